@@ -106,7 +106,7 @@ def required_damping(
     Args:
         coupling: K and B of the law.
         period: T of the device in s.
-        laws: n, 1 to ``MOST_SUBSTEPS``.
+        laws: n, 1 to ``MAX_SUBSTEPS``.
         axis: Kind of axis.
 
     Raises:
@@ -368,7 +368,7 @@ def run_conditions(
         parameters.period,
         parameters.scale,
         parameters.force_scale,
-        parameters.laws,
+        parameters.law_evaluations,
         method,
     )
 

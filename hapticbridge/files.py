@@ -36,7 +36,7 @@ def import_extra(
         ) from None
 
 
-# JSON without NaN and infinity, and JSON that was written elsewhere.
+# JSON without NaN and infinity, and JSON from other programs.
 
 
 def finite_or_null(value: Any) -> Any:
@@ -52,10 +52,10 @@ def finite_or_null(value: Any) -> Any:
 
 
 def read_json(text: str | bytes) -> Any:
-    """Reads JSON that a file, a device or a browser gave.
+    """Parses JSON from a file, a device or a browser.
 
     Raises:
-        ValueError: The text is not JSON, or is nested more deeply than the interpreter can follow.
+        ValueError: The text is not JSON, or is nested too deeply for the interpreter.
     """
     try:
         return json.loads(text)

@@ -16,7 +16,7 @@ from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import handle_pose
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MOST_BUTTONS, OFF, GuardParameters
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.pose import canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -53,7 +53,7 @@ class Limits:
         torque: Largest norm of the torque in N m, > 0.
         rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
         ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
-            stores much energy meanwhile (``kernel.ramp``).
+            stores much energy meanwhile (``kernel.guard``).
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
@@ -231,17 +231,17 @@ def refuse_stretched_start(
     Raises:
         DeviceError: The message names the handle's distance from the grip, and the grip's position.
     """
-    s = state[0]
+    pose = state["pose"][0]
     x, y, z = sample["position"][0].tolist()
     quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
-    handle, _ = handle_pose(state, (x, y, z), quaternion)
-    distance = float(np.linalg.norm(np.subtract(handle, s["tool_position"])))
-    force = float(s["stiffness"]) * distance
+    handle, _ = handle_pose(state["run"][0], pose, (x, y, z), quaternion)
+    distance = float(np.linalg.norm(np.subtract(handle, pose["tool_position"])))
+    force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
         raise DeviceError(
             f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
-            f"{np.round(s['tool_position'], 4).tolist()} m or use relative poses"
+            f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
         )
 
 
@@ -339,8 +339,8 @@ def button_mask(button: int | None, what: str) -> int:
     """
     if button is None:
         return 0
-    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MOST_BUTTONS:
-        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MOST_BUTTONS - 1}")
+    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MAX_BUTTONS:
+        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MAX_BUTTONS - 1}")
     return 1 << button
 
 

@@ -13,17 +13,8 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
-from hapticbridge.kernel.codes import (
-    COUPLED,
-    DIRECT,
-    HELD,
-    LOSSLESS,
-    WELD,
-    WELD_NAME,
-    has_law,
-    laws_per_tick,
-)
-from hapticbridge.kernel.handle import Gains
+from hapticbridge.kernel.codes import WELD_NAME, Scheme, has_law, law_evaluations
+from hapticbridge.kernel.coupling import Gains
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.scene import Scene
@@ -47,7 +38,7 @@ class Method:
         about: Description in one sentence.
         hazard: Hazard on a real device beyond the device condition, in one sentence; empty without
             one.
-        scheme: Code of the kernel's scheme (``kernel.scheme.COUPLED`` …).
+        scheme: Path of the wrench to the tool.
         integrator: MuJoCo's integrator by its MJCF name.
         discretization: Discretisation of the coupling's damper in the bounds; ``none`` without a
             law.
@@ -62,7 +53,7 @@ class Method:
     name: str
     about: str
     hazard: str
-    scheme: int
+    scheme: Scheme
     integrator: str
     discretization: str = "backward"
     compensated: bool = False
@@ -73,7 +64,7 @@ class Method:
     def step(self) -> Callable[[Any, Any], None]:
         """MuJoCo's part of a substep through the Python bindings.
 
-        ``kernel.step.advance`` calls the C function with equal results to the bit.
+        ``kernel.tick.advance`` calls the C function with equal results to the bit.
         """
         step: Callable[[Any, Any], None] = (
             mujoco.mj_step if self.has_coupling else mujoco.mj_fwdPosition
@@ -82,7 +73,7 @@ class Method:
 
     def laws(self, substeps: int) -> int:
         """Returns the evaluations of the tool's wrench per tick."""
-        return laws_per_tick(self.scheme, substeps)
+        return law_evaluations(self.scheme, substeps)
 
     @property
     def has_law(self) -> bool:
@@ -92,18 +83,18 @@ class Method:
     @property
     def meters_inputs(self) -> bool:
         """True if the work of applied forces and moved mocap bodies is metered."""
-        return self.integrator != "RK4" and self.scheme != DIRECT
+        return self.integrator != "RK4" and self.scheme != Scheme.MASSLESS
 
     @property
     def has_coupling(self) -> bool:
         """True if an elastic coupling lies between handle and tool."""
-        return self.scheme != DIRECT
+        return self.scheme != Scheme.MASSLESS
 
     def gains(self, coupling: Coupling, timestep: float) -> tuple[Gains, Gains]:
         """Returns the gains of the coupling's actuators, for forces and for torques."""
-        if self.scheme == HELD:
+        if self.scheme == Scheme.ZERO_ORDER_HOLD:
             return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
-        if self.scheme not in (COUPLED, LOSSLESS):
+        if self.scheme not in (Scheme.IMPLICIT, Scheme.MIDPOINT):
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         more = timestep if self.compensated else 0.0
         k, b = coupling.stiffness, coupling.damping
@@ -120,7 +111,7 @@ class Method:
             CouplingError: The time step is not finite and > 0.
 
         References:
-            ``passivity.compensation``.
+            ``theory.compensation``.
         """
         return self._with_damping(coupling, timestep, law_damping)
 
@@ -166,7 +157,7 @@ IMPLICIT = Method(
     about="the coupling as actuators under MuJoCo's discrete integrator: implicit in position and "
     "velocity, solved together with the contacts, passive behind the coupling",
     hazard="",
-    scheme=COUPLED,
+    scheme=Scheme.IMPLICIT,
     integrator="discrete",
     adds=IMPLICIT_LAG,
 )
@@ -183,7 +174,7 @@ LOSSLESS_COUPLING = Method(
     about="half of the coupling inside MuJoCo's implicit step, half carried over from the last: a "
     "free tool keeps its energy and is followed to second order; near contacts it is 'implicit'",
     hazard="",
-    scheme=LOSSLESS,
+    scheme=Scheme.MIDPOINT,
     integrator="discrete",
     lag=MIDPOINT_LAG,
     adds=MIDPOINT_LAG,
@@ -272,9 +263,9 @@ def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
     Raises:
         SceneError: The message names the obstacle in the scene.
     """
-    if method.scheme == DIRECT:
+    if method.scheme == Scheme.MASSLESS:
         check_massless_tool(model, grip, method.name)
-    if method.scheme == WELD:
+    if method.scheme == Scheme.WELD:
         check_weldable(model, grip)
     check_metered(model, method.integrator, method.name)
 
@@ -310,15 +301,15 @@ def prepare(
     for item in fields(Coupling):
         _ARGUMENTS.number(f"coupling {item.name.replace('_', ' ')}", getattr(coupling, item.name))
     check_scene(scene.model, scene.grip, method)
-    scene.set_weld(coupling if method.scheme == WELD else None)
+    scene.set_weld(coupling if method.scheme == Scheme.WELD else None)
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
-    scene.set_reach(REACH if method.scheme == LOSSLESS else 0.0)
-    if warns and method.scheme in (COUPLED, LOSSLESS):
+    scene.set_reach(REACH if method.scheme == Scheme.MIDPOINT else 0.0)
+    if warns and method.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT):
         warn_of_contacts(scene.model, scene.grip, scene.path)
     step = period / substeps
     scene.set_gains(*method.gains(method.used(coupling, step), step))
-    felt = measured_weld(scene.model, scene.grip) if method.scheme == WELD else None
+    felt = measured_weld(scene.model, scene.grip) if method.scheme == Scheme.WELD else None
     scene.reset()
     return felt
 
@@ -333,9 +324,9 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
         raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
-    if has_weld != (method.scheme == WELD):
+    if has_weld != (method.scheme == Scheme.WELD):
         raise SceneError(
-            f"method '{method.name}' requires {'a' if method.scheme == WELD else 'no'} "
+            f"method '{method.name}' requires {'a' if method.scheme == Scheme.WELD else 'no'} "
             "weld to the handle"
         )
     if has_weld:

@@ -22,7 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import WELD
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.recording import Attachment
@@ -76,10 +76,11 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
 def start_of(state: NDArray[np.void], name: str) -> list[float]:
     """Returns one of ``STARTS`` from the kernel's state before the first tick."""
     if name in _STORED:
-        return [float(state[_STORED[name]][0])]
+        return [float(state["energy"][_STORED[name]][0])]
     body = name.removesuffix("_start")
-    pose = (*state[f"{body}_position"][0], *state[f"{body}_quaternion"][0])
-    return [float(value) for value in pose]
+    pose = state["pose"][0]
+    numbers = (*pose[f"{body}_position"], *pose[f"{body}_quaternion"])
+    return [float(value) for value in numbers]
 
 
 # Numbers of a recording's metadata.
@@ -243,7 +244,7 @@ def describe_run(
 
 def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
     """Returns a weld's measured coupling; None for other methods."""
-    if method.scheme != WELD:
+    if method.scheme != Scheme.WELD:
         return None
     return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
 

@@ -181,8 +181,8 @@ class TickKernel:
         method = setup.method
         self.bound, self.step, self.substeps = bound, method.step, range(setup.substeps)
         self.is_ahead = setup.is_pipelined and can_split(setup.scene.model, method.scheme)
-        self.external_flags = bound.state["outside"]
-        self.wrench = bound.state["wrench_on_device"][0]
+        self.external_flags = bound.external_flags
+        self.wrench = bound.wrench_on_device
 
     def publish_again(self, deadline: int, wake: int, read: int, write: int, flags: int) -> int:
         """Publishes a record that a full ring refused; returns ``OK`` or ``RING_FULL``.

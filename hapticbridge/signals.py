@@ -1,4 +1,4 @@
-"""Signals as a wish to stop while a loop runs, or held back for a moment."""
+"""Signals as requests to stop a run, or deferred for a moment."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ STOP_SIGNALS = tuple(
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT", "SIGXCPU")
     if hasattr(signal, name)
 )
-"""What ends a run. Ctrl-Z (SIGTSTP) among them: a process that is suspended leaves the force on; so
-does one that Ctrl-\\ (SIGQUIT) or a limit on its processor time (SIGXCPU) ends at once."""
+"""Signals that end a run. Ctrl-Z (SIGTSTP) is among them, because a suspended process leaves the
+force on. So does a process killed by Ctrl-\\ (SIGQUIT) or by a limit on its processor time
+(SIGXCPU)."""
 
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """Calls ``stop`` with the signal's name; only the main thread may, others run as they are.
+    """Calls ``stop`` with the name of each stop signal, in the main thread only.
 
-    A signal that is ignored stays so: ``nohup`` sees to that for SIGHUP. One that a library handles
-    in C stays with it: Python could not give it back.
-
-    A ``KeyboardInterrupt`` in the middle of a tick could fall between a computed wrench and its
-    being sent; a wish that is looked at once a tick cannot.
+    Ignored signals stay ignored, such as SIGHUP under ``nohup``. A signal handled by a library in C
+    stays with it, because Python could not restore its handler. A ``KeyboardInterrupt`` during a
+    tick could fall between the computation of a wrench and its sending; a request that is checked
+    once per tick cannot.
     """
 
     def handle(number: int, _frame: FrameType | None) -> None:
@@ -47,10 +47,10 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
 @contextmanager
 def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
-    """Lets every signal that ends a run end a program as Ctrl-C does, with all that is then closed.
+    """Makes every stop signal act like Ctrl-C, so that all resources are closed.
 
-    Yields a list, at first empty: once somebody stands in it who takes a signal's name, the last
-    one is told instead, and nothing is interrupted any more.
+    Yields a list of callbacks. While it is empty a signal raises KeyboardInterrupt; otherwise the
+    last callback receives the signal's name.
     """
     told: list[Callable[[str], None]] = []
 
@@ -65,12 +65,12 @@ def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
 
 @contextmanager
 def holding_interrupts() -> Iterator[None]:
-    """Holds Ctrl-C back from the main thread, and from processes that this thread starts meanwhile.
+    """Defers Ctrl-C for the main thread, and for processes that this thread starts meanwhile.
 
-    It arrives at the end. A process begins with what its parent's thread holds back, so an
-    interrupt cannot end it in the middle of its imports, with a traceback; it has to unblock SIGINT
-    itself. In the parent that is not enough, because any other thread may take the signal and hand
-    it to the main one: there, a handler notes it.
+    It arrives at the end. A child process inherits the signals that its parent's thread blocks, so
+    an interrupt cannot end it with a traceback during its imports; it must unblock SIGINT itself.
+    In the parent, any other thread may take the signal and pass it to the main one, so a handler
+    notes it.
     """
     noted: list[int] = []
     before = signal.getsignal(signal.SIGINT)  # None if it is not Python's
@@ -93,13 +93,11 @@ def holding_interrupts() -> Iterator[None]:
 
 @contextmanager
 def leaving_on_interrupt(code: int) -> Iterator[None]:
-    """Ends the process at once on Ctrl-C, without a message, where there is nothing to lose.
+    """Ends the process at once on Ctrl-C, without a message, while there is nothing to lose.
 
-    For imports: there a ``KeyboardInterrupt`` is lost in callbacks of the importer, which print it,
-    or becomes another error in a library's C code. A handler other than Python's own is kept.
-
-    Args:
-        code: The exit code.
+    It is for imports. There a ``KeyboardInterrupt`` is lost in callbacks of the importer, which
+    print it, or becomes another error in a library's C code. A handler other than Python's own is
+    kept.
     """
     is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not is_usual or threading.current_thread() is not threading.main_thread():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, LOSSLESS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
 from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
@@ -69,7 +69,7 @@ def coupling_sentences(
         rotation = law.rotational_stiffness, law.rotational_damping
         kinds.append(_AxisGains("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
     name, adds = method.name, method.adds
-    if is_always_held and method.scheme == LOSSLESS:
+    if is_always_held and method.scheme == Scheme.MIDPOINT:
         name, adds = f"{name}, here always implicit,", IMPLICIT_LAG
     return tuple(_sentence(name, adds, period / substeps, substeps, kind) for kind in kinds)
 
@@ -118,7 +118,7 @@ class Ledger:
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
-        tuning_work: Work on the coupling's spring by commands (``BoundKernel.tune``).
+        tuning_work: Work on the coupling's spring by commands (``kernel.coupling``).
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.
@@ -146,8 +146,9 @@ class Ledger:
     @classmethod
     def of(cls, state: NDArray[np.void]) -> Ledger:
         """Reads the ledger from the kernel's state (``STATE_DTYPE``, one element)."""
-        values = {name: float(state[name][0]) for name in _ENERGIES}
-        ticks = [int(state[name][0]) for name in _TICKS]
+        energy = state["energy"][0]
+        values = {name: float(energy[name]) for name in _ENERGIES}
+        ticks = [int(energy[name]) for name in _TICKS]
         unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
         return cls(**values, first_unstrict=unstrict, first_active=active, first_kick=kick)
 
@@ -294,8 +295,8 @@ class Summary:
             overruns=outcome.overruns,
             skipped=outcome.skipped,
             dropped=outcome.dropped,
-            peak_force=float(state["peak_force"][0]),
-            peak_torque=float(state["peak_torque"][0]),
+            peak_force=float(state["loop"]["peak_force"][0]),
+            peak_torque=float(state["loop"]["peak_torque"][0]),
             energies=ledger.energies(),
             environment=ledger.environment,
             slack_share=ledger.slack_share,
@@ -309,7 +310,7 @@ class Summary:
                 method,
                 parameters.period,
                 parameters.substeps,
-                is_always_held=outcome.ticks > 0 and not state["lossless_ticks"][0],
+                is_always_held=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
             ),
             effective=parameters.felt,
             fault=ledger.fault,

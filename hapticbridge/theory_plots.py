@@ -1,4 +1,4 @@
-"""The theory in pictures: what a device can show, and what a coupling needs."""
+"""Plots of the theory: couplings that a device can show, and their required damping."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 _Array = NDArray[np.float64]
 
 POINTS = 400
-"""Frequencies per spectrum, over three decades up to Nyquist; more only makes pictures larger."""
+"""Number of frequencies per spectrum, over three decades up to Nyquist; more only enlarges the
+file."""
 
 HIGHEST_SHOWN = 4.0
-"""Where a line or spectrum is cut off, in units of what the picture is about (the largest stiffness
-of the region, the damping needed); more shows more of what lies far outside and flattens the rest.
-"""
+"""Upper limit of an axis in units of its main quantity: the largest stiffness of the region, or the
+required damping. A larger limit shows more of the far range and flattens the rest."""
 
 TITLE_WIDTH = 95
-"""Characters of a title's line that fit into 8 inches; more would be cut off."""
+"""Number of characters in a title's line that fit into 8 inches; more would be cut off."""
 
 _COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#8e44ad", "#c77700", "#5f6368", "#0b7285", "#d6336c")
 _STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), "-.", (0, (4, 4)))
@@ -42,14 +42,14 @@ _STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (1, 1)), "-.", (0, (4, 4)))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """One way to realise the same stiffness and damping, and what it asks of the device.
+    """One realisation of a stiffness and damping, and its requirement on the device.
 
     Attributes:
-        name: What is different.
-        needed: Device damping in N s/m; inf where none suffices.
-        frequency: Where it is needed, in rad/s: 0.0 at low frequency; None where there is no single
-            one: needed alike at all of them, as by a spring without damper, or at none.
-        spectrum: Frequencies in rad/s and the damping needed there; None where none is drawn.
+        name: Distinctive property.
+        needed: Device damping in N s/m; inf if none suffices.
+        frequency: Frequency in rad/s at which it is needed, 0.0 for low frequency. None without a
+            single frequency: all alike, as for a spring without damper, or none.
+        spectrum: Frequencies in rad/s and the damping needed there; None without a curve.
     """
 
     name: str
@@ -59,17 +59,17 @@ class Alternative:
 
 
 def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
-    """Returns what a device needs to show a coupling, by method and by each way around the bound.
+    """Returns the requirements of a coupling by method, and by each way around the bound.
 
-    First the methods with a guarantee, the default one leading: each uses the damping B' of
-    ``Method.used``, and where that would be below zero more is felt than asked for. Then laws that
-    use B' = B: at half the period; with a first-order low-pass behind the damper; with Tustin's
-    damper; with one sample of delay against a wall, and for any environment. Last a lossless
-    transmission line of the same static stiffness, of impedance Z = K T and one sample each way,
-    ended by the device.
+    The methods with a guarantee come first, the default one leading. Each uses the damping B' of
+    ``Method.used``; if that would be negative, the effective damping exceeds the requested one.
+    Laws with B' = B follow: at half the period; with a first-order low-pass behind the damper; with
+    Tustin's damper; with one sample of delay against a wall, and for any environment. Last is a
+    lossless transmission line of equal static stiffness, with impedance Z = K T and one sample each
+    way, terminated by the device.
 
     Args:
-        felt: K and B that should be felt; the translation counts.
+        felt: Requested K and B; only the translation counts.
         period: T in s, finite and > 0.
         filter_time: τ in s of the low-pass, >= 0.
 
@@ -95,7 +95,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         spectrum = damping_spectrum(
             law, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
         )
-        if delay == 0 and law.damping == 0:  # a plain spring asks for K T/2 at all of them
+        if delay == 0 and law.damping == 0:  # a plain spring needs K T/2 at all frequencies
             return Alternative(name, needed, None, (frequency, spectrum))
         worst = worst_frequency(law, step, discretization=scheme, delay=delay, filter_time=low_pass)
         return Alternative(name, needed, float(worst), (frequency, spectrum))
@@ -109,7 +109,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
     methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(felt.stiffness * period, period, frequency)
-    # the phase of (1 − z⁻¹)z/C passes through π on its way to Nyquist, whatever K and B
+    # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B
     anywhere = Alternative("B' = B, one tick late, any environment", float("inf"), None, None)
     return (
         *methods,
@@ -136,12 +136,9 @@ def _frequencies(period: float) -> _Array:
 def draw_alternatives(
     ways: tuple[Alternative, ...], title: str, device_damping: float | None = None
 ) -> Figure:
-    """Draws the damping that each way needs over frequency.
+    """Draws the required damping of each alternative over frequency.
 
-    Args:
-        ways: From ``alternatives``; the first one sets the scale.
-        title: Above the picture.
-        device_damping: b in N s/m, drawn as a level if it is given.
+    The first alternative sets the scale. ``device_damping`` b in N s/m is drawn as a level.
     """
     figure = new_figure(8, 5.5)
     axes = figure.subplots()
@@ -170,23 +167,21 @@ def draw_alternatives(
 
 
 def recommended(z: ZWidth) -> Coupling:
-    """Returns the corner as it is felt by the default method, which so uses its B' unclipped."""
+    """Returns the corner as a requested coupling of the default method, without clipping of B'."""
     return default_method().rendered(z.corner, z.period)
 
 
 def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | None = None) -> Figure:
-    """Draws the couplings that a device can show: region, limiting lines, corner to use.
+    """Draws the couplings that a device can show: region, limiting lines and recommended corner.
 
-    Args:
-        z: From ``z_width``.
-        measured: Limits that were found by trying: B in N s/m, K and its half-width in N/m.
+    ``measured`` holds limits found by trial: B in N s/m, K and its half-width in N/m.
     """
     figure = new_figure(8, 5.5)
     axes = figure.subplots()
     axes.fill_between(z.damping, z.limit, color="#1a5fb4", alpha=0.15, lw=0, label="can be shown")
     for i, line in enumerate(z.lines):
         remark = "" if line.is_required else ", not kept"
-        # to its end, not along the axis beyond
+        # draw the line to its end only
         inside = z.damping < line.largest_damping
         ends = not inside.all()
         axes.plot(
@@ -227,7 +222,7 @@ def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | Non
     facts += [f"steps of {z.resolution:g} m"] * bool(z.resolution)
     facts += [f"delay of {1e3 * z.delay * z.period:g} ms"] * bool(z.delay)
     facts += [f"low-pass of {1e3 * z.filter_time:g} ms"] * bool(z.filter_time)
-    # a line may end between facts only
+    # line breaks fall between facts only
     kept = ", ".join(fact.replace(" ", "\xa0") for fact in facts)
     title = "\n".join(wrap(f"What a device can show: {kept}", TITLE_WIDTH)).replace("\xa0", " ")
     figure.suptitle(title, fontsize="medium", parse_math=False)

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.lab.chart import Chart, Extent, measure_chart, open_workload
-from hapticbridge.lab.chart.chart import Cost, Measurement
+from hapticbridge.lab.chart.catalogue import (
+    Extent,
+    open_workload,
+)
+from hapticbridge.lab.chart.chart import (
+    Chart,
+    Cost,
+    Measurement,
+    measure_chart,
+)
 from hapticbridge.lab.chart.setting import SHIPPED, Setting
 from hapticbridge.lab.chart.workload import Score, Verdict
 from hapticbridge.lab.methods import METHODS

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.lab.engines import Contacts, Pose, Setting, Task, Velocity
+from hapticbridge.lab.engines.base import (
+    Contacts,
+    Pose,
+    Setting,
+    Task,
+    Velocity,
+)
 from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Vector, add, canonical, product, quaternion_exp, scaled
 

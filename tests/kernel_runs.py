@@ -169,15 +169,15 @@ def bind(
 
 def run_of(scene: Scene, binding: BoundKernel, parameters: RunParameters) -> Run:
     """Returns a run without ticks: call it before the first one."""
-    state = binding.state[0]
+    pose = binding.state["pose"][0]
     return Run(
         scene,
         parameters,
         binding,
         np.zeros(0, TICK_DTYPE),
-        np.concatenate([state["tool_position"], state["tool_quaternion"]]),
-        np.concatenate([state["handle_position"], state["handle_quaternion"]]),
-        float(state["start_energy"]),
+        np.concatenate([pose["tool_position"], pose["tool_quaternion"]]),
+        np.concatenate([pose["handle_position"], pose["handle_quaternion"]]),
+        float(binding.state["energy"]["start_energy"][0]),
     )
 
 

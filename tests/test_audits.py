@@ -80,9 +80,9 @@ def test_a_folder_is_searched_through_and_patterns_are_understood(runs: Path) ->
 def test_a_word_that_names_no_recording_is_refused(runs: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"no recording .* in the folder"):
         find_recordings([tmp_path])
-    with pytest.raises(RecordingError, match="no recording fits"):
+    with pytest.raises(RecordingError, match="no recording matches"):
         find_recordings([f"{runs}/x*.mcap"])
-    with pytest.raises(RecordingError, match=r"/\*\*x' is no pattern"):
+    with pytest.raises(RecordingError, match=r"/\*\*x' is not a valid pattern"):
         find_recordings([f"{runs}/**x"])
 
 

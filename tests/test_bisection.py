@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.maps.base import Bracket, agreement, largest_stable, per_cent
+from hapticbridge.lab.maps.base import Bracket, agreement, largest_stable
 
 
 @given(limit=st.floats(0.011, 90.0), width=st.floats(1e-6, 0.1))
@@ -33,8 +33,6 @@ def test_an_agreement_is_never_finer_than_half_the_search() -> None:
     assert agreement([1.0, 0.9], [1.0, 1.0], 0.002) == pytest.approx(0.1)
     assert agreement([math.nan], [1.0]) is None
     assert agreement([], []) is None
-    assert per_cent(0.0012) == "within 0.12 %"
-    assert per_cent(None) == "nowhere comparable"
 
 
 def test_a_search_without_a_range_is_refused() -> None:

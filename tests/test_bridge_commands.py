@@ -56,9 +56,9 @@ class Script:
         bridge.session.commands.now = lambda: self.done * T
         if self.done in self.commands:
             bridge.command(self.commands[self.done], by="test")
-        state = bridge.session.kernel.bound.state[0]
-        self.stiffness.append(float(state["stiffness"]))
-        self.bound.append(float(state["stiffness"] * T / 2 + state["damping"]))
+        coupling = bridge.session.kernel.bound.state["coupling"][0]
+        self.stiffness.append(float(coupling["stiffness"]))
+        self.bound.append(float(coupling["stiffness"] * T / 2 + coupling["damping"]))
         self.done += 1
 
 
@@ -267,7 +267,7 @@ def test_what_a_hand_rubbed_away_by_turning_pays_for_no_command_either(
         with pytest.raises(SafetyTrip, match=r"tick 3[4-7].*more energy beyond what the hand"):
             run(pump, 4.0, **options)
     else:
-        monkeypatch.setattr("hapticbridge.kernel.state.forget_dissipation", lambda _state: None)
+        monkeypatch.setattr("hapticbridge.kernel.state.cap_dissipation", lambda _state: None)
         assert run(pump, 4.0, **options)[0].stopped_by == "duration"
 
 
@@ -310,7 +310,7 @@ def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> N
 
     def on_tick(bridge: Bridge, tick: int) -> None:
         script(bridge, tick)
-        given.append(float(bridge.session.kernel.bound.state["given"][0]))
+        given.append(float(bridge.session.kernel.bound.state["observer"]["energy_to_device"][0]))
 
     run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
     # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated

@@ -15,21 +15,32 @@ from chart_cases import FakeRun, made_up, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.codes import DIRECT, LOSSLESS
-from hapticbridge.lab.chart import (
-    Chart,
+from hapticbridge.kernel.codes import Scheme
+from hapticbridge.lab.chart.catalogue import (
     Extent,
-    chosen_methods,
-    chosen_periods,
-    measure_chart,
     open_workload,
+)
+from hapticbridge.lab.chart.chart import (
+    Chart,
+    Measurement,
+    interleaved_costs,
+    measure_chart,
+    one_core,
+    pareto_front,
+)
+from hapticbridge.lab.chart.output import (
+    draw_chart,
     prepared_files,
-    settings_for,
     write_chart,
 )
-from hapticbridge.lab.chart.chart import Measurement, interleaved_costs, one_core, pareto_front
-from hapticbridge.lab.chart.output import draw_chart
-from hapticbridge.lab.chart.setting import CONTACTS, SHIPPED, Setting
+from hapticbridge.lab.chart.setting import (
+    CONTACTS,
+    SHIPPED,
+    Setting,
+    chosen_methods,
+    chosen_periods,
+    settings_for,
+)
 from hapticbridge.lab.methods import METHODS
 
 
@@ -91,7 +102,7 @@ def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
     for method in METHODS.values():
         assert {s.period for s in settings if s.method is method} == set(periods)
     assert {s.contact for s in settings} == set(CONTACTS)
-    undivided = [s for s in settings if s.method.scheme in (LOSSLESS, DIRECT)]
+    undivided = [s for s in settings if s.method.scheme in (Scheme.MIDPOINT, Scheme.MASSLESS)]
     assert {s.substeps for s in undivided} == {1}
     for name in ("implicit", "lossless"):
         tried = {s.period for s in settings if (s.method.name, s.contact) == (name, "damped")}

@@ -23,23 +23,6 @@ def test_points_whose_spreads_meet_cost_alike_whichever_is_disturbed() -> None:
     assert recommended([calm, apart]) is calm
 
 
-def test_better_point_that_is_not_taken_is_named_with_the_reason() -> None:
-    best = made_up(0.010, 0.6)
-    kicks = made_up(0.009, 0.2, method="explicit")
-    text = recommendation([best, kicks], "a machine")
-    assert "use implicit, 1 ms" in text
-    assert "explicit, 1 ms would cost no more and err less (0.2 JND), but it may kick" in text
-    for no_better in (
-        made_up(0.020, 0.2, method="explicit"),
-        made_up(0.009, 0.595, method="explicit"),
-        made_up(0.009, 0.7, method="explicit"),
-        made_up(0.009, 0.2, method="explicit", period=4e-3),
-    ):
-        assert "explicit" not in recommendation([best, no_better], "a machine")
-    other_law = made_up(0.001, 0.0, method="direct")
-    assert "direct" not in recommendation([best, other_law], "a machine")
-
-
 def test_recommendation_says_where_its_error_is_not_counted_from_the_truth() -> None:
     point = made_up(0.01, 0.2)
     assert "not from the truth" in recommendation([point], "a machine", is_truth=False)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from check_scenes import (
@@ -20,16 +21,27 @@ from check_scenes import (
 )
 from outside_scenes import hand_rows, mjcf
 
+from hapticbridge.check import lean
 from hapticbridge.check.case import open_case
 from hapticbridge.check.fault import Fault, length, weight
+from hapticbridge.check.inventory import take_inventory
+from hapticbridge.check.lean import MAY_GO
 from hapticbridge.check.physics import depth_under
 from hapticbridge.check.run_faults import find_faults
+from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
+from hapticbridge.check.version import SceneVariant, Setting, name_everything
+from hapticbridge.check.witness import witness
+from hapticbridge.cli import main
+from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import read_scene, scene_names, scene_path
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
 """What a planted fault may lead to in the motion."""
+
+FLOOR = '<geom name="floor" type="plane" size="1 1 1"/>'
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +64,7 @@ def test_planted_fault_alone_is_named_with_file_and_line(tmp_path: Path, plant: 
     assert fault.change
 
 
-def test_an_inertia_that_no_body_has_is_not_called_missing_and_its_stand_in_is_told(
-    tmp_path: Path,
-) -> None:
+def test_an_impossible_inertia_is_told_with_its_stand_in(tmp_path: Path) -> None:
     box = 'size="0.01 0.01 0.01" mass="0.1"/>'
     inertial = '<inertial pos="0 0 0" mass="0.1" diaginertia="1 1 9"/>'
     plant = Plant("impossible inertia", box, box + inertial, file="parts.xml")
@@ -100,16 +110,13 @@ def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path
         ("0.002 1", 0.05e-3, False),  # too narrow, but no stiffer contact is passive
     ],
 )
-def test_contact_softer_than_it_need_be_is_told_in_a_narrow_clearance(
-    tmp_path: Path, solref: str, clearance: float, is_told: bool
-) -> None:
-    source = read_scene(peg_with(tmp_path, solref), clearance=clearance)
-    faults = find_faults(open_case(source))
-    assert ("soft contact" in kinds(faults)) == is_told
-    if is_told:
-        told = next(f.sentence for f in faults if f.kind == "soft contact")
-        room = float(told.split("into a clearance of ")[1].split(" µm")[0])
-        assert room == pytest.approx(1e6 * clearance, rel=0.05)  # of postures, none quite straight
+def test_needless_softness_is(tmp_path: Path, solref: str, clearance: float, is_told: bool) -> None:
+    faults = find_faults(open_case(read_scene(peg_with(tmp_path, solref), clearance=clearance)))
+    told = [fault.sentence for fault in faults if fault.kind == "soft contact"]
+    assert bool(told) == is_told
+    for sentence in told:  # of postures, none quite straight
+        room = float(sentence.split("into a clearance of ")[1].split(" µm")[0])
+        assert room == pytest.approx(1e6 * clearance, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -123,91 +130,62 @@ def test_contact_softer_than_it_need_be_is_told_in_a_narrow_clearance(
         ('solref="-400000 -1000"', 'solref="0.002 1"', "geom 'floor'"),
     ],
 )
-def test_geom_whose_setting_spoils_the_mean_is_named(
-    tmp_path: Path, floor: str, tool: str, place: str
-) -> None:
-    text = mjcf(
-        GOOD_OPTION,
-        body=f'<body name="tool" pos="0 0 0.05"><freejoint/><geom name="ball" size="0.01" '
-        f'mass="0.1" {tool}/><site name="grip"/></body>',
-        world=f'<geom name="floor" type="plane" size="1 1 1" {floor}/>',
+def test_spoiling_geom_is_named(tmp_path: Path, floor: str, tool: str, place: str) -> None:
+    body, world = (
+        BALL.replace('mass="0.1"', f'mass="0.1" {tool}'),
+        FLOOR.replace("/>", f" {floor}/>"),
     )
-    found = [f for f in faults_of(written(tmp_path, text)) if f.place.element.startswith("geom")]
+    scene = written(tmp_path, mjcf(GOOD_OPTION, body=body, world=world))
+    found = [f for f in faults_of(scene) if f.place.element.startswith("geom")]
     assert [fault.place.element for fault in found] == [place]
     assert ("geom 'floor'" in found[0].change) == (floor == tool)
 
 
 def test_explicit_pair_is_named_instead_of_its_geoms(tmp_path: Path) -> None:
-    text = mjcf(
-        GOOD_OPTION,
-        GOOD_CONTACT,
-        '<contact><pair name="rest" geom1="floor" geom2="ball" solref="0.03 1"/></contact>',
-        body='<body name="tool" pos="0 0 0.05"><freejoint/><geom name="ball" size="0.01" '
-        'mass="0.1"/><site name="grip"/></body>',
-        world='<geom name="floor" type="plane" size="1 1 1"/>',
-    )
+    pair = '<contact><pair name="rest" geom1="floor" geom2="ball" solref="0.03 1"/></contact>'
+    text = mjcf(GOOD_OPTION, GOOD_CONTACT, pair, body=BALL, world=FLOOR)
     (fault,) = faults_of(written(tmp_path, text))
     assert (fault.kind, fault.place.element) == ("soft contact", "pair 'rest'")
 
 
-@pytest.mark.parametrize(("mass", "is_told"), [(0.24, False), (0.25, True)])
-def test_tool_that_sags_by_more_than_a_millimetre_is_heavy(
-    tmp_path: Path, mass: float, is_told: bool
-) -> None:
-    text = mjcf(
-        GOOD_OPTION.replace('"0 0 0"', '"0 0 -9.81"'),
-        GOOD_CONTACT,
-        body=f'<body name="tool"><freejoint/><geom size="0.01" mass="{mass}"/>'
-        '<site name="grip" pos="0.005 0 0"/></body>',
-    )
-    coupling = Coupling(stiffness=2400, damping=1, rotational_stiffness=1e6, rotational_damping=1)
-    case = case_of(written(tmp_path, text), coupling=coupling)
-    found = [fault for fault in find_faults(case) if fault.kind == "heavy tool"]
-    assert len(found) == is_told
-    if found:
-        assert f"by {length(mass * 9.81 / 2400)} at rest" in found[0].sentence
+def free(geom: str, grip: str = "") -> str:
+    """Returns a free tool of one geom."""
+    return f'<body name="tool"><freejoint/><geom {geom}/><site name="grip" {grip}/></body>'
 
 
-@pytest.mark.parametrize(("load", "is_told"), [(0.9, False), (1.1, True)])
-def test_load_a_thousand_times_its_carrier_is_told(
-    tmp_path: Path, load: float, is_told: bool
-) -> None:
-    text = mjcf(
-        GOOD_OPTION,
-        body='<body name="link"><joint/><geom size="0.01" mass="0.001"/>'
-        f'<body name="load" pos="0.1 0 0"><joint/><geom size="0.02" mass="{load}"/>'
-        '<site name="grip"/></body></body>',
-    )
-    faults = faults_of(written(tmp_path, text))
-    assert ("mass ratio" in kinds(faults)) == is_told
+SAG = free('size="0.01" mass="{}"', 'pos="0.005 0 0"')
+LINKS = """<body name="link"><joint/><geom size="0.01" mass="0.001"/><body pos="0.1 0 0">
+  <joint/><geom size="0.02" mass="{}"/><site name="grip"/></body></body>"""
+HEAVY = GOOD_OPTION.replace('"0 0 0"', '"0 0 -9.81"')
 
 
 @pytest.mark.parametrize(
-    ("size", "mass", "is_told"), [(1.0, 40, False), (1.6, 40, True), (1.0, 60, True)]
+    ("kind", "option", "body", "words"),
+    [
+        ("heavy tool", HEAVY, SAG.format(0.24), None),
+        ("heavy tool", HEAVY, SAG.format(0.25), f"by {length(0.25 * 9.81 / 2400)} at rest"),
+        ("mass ratio", GOOD_OPTION, LINKS.format(0.9), None),
+        ("mass ratio", GOOD_OPTION, LINKS.format(1.1), ""),
+        ("units", GOOD_OPTION, free('size="1.0" mass="40"'), None),
+        ("units", GOOD_OPTION, free('size="1.6" mass="40"'), f"{length(3.2)} long"),
+        ("units", GOOD_OPTION, free('size="1.0" mass="60"'), f"weighs {weight(60)}"),
+    ],
 )
-def test_tool_that_no_hand_holds_has_other_units(
-    tmp_path: Path, size: float, mass: float, is_told: bool
+def test_a_tool_beyond_the_line_is_told_and_none_below(
+    tmp_path: Path, kind: str, option: str, body: str, words: str | None
 ) -> None:
-    text = mjcf(
-        GOOD_OPTION,
-        GOOD_CONTACT,
-        body=f'<body name="tool"><freejoint/><geom size="{size}" mass="{mass}"/>'
-        '<site name="grip"/></body>',
-    )
-    found = [f for f in faults_of(written(tmp_path, text)) if f.kind == "units"]
-    assert len(found) == is_told
-    if found:
-        assert (f"{length(2 * size)} long" in found[0].sentence) == (size > 1.5)
-        assert (f"weighs {weight(mass)}" in found[0].sentence) == (mass > 50)
+    coupling = Coupling(stiffness=2400, damping=1, rotational_stiffness=1e6, rotational_damping=1)
+    scene = written(tmp_path, mjcf(option, GOOD_CONTACT, body=body))
+    told = [fault for fault in faults_of(scene, coupling=coupling) if fault.kind == kind]
+    assert len(told) == (words is not None)
+    assert all(str(words) in fault.sentence for fault in told)
 
 
 @pytest.mark.parametrize(
     ("workspace", "scale", "is_told"),
     [(0.21, 1.0, False), (0.19, 1.0, True), (0.19, 1.1, False), (0.11, 1.9, False)],
 )
-def test_motion_that_the_device_cannot_make_is_told(
-    tmp_path: Path, workspace: float, scale: float, is_told: bool
-) -> None:
+def test_far_motion_is_told(tmp_path: Path, workspace: float, scale: float, is_told: bool) -> None:
     text = mjcf(GOOD_OPTION, GOOD_CONTACT)
     motion = hand_rows([(0.5, (0.1, 0, 0)), (0.5, (-0.1, 0, 0))])
     faults = faults_of(written(tmp_path, text, motion), workspace=workspace, scale=scale)
@@ -266,6 +244,157 @@ def test_workspace_must_be_a_length(workspace: float) -> None:
         case_of(scene_path("point_mass"), workspace=workspace)
 
 
-def test_what_is_no_inertia_is_an_error_of_the_scene(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="nowhere"):
-        case_of(bench(tmp_path / "scene"), grip="nowhere")
+Capsys = pytest.CaptureFixture[str]
+
+STILL = "t,x,y,z\n0,0,0,0\n0.1,0,0,0\n"
+BALL = """<body name="tool" pos="0 0 0.05"><freejoint/><geom name="ball" size="0.01" mass="0.1"/>
+  <site name="grip"/></body>"""
+BRICKS = "".join(
+    f'<geom name="brick_{k}" type="box" size="0.01 0.01 0.01" pos="{0.05 * k} 0 -0.01"/>'
+    for k in range(3)
+)
+
+
+def change_of(kind: str, faults: tuple[Fault, ...]) -> Fault:
+    return next(fault for fault in faults if fault.kind == kind)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ['<geom size="0.01" pos="0 nan 0"/>', '<geom size="0.01" solref="NaN 1"/>'],
+    ids=["pos", "solref"],
+)
+def test_nan_is_refused_with_its_line(tmp_path: Path, words: str, capfd: Capsys) -> None:
+    scene = written(tmp_path, mjcf("\n", "\n", body=BALL, world=words))
+    with pytest.raises(SceneError, match=r"scene.xml, line 4: .* of <geom> is '.*'; write a n"):
+        read_scene(scene)
+    capfd.readouterr()  # MuJoCo's own warning
+
+
+def test_options_are_written_where_they_are_missing(tmp_path: Path) -> None:
+    faults = faults_of(written(tmp_path, mjcf(body=BALL), STILL))
+    changes = [change_of(kind, faults).change for kind in ("integrator", "time step")]
+    assert [change.split(" in <mujoco>")[0] for change in changes] == [
+        '<option integrator="discrete"/>',
+        '<option timestep="0.001"/>',
+    ]
+    # MuJoCo takes several of them
+    mended = mjcf(*(change.split(" in <mujoco>")[0] for change in changes), body=BALL)
+    assert not {"integrator", "time step"} & kinds(faults_of(written(tmp_path, mended, STILL)))
+
+
+def test_flag_joins_the_one_that_is_there(tmp_path: Path) -> None:
+    text = mjcf('<option>\n<flag energy="enable"/></option>', body=BALL)
+    fault = change_of("diagexact", faults_of(written(tmp_path, text, STILL)))
+    assert (fault.place.line, fault.change) == (2, 'diagexact="enable"')
+
+
+def test_one_line_mends_the_default_contact_of_many_geoms(tmp_path: Path) -> None:
+    fault = change_of(
+        "default contact",
+        faults_of(written(tmp_path, mjcf(GOOD_OPTION, body=BALL, world=BRICKS), STILL)),
+    )
+    line = fault.change.split("at once: ")[1].removesuffix(" in <default>")
+    mended = mjcf(GOOD_OPTION, f"<default>{line}</default>", body=BALL, world=BRICKS)
+    assert "default contact" not in kinds(faults_of(written(tmp_path, mended, STILL)))
+
+
+def test_floor_under_a_flex_is_not_called_idle(tmp_path: Path) -> None:
+    cloth = """<geom name="floor" type="plane" size="1 1 1"/><flexcomp name="cloth" type="grid"
+      count="3 3 1" spacing="0.02 0.02 0.02" pos="0 0 0.002" mass="0.1" radius="0.003" dim="2">
+      <edge equality="true"/></flexcomp>"""
+    scene = written(tmp_path, mjcf(GOOD_OPTION, body=BALL, world=cloth), STILL)
+    case = case_of(scene)
+    inventory = take_inventory(case.model, "grip", case.places, case.observation)
+    assert inventory.flexes == 1
+    assert not inventory.idle
+    draft = SceneVariant(case.source, "grip", Setting(case.coupling))
+    assert "floor" in witness(draft, case.motion).near_geoms
+
+
+@pytest.mark.parametrize(("mass", "is_told"), [(0.05, True), (20.0, False)])
+def test_limit_that_hardly_gives_is_not_soft(tmp_path: Path, mass: float, is_told: bool) -> None:
+    arm = f"""<body name="tool" gravcomp="1"><joint axis="0 0 1" range="-1 1"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="{mass}"/>
+      <site name="grip" pos="0.3 0 0"/></body>"""
+    text = mjcf('<compiler angle="radian"/>', GOOD_OPTION, GOOD_CONTACT, body=arm)
+    assert ("soft limit" in kinds(faults_of(written(tmp_path, text, STILL)))) == is_told
+
+
+def test_bare_lever_is_told_to_have_damping_and_then_creates_nothing(tmp_path: Path) -> None:
+    # joint friction, however little, keeps a tool from being rendered losslessly
+    lever = """<body name="tool" pos="0 0 0.1"><joint name="h" axis="0 1 0" frictionloss="1e-9"/>
+      <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01" mass="0.0356"/>
+      <site name="grip" pos="0.1 0 0"/></body>"""
+    fault = change_of(
+        "energy created", faults_of(written(tmp_path, mjcf(GOOD_OPTION, GOOD_CONTACT, body=lever)))
+    )
+    assert fault.place.element == "joint 'h'"
+    damping = fault.change.split(" or more")[0]
+    mended = lever.replace('name="h"', f'name="h" {damping}')
+    text = mjcf(GOOD_OPTION, GOOD_CONTACT, body=mended)
+    assert "energy created" not in kinds(faults_of(written(tmp_path, text)))
+
+
+def test_what_has_no_name_is_called_after_its_body() -> None:
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><geom size="1"/><body name="cup"><freejoint/><geom size="1"/>'
+        '<geom size="1"/><geom name="cup_geom" size="1"/></body></worldbody></mujoco>'
+    )
+    name_everything(spec)
+    assert [joint.name for joint in spec.joints] == ["cup_joint"]
+    assert [geom.name for geom in spec.geoms] == [
+        "world_geom",
+        "cup_geom_2",
+        "cup_geom_3",
+        "cup_geom",
+    ]
+
+
+def lean_by(
+    costs: list[float], taken: list[Simplification], folder: Path, patch: pytest.MonkeyPatch
+) -> lean.Lean:
+    """Searches a ball for what may go, at told costs: against itself, alone, then together."""
+    patch.setattr(lean, "_simplifications", lambda *_: taken)
+    told = iter(costs)
+    return lean.find_lean(
+        read_scene(written(folder, mjcf(GOOD_OPTION, GOOD_CONTACT, body=BALL))),
+        "grip",
+        Motion([0.0, 0.1], [(0, 0, 0)] * 2),
+        Setting(Coupling(2400.0, 0.5, 2.4, 5e-4)),
+        cost=lambda *_: (1.0, next(told, costs[-1])),
+    )
+
+
+def relax(draft: SceneVariant) -> bool:
+    draft.spec.option.tolerance *= 100.0
+    return True
+
+
+@pytest.mark.parametrize(("again", "is_taken"), [(1.0, False), (0.5, True)])
+def test_saving_that_is_gone_when_measured_again_is_noise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, again: float, is_taken: bool
+) -> None:
+    only = Simplification("tolerance", "the solver stops earlier", relax)
+    found = lean_by([1.0, 0.5, 0.5, again], [only], tmp_path, monkeypatch)
+    assert [trial.verdict for trial in found.alone] == [MAY_GO]
+    assert bool(found.together) == is_taken
+    assert found.result.cost == pytest.approx(again)
+    assert found.draft.spec.option.tolerance == pytest.approx(1e-6 if is_taken else 1e-8)
+
+
+def test_risky_change_is_taken_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    risky = Simplification("risky", "saves most", relax, loses=OTHER_MOTIONS)
+    plain = [Simplification(name, "loses nothing", relax) for name in ("some", "more")]
+    found = lean_by([1.0, 0.3, 0.8, 0.6, 0.5], [risky, *plain], tmp_path, monkeypatch)
+    assert [trial.name for trial in found.together] == ["more", "some", "risky"]
+
+
+@pytest.mark.parametrize(
+    ("option", "ending"), [("write", "xml"), ("table", "csv"), ("plot", "png")]
+)
+def test_missing_folder_is_told(tmp_path: Path, option: str, ending: str, capsys: Capsys) -> None:
+    target = tmp_path / "gone" / f"x.{ending}"
+    assert main(["check", "peg_in_hole", f"--{option}", str(target)]) == USAGE_ERROR
+    said = capsys.readouterr()
+    assert ("its folder does not exist" in said.err, said.out) == (True, "")

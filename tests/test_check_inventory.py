@@ -109,20 +109,13 @@ def test_constraint_rows_are_counted_by_kind(tmp_path: Path) -> None:
     assert rows["friction loss"] == (1, 1.0)
     assert rows["limit"] == (1, 1.0)  # zero is below its range
     assert rows["equality"] == (3, 3.0)
-
-
-def test_rows_of_a_cone_of_four_edges_are_four(tmp_path: Path) -> None:
-    text = ROWS.replace("elliptic", "pyramidal")
-    rows = inventory_of(written(tmp_path, text, HAND)).rows
-    assert rows is not None
-    assert rows["contact"] == (4, 4.0)
+    pyramid = written(tmp_path, ROWS.replace("elliptic", "pyramidal"), HAND)
+    assert (inventory_of(pyramid).rows or {})["contact"] == (4, 4.0)
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize("condim", [1, 3, 4])
-def test_stiffness_that_was_seen_is_force_over_depth_at_rest(
-    tmp_path: Path, cone: str, condim: int
-) -> None:
+def test_stiffness_seen_is_force_over_depth_at_rest(tmp_path: Path, cone: str, condim: int) -> None:
     text = ROWS.replace("elliptic", cone).replace("<geom solref", f'<geom condim="{condim}" solref')
     case = case_of(written(tmp_path, text, HAND))
     assert case.observation is not None
@@ -184,9 +177,7 @@ def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_influence_goes_through_equalities_and_tendons(
-    tmp_path: Path, joints: str, reached: set[str]
-) -> None:
+def test_tendons_and_equalities_influence(tmp_path: Path, joints: str, reached: set[str]) -> None:
     others = "".join(
         f'<body name="{name}" pos="{x} 0 0"><joint name="j{name}" type="slide"/>'
         f'<geom name="{name}" size="0.01" mass="0.1" contype="0" conaffinity="0"/>'
@@ -216,19 +207,6 @@ def test_without_a_motion_what_can_meet_counts_as_met(tmp_path: Path) -> None:
     assert counted.rows is None
     assert counted.met_pairs is None
     assert [each.place.element for each in counted.idle] == ["geom 'cap'"]
-
-
-def test_every_geom_is_found_on_its_line(tmp_path: Path) -> None:
-    scene = bench(tmp_path / "scene")
-    case = case_of(scene)
-    lines = {"floor": 13, "stop": 14, "shaft": 17, "cap": 18, "button": 6, "": 11, "block": 15}
-    for geom in range(case.model.ngeom):
-        place = case.places.geom(geom)
-        name = case.model.geom(geom).name
-        assert place.line == lines[name]
-        text = (scene.parent / place.file).read_text().splitlines()[place.line - 1]
-        assert "<geom" in text
-        assert name in text
 
 
 def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hapticbridge.device.transport import usb as usb_search
         (
             "falcon",
             "error: no device 'falcon' is plugged in (looked for 0403:cb48); 'hapticbridge "
-            "devices' lists what is",
+            "devices' lists connected",
         ),
         ("falcon:damping=-1", "error: damping = -1.0: must be a finite number >= 0 N s/m"),
         ("falcon:firmware=/no/image,damping=2", "error: firmware = '/no/image': cannot be read"),

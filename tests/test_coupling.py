@@ -173,7 +173,7 @@ def test_wrench_law_holds_for_any_coupling(
 def _with_world_frame_control(run: Run, samples: np.ndarray) -> Run:
     """Overwrites the control by the handle's velocity in the world frame, the obvious mistake."""
     state, row, data = run.binding.state, run.binding.row, run.scene.data
-    first = int(state["coupling_ctrl_adr"][0])
+    first = int(state["mj"]["coupling_ctrl_adr"][0])
     run.ticks = np.zeros(len(samples), TICK_DTYPE)
     steps = np.diff(samples["position"], axis=0, prepend=np.zeros((1, 3)))
     for k in range(len(samples)):

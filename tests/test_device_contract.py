@@ -184,6 +184,16 @@ def test_closing_twice_is_allowed(device: Device) -> None:
     device.close()
 
 
+@pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "stick"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_path: Path) -> None:
+    device = DEVICES[name](tmp_path)
+    device.start(PERIOD)
+    for axis in (0, 1):
+        with pytest.raises(DeviceError, match="that is not finite was not sent"):
+            device.write(np.where(np.arange(6) == axis, value, 0.0))
+
+
 def test_an_impossible_period_and_a_read_before_the_start_are_refused(device: Device) -> None:
     with pytest.raises(DeviceError, match="before it was started"):
         device.read(np.zeros(1, SAMPLE_DTYPE))
@@ -271,26 +281,16 @@ def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:
     assert words in str(error.value)
 
 
-def test_options_reach_the_device_and_the_specification_goes_before_the_code(
-    tmp_path: Path,
-) -> None:
-    device = open_device(
-        "simulated: damping = 5, delay=2,hand_mass=0.3", damping=7.0, force_limit=3
-    )
-    assert isinstance(device, SimulatedDevice)
-    assert (device.info.damping, device.info.force_limit) == (5.0, 3.0)
-    assert device.hand == Hand(mass=0.3)
-    free = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
-    assert isinstance(free, SimulatedDevice)
-    assert free.hand is None
-    assert free.info.duration is None
+def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Path) -> None:
+    both: Any = open_device("simulated: damping = 5, delay=2,hand_mass=0.3", damping=7.0)
+    assert (both.info.damping, both.hand) == (5.0, Hand(mass=0.3))
+    free: Any = open_device("simulated:hand=none", path=written(tmp_path / "hand.csv"))
+    assert (free.hand, free.info.duration) == (None, None)
     file = written(tmp_path / "a,b=c:d.csv")
-    guided = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
-    assert isinstance(guided, SimulatedDevice)
+    guided: Any = open_device(f"simulated:friction=0.1,path={file}", hand=Hand(stiffness=50.0))
     assert guided.info.duration == pytest.approx(0.195)
     assert guided.hand == Hand(stiffness=50.0)
-    limited = open_device(f"trajectory:{file}", torque_limit=0.1)
-    assert limited.info.torque_limit == 0.1
+    assert open_device(f"trajectory:{file}", torque_limit=0.1).info.torque_limit == 0.1
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 Array = NDArray[np.float64]
 
@@ -190,7 +192,7 @@ def test_a_free_device_coasts_and_loses_what_its_damper_takes() -> None:
     damping=st.sampled_from([0.0, 0.3, 3.0]),
 )
 @settings(max_examples=40)
-def test_friction_stops_a_free_device_where_the_closed_form_says(
+def test_friction_stops_it_right(
     period: float, kick: float, friction: float, damping: float
 ) -> None:
     m = 0.1
@@ -270,9 +272,7 @@ def stick_and_slip(
 
 
 @pytest.mark.parametrize(("period", "amplitude"), [(0.004, 5e-4), (0.15, 1e-2)])
-def test_friction_in_a_moving_hand_agrees_with_event_detection(
-    period: float, amplitude: float
-) -> None:
+def test_friction_in_a_moving_hand_is_that_of_events(period: float, amplitude: float) -> None:
     ticks = 60
     rng = np.random.default_rng(4)
     forces = rng.normal(0.0, 0.4, ticks).round(1) * (rng.random(ticks) > 0.6)
@@ -287,12 +287,7 @@ def test_friction_in_a_moving_hand_agrees_with_event_detection(
         drift = float(path[k + 1] - path[k]) / period
         expected.append(
             stick_and_slip(
-                expected[k],
-                float(forces[k]),
-                float(path[k]),
-                drift,
-                period=period,
-                friction=0.3,
+                expected[k], float(forces[k]), float(path[k]), drift, period=period, friction=0.3
             )
         )
     stuck = velocities[:, 0] == 0.0
@@ -306,9 +301,7 @@ def test_friction_in_a_moving_hand_agrees_with_event_detection(
 
 @given(friction=st.floats(0.01, 2.0), stiffness=st.floats(10.0, 300.0), speed=st.floats(1e-3, 1.0))
 @settings(max_examples=40)
-def test_a_pulling_hand_breaks_the_device_loose_when_the_closed_form_says(
-    friction: float, stiffness: float, speed: float
-) -> None:
+def test_pulling_hand_breaks_it_loose(friction: float, stiffness: float, speed: float) -> None:
     period, m = 0.1, 0.1
     hand = Hand(mass=0.0, damping=0.0, stiffness=stiffness)
     path = Motion([0.0, period], np.outer([0.0, speed * period], [1.0, 0.0, 0.0]))
@@ -483,3 +476,70 @@ def test_bad_parameters_are_refused(build: Callable[[], object], words: str) -> 
     with pytest.raises(DeviceError) as error:
         build()
     assert words in str(error.value)
+
+
+PERIOD = 1e-3
+
+
+def test_device_on_a_wall_is_the_theorys_loop_sample_by_sample() -> None:
+    coupling = Coupling(3000, 0.7, 1.0, 0.0)
+    loop = SampledLoop(coupling, PERIOD)
+    hand = WorstHand(1.9, 900.0, PERIOD, complex(loop.response(900.0)))
+    expected = loop.simulate(hand, 500)
+    device, sample = SimulatedDevice(hand=hand), np.zeros(1, SAMPLE_DTYPE)
+    device.start(PERIOD)
+    device.displace(np.array([1e-3, 0, 0, 0, 0, 0]))
+    before, wrench = 0.0, np.zeros(6)
+    for k in range(500):
+        device.read(sample)
+        x = sample[0]["position"][0]
+        wrench[0] = -(3000 * x + 0.7 / PERIOD * (x - before))
+        before = x
+        device.write(wrench)
+        assert x == pytest.approx(expected.handle[k], rel=1e-9, abs=1e-15)
+        assert -wrench[0] == pytest.approx(expected.force[k], rel=1e-9, abs=1e-9)
+
+
+def test_rotation_has_a_line_of_its_own_or_stands_still() -> None:
+    translation = WorstHand(2.0, np.pi / PERIOD, PERIOD)
+    rotation = WorstHand(2e-3, np.pi / PERIOD, PERIOD)
+    torque = np.array([0, 0, 0, 0, 0, 0.004])
+    turned = []
+    for second in (None, rotation):
+        device, sample = (
+            SimulatedDevice(hand=translation, rotational_hand=second),
+            np.zeros(1, SAMPLE_DTYPE),
+        )
+        device.start(PERIOD)
+        device.read(sample)
+        device.write(torque)
+        device.read(sample)
+        turned.append(2 * np.arctan2(sample[0]["quaternion"][3], sample[0]["quaternion"][0]))
+    # a damper alone turns by τ T/b
+    assert turned == pytest.approx([0.0, 0.004 * PERIOD / 2e-3], abs=1e-15)
+
+
+def test_worst_hand_of_another_period_is_refused() -> None:
+    with pytest.raises(DeviceError, match=r"tuned to a period of 0\.001 s, the loop's is 0\.002 s"):
+        SimulatedDevice(hand=WorstHand(2.0, 100.0, PERIOD)).start(2 * PERIOD)
+
+
+def test_worst_hand_takes_no_friction_and_needs_no_mixture() -> None:
+    with pytest.raises(DeviceError, match=r"friction = 0\.1 N"):
+        SimulatedDevice(hand=WorstHand(2.0, 100.0, PERIOD), friction=0.1)
+    with pytest.raises(DeviceError, match="rotational_hand"):
+        SimulatedDevice(hand=Hand(), rotational_hand=WorstHand(2.0, 100.0, PERIOD))
+
+
+def test_a_device_is_displaced_only_between_start_and_first_sample() -> None:
+    device, sample = SimulatedDevice(hand=None), np.zeros(1, SAMPLE_DTYPE)
+    knock = np.array([1e-3, 0, 0, 0, 0, 0.1])
+    with pytest.raises(DeviceError, match="after its start"):
+        device.displace(knock)
+    device.start(PERIOD)
+    device.displace(knock)
+    device.read(sample)
+    assert sample[0]["position"] == pytest.approx([1e-3, 0, 0], abs=1e-18)
+    assert sample[0]["quaternion"] == pytest.approx([np.cos(0.05), 0, 0, np.sin(0.05)], abs=1e-15)
+    with pytest.raises(DeviceError, match="before its first sample"):
+        device.displace(knock)

@@ -7,8 +7,13 @@ import pytest
 from engine_stand_in import StandIn
 from engine_tasks import AMPLITUDE, COUPLING, MASS, driven_error, driven_mass, driven_path, opened
 
-from hapticbridge.lab.engines import Body, Pose, Task, composed
-from hapticbridge.lab.engines.base import Engine
+from hapticbridge.lab.engines.base import (
+    Body,
+    Engine,
+    Pose,
+    Task,
+    composed,
+)
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.theory.rigid_body import drive_mass
 

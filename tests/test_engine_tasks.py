@@ -14,19 +14,21 @@ from engine_tasks import COUPLING
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.engines import (
+    base,
+    ode,
+)
+from hapticbridge.lab.engines.base import (
+    ENGINES,
     Body,
     Pose,
     Shape,
     Task,
     Velocity,
     available_engines,
-    base,
     composed,
-    engine_names,
-    ode,
     open_engine,
-    task_from_scene,
 )
+from hapticbridge.lab.engines.from_scene import task_from_scene
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.scene import Scene, load_scene
 
@@ -260,7 +262,7 @@ def test_a_handle_without_motion_rests_at_the_grip() -> None:
 def test_every_engine_is_available_or_says_in_a_sentence_why_not() -> None:
     found = available_engines()
     assert "mujoco" in found.available
-    assert {*found.available, *found.missing} == set(engine_names())
+    assert {*found.available, *found.missing} == set(ENGINES)
     assert all(engine.name == name for name, engine in found.available.items())
     assert all("not installed" in sentence for sentence in found.missing.values())
 

@@ -219,8 +219,8 @@ def test_a_device_that_does_not_turn_is_not_damped_for_the_rounding_of_its_turn(
         return (0, 0, 0, turn[3], *turn[:3])
 
     def owing(bridge: Bridge, _: int) -> None:
-        state = bridge.session.kernel.bound.state
-        state["account"] = state["axis_account"] = 1e-3
+        observer = bridge.session.kernel.bound.state["observer"]
+        observer["observed_energy"] = observer["axis_energy"] = 1e-3
 
     path, device = tmp_path / "run.mcap", ScriptedDevice(tilted, damping=0.5)
     with fast("point_mass", device, recording=path, controller="damper") as bridge:
@@ -230,45 +230,52 @@ def test_a_device_that_does_not_turn_is_not_damped_for_the_rounding_of_its_turn(
     assert injected.any() == is_turning
 
 
+def moving_state() -> np.ndarray:
+    """Returns a state in its second tick, with a credit limit of 50 mJ."""
+    state = np.zeros(1, STATE_DTYPE)
+    run = state["run"]
+    run["period"], run["scale"], run["force_scale"], state["loop"]["tick"] = T, 1.0, 1.0, 1
+    state["observer"]["energy_credit_limit"] = 0.05
+    return state
+
+
 @pytest.mark.parametrize("axis", range(6))
 def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus(axis: int) -> None:
-    state = np.zeros(1, STATE_DTYPE)
-    state["period"], state["scale"], state["force_scale"], state["tick"] = T, 1.0, 1.0, 1
-    state["surplus"] = 0.05
-    state["wrench_on_device"][0, axis] = -2.0
+    state = moving_state()
+    observer = state["observer"]
+    state["loop"]["wrench_on_device"][0, axis] = -2.0
 
     def move(by: float) -> None:
         motion = np.zeros(6)
         motion[axis] = by
         x, y, z, rx, ry, rz = motion.tolist()
-        observe_energy(state, (x, y, z), (rx, ry, rz), T)
+        observe_energy(state[0], (x, y, z), (rx, ry, rz), T)
 
     for _ in range(1000):
         move(1e-3)  # the hand pushes in 2 mJ each time
     expected = np.zeros(6)
     expected[axis] = -0.05
-    assert state["account"][0] == -0.05
-    assert state["axis_account"][0].tolist() == expected.tolist()
-    assert state["given"][0] == pytest.approx(-2.0)
+    assert observer["observed_energy"][0] == -0.05
+    assert observer["axis_energy"][0].tolist() == expected.tolist()
+    assert observer["energy_to_device"][0] == pytest.approx(-2.0)
     for _ in range(30):
         move(-1e-3)
-    assert state["account"][0] == pytest.approx(0.01)
-    assert state["axis_account"][0, axis] == pytest.approx(0.01)
+    assert observer["observed_energy"][0] == pytest.approx(0.01)
+    assert observer["axis_energy"][0, axis] == pytest.approx(0.01)
 
 
 def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either() -> None:
-    state = np.zeros(1, STATE_DTYPE)
-    state["period"], state["scale"], state["force_scale"], state["tick"] = T, 1.0, 1.0, 1
-    state["surplus"] = 0.05
+    state = moving_state()
+    observer = state["observer"]
     nothing = (0.0, 0.0, 0.0)
     for burnt in (1.0, 2.0, 3.0):
-        state["environment_energy"] = -burnt
-        observe_energy(state, nothing, nothing, T)
-    assert state["excess"][0] == -0.05
-    state["environment_energy"] += 0.06
-    state["slack"] += 0.002
-    observe_energy(state, nothing, nothing, T)
-    assert state["excess"][0] == pytest.approx(0.008)
+        state["energy"]["environment_energy"] = -burnt
+        observe_energy(state[0], nothing, nothing, T)
+    assert observer["generated_energy"][0] == -0.05
+    state["energy"]["environment_energy"] += 0.06
+    state["energy"]["slack"] += 0.002
+    observe_energy(state[0], nothing, nothing, T)
+    assert observer["generated_energy"][0] == pytest.approx(0.008)
 
 
 def test_the_audits_capped_sum_is_the_recursion() -> None:

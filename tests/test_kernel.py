@@ -53,7 +53,7 @@ def test_compiled_loop_equals_the_live_one_bit_for_bit(name: str, substeps: int)
     one = live(load_scene(name), samples, substeps=substeps)
     other = fast(load_scene(name), samples, substeps=substeps)
     assert one.ticks.tobytes() == other.ticks.tobytes()
-    assert one.binding.state["slack"] == other.binding.state["slack"]
+    assert one.binding.slack == other.binding.slack
 
 
 def test_compiled_loop_agrees_also_where_inputs_change_between_its_calls() -> None:
@@ -180,9 +180,9 @@ def test_diverged_scene_gives_zero_wrench_and_a_trip(value: float) -> None:
     mujoco.mj_step(scene.model, scene.data)
     scene.data.qpos[0] = value
     assert after_step(binding.state, binding.row, 0) == BAD_RESULT
-    assert not binding.state["wrench_on_device"].any()
-    assert binding.state["flags"] == TickFlag.TRIP
-    assert binding.state["tick"] == 30  # the tick is not counted
+    assert not binding.wrench_on_device.any()
+    assert binding.state["loop"]["flags"] == TickFlag.TRIP
+    assert binding.state["loop"]["tick"] == 30  # the tick is not counted
     assert (binding.row["wrench_on_tool"] == recorded["wrench_on_tool"]).all()
     assert len(run.ticks) == 30
 
@@ -253,7 +253,8 @@ def test_handle_follows_the_device_through_scale_axes_and_offset() -> None:
     )
     q = turning.as_quat(scalar_first=True)
     here, orientation = handle_pose(
-        binding.state,
+        binding.state["run"][0],
+        binding.state["pose"][0],
         tuple(position.tolist()),
         tuple(q.tolist()),
     )
@@ -264,7 +265,7 @@ def test_handle_follows_the_device_through_scale_axes_and_offset() -> None:
     assert rotation(np.array(orientation)).as_matrix() == pytest.approx(
         expected_orientation, abs=1e-14
     )
-    start = binding.state[0]
+    start = binding.state["pose"][0]
     assert start["handle_position"] == pytest.approx(origin[:3], abs=1e-15)
 
 
@@ -325,11 +326,11 @@ def test_record_holds_the_tick_the_sample_and_the_pose_after_the_step() -> None:
     assert (run.ticks["tool_position"] == np.array(poses)).all()
     assert (run.ticks["tool_quaternion"][:, 0] >= 0).all()
     assert (run.ticks["tool_position"][-1] == run.scene.data.qpos[:3]).all()
-    state = run.binding.state
+    loop = run.binding.state["loop"]
     force = np.linalg.norm(run.ticks["wrench_on_tool"][:, :3], axis=1)
     torque = np.linalg.norm(run.ticks["wrench_on_tool"][:, 3:], axis=1)
-    assert state["peak_force"][0] == pytest.approx(force.max(), rel=1e-15)
-    assert state["peak_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
+    assert loop["peak_force"][0] == pytest.approx(force.max(), rel=1e-15)
+    assert loop["peak_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
 
 
 def test_publish_writes_one_record_and_refuses_a_full_ring() -> None:

@@ -10,11 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 from map_runs import NEVER, recorded_and_audited
-from map_tables import Row, without_rows, written
+from map_tables import Row, written
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.errors import StudyError
 from hapticbridge.lab.closed_loop import PARTS, Timing
 from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
 from hapticbridge.lab.maps.rate import (
@@ -31,7 +30,6 @@ from hapticbridge.lab.maps.rate import (
     WALL_MASS,
     evaluate,
     finite_hand,
-    read,
     unevenness,
     wall_limit,
     worst_hand,
@@ -230,7 +228,7 @@ FULL = [
 
 
 def test_what_is_read_is_what_the_table_says() -> None:
-    found = read(written(FULL))
+    found = RATE.read(written(FULL))
     none, five = (found.boundary["methods"]["implicit"][delay] for delay in ("0", "5"))
     (lossless,) = found.boundary["methods"]["lossless"].values()
     assert lossless["predicted"] == pytest.approx([4000, 2000], rel=1e-4)
@@ -247,19 +245,10 @@ def test_what_is_read_is_what_the_table_says() -> None:
         assert free["at_mean"] == pytest.approx([4000, 4000])
         assert free["at_balanced"] == pytest.approx([4000, 4000 / 1.5])
         assert free["at_longest"] == pytest.approx([1000, 1000])
-    said = found.paragraph
-    assert "within 1.2e+02 % of the bound" in said
-    assert "T = 1 to 2 ms" in said
-    assert "to the power 0.000" in said or "to the power -0.000" in said
-    assert said.count("at 0.5 a free device keeps 75 % of its stiffness (3000 N/m)") == 2
-    assert said.count("2b ΣT/ΣT² = 2667 by the balance of energy, 4000 at the mean") == 2
-    assert said.count("and 1000 at the longest") == 2
-    assert said.count("an ordinary hand is stable up to 9000 N/m") == 2
+    assert "'implicit': without a delay K goes with T to the power" in found.paragraph
+    assert found.paragraph.count("with no hand the wall is stable up to 3000 N/m") == 2
+    assert "'compensated'" not in found.paragraph
     # K T/(2b): 0.55 and 1.1, their mean; theory at a delay of 5 is 0.526
-    assert "'implicit' bears, of K = 2b/T, 82 % without a delay, 13 % at 5; without" in said
-    assert "0.000; delay of 1, 2, 3, 4 samples: no point could be computed. 'comp" in said
-    assert "'compensated' at even ticks: no point could be computed. 'lossless' bears" in said
-    assert "2b/T, 75 % without a delay; without a delay K was found to go with T to the" in said
 
 
 def test_what_failed_is_left_out_and_named() -> None:
@@ -267,49 +256,20 @@ def test_what_failed_is_left_out_and_named() -> None:
         (at, "SceneError: no") if at["what"] == "jitter" or at["hand"] == "no hand" else (at, got)
         for at, got in FULL
     ]
-    found = read(written([row for row in rows if row[0]["delay"] != 5]))
+    found = RATE.read(written([row for row in rows if row[0]["delay"] != 5]))
     assert set(found.boundary["methods"]["implicit"]) == {"0"}
     assert found.boundary["uneven"]["jitter"] == {}
     assert set(found.boundary["uneven"]["drops"]) == {"ordinary hand"}
-    said = found.paragraph
-    assert "; delay of 1, 2, 3, 4, 5 samples: no point could be computed" in said
-    assert "share of T: no hand: no point could be computed; ordinary hand: no point" in said
-    assert "lost: no hand: no point could be computed; an ordinary hand is stable up to" in said
-    only = read(written([row for row in FULL if row[0]["what"] == "jitter"]))
+    only = RATE.read(written([row for row in FULL if row[0]["what"] == "jitter"]))
     assert only.boundary["methods"] == {name: {} for name in METHODS_SHOWN}
-    assert only.paragraph.startswith("Even ticks: no point could be computed")
 
 
 def test_a_search_without_an_end_is_no_comparison() -> None:
     ends = [even(1e-3, 0, 0.0), even(2e-3, 0, float("inf"))]
-    found = read(written([*ends, uneven("drops", "no hand", 0, 0.0)]))
+    found = RATE.read(written([*ends, uneven("drops", "no hand", 0, 0.0)]))
     assert found.boundary["methods"]["implicit"]["0"]["slope"] is None
-    some = read(written([*ends, even(1e-3, 0, 700.0), even(4e-3, 0, 175.0)]))
+    some = RATE.read(written([*ends, even(1e-3, 0, 700.0), even(4e-3, 0, 175.0)]))
     assert some.boundary["methods"]["implicit"]["0"]["slope"] == pytest.approx(-1)
-    assert "a free device bears (0 N/m)" in found.paragraph
-
-
-def test_a_table_without_a_computed_row_is_refused() -> None:
-    with pytest.raises(StudyError, match="map 'rate': the table has no rows"):
-        read(without_rows(written(FULL)))
-    with pytest.raises(StudyError, match="no point could be computed; first: SceneError: no"):
-        read(written([(at, "SceneError: no") for at, _ in FULL]))
-
-
-def evaluate_but_not_jitter(at: Point) -> dict[str, float]:
-    if at["what"] == "jitter":
-        raise StudyError("no jitter today")
-    return {"limit": 1000.0} | unevenness([float(at["period"])])
-
-
-def test_points_that_fail_say_why_and_do_not_stop_the_map(tmp_path: Path) -> None:
-    broken = replace(RATE, evaluate=evaluate_but_not_jitter)
-    with ThreadPoolExecutor(1) as executor:
-        files = run_map(broken, tmp_path, points=20, executor=executor)
-    assert files.failed == 4
-    assert "share of T: no hand: no point could be computed" in files.finding.paragraph
-    assert files.table.read_text(encoding="utf-8").count("StudyError: no jitter today") == 4
-    assert files.picture.stat().st_size > 10_000
 
 
 def few(count: int) -> list[Point]:
@@ -341,4 +301,3 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     ]
     free = files.finding.boundary["uneven"]["drops"]["no hand"]
     assert free["at_longest"][-1] < free["measured"][-1] < free["at_mean"][-1]
-    assert "within" in files.finding.paragraph

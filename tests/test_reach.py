@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast
-from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.profile import SHIPPED, Profile, profile_named, profiles
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 
@@ -51,7 +51,7 @@ def clutched(path: Path, reach: float | None, asked: float | None = None, **opti
 def test_a_device_that_knows_its_reach_is_let_go_beyond_it(tmp_path: Path, scale: float) -> None:
     """It counts the device's own metres: a scale moves the handle, not the stops."""
     path = tmp_path / "run.mcap"
-    summary, distance, is_clutched = clutched(path, REACH, scale=scale)
+    summary, distance, is_clutched = clutched(path, REACH, workspace=Workspace(scale=scale))
     assert is_clutched.tolist() == (distance > REACH).tolist()
     assert 100 < np.count_nonzero(is_clutched) < 600
     assert summary.reach == REACH
@@ -104,24 +104,3 @@ def test_no_shipped_reach_cuts_what_the_maker_calls_the_workspace() -> None:
         reach, box = profile.quantities["reach"].value, profile.quantities["workspace"].value
         assert isinstance(reach, float) and isinstance(box, tuple)
         assert 0 <= reach - 0.5 * math.hypot(*box) < 1e-4
-
-
-def test_the_command_line_says_where_the_reach_ends(
-    call: Called, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    reach: dict[str, float | None] = {"device": REACH}
-    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: device(reach["device"]))
-    short = ("run", "point_mass", "--fast", "--duration", "0.05")
-    code, text, said = call(*short, "--record", str(tmp_path / "run.mcap"))
-    assert code == 0
-    assert "20 mm; beyond, no handle and no force" in text
-    assert "20 mm from its middle the device is at the end of its reach" in " ".join(said.split())
-    code, text, said = call(*short, "--json")
-    assert json.loads(text)["reach"] == REACH
-    for options in (("--reach-limit", "inf"), ()):
-        reach["device"] = REACH if options else None
-        code, text, said = call(*short, *options)
-        assert (code, "reach" in text, "reach" in said) == (0, False, False)
-    code, _, said = call(*short, "--reach-limit", "0")
-    assert (code, said.count("\n")) == (2, 1)
-    assert "reach limit is 0.0 m; it must be > 0" in said

@@ -39,7 +39,6 @@ from hapticbridge.realtime.realtime import (
     CONTAINER,
     PRIORITY,
     SHELL,
-    SPARE,
     rate_for,
 )
 from hapticbridge.recording import read_recording
@@ -158,7 +157,7 @@ def test_processes_started_meanwhile_are_ordinary_ones() -> None:
 
 
 @pytest.mark.parametrize(("user", "remedy"), [(1000, SHELL), (0, CONTAINER)])
-def test_what_is_refused_is_said_with_the_command_that_grants_it(
+def test_refusal_is_said_with_its_remedy(
     refusing: Library, monkeypatch: pytest.MonkeyPatch, user: int, remedy: str
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: user)
@@ -192,7 +191,7 @@ def test_a_lower_limit_on_priority_is_used(monkeypatch: pytest.MonkeyPatch, limi
 @pytest.mark.parametrize(
     ("limit", "flags"), [(resource.RLIM_INFINITY, 3), (1 << 50, 1), (1 << 23, 3)]
 )
-def test_memory_to_come_is_locked_only_where_no_limit_can_fail_it(
+def test_memory_to_come_is_locked_if_unlimited(
     library: Library, monkeypatch: pytest.MonkeyPatch, limit: int, flags: int
 ) -> None:
     """This process has more than 8 MB already: if it may lock that, the limit does not bind it."""
@@ -232,7 +231,7 @@ def test_a_core_that_is_not_there_is_said() -> None:
         (None, ()),
     ],
 )
-def test_a_core_that_is_refused_is_said_with_what_gives_it(
+def test_a_refused_core_is_told_with_remedy(
     monkeypatch: pytest.MonkeyPatch, code: int | None, words: tuple[str, ...]
 ) -> None:
     def refuse(_process: int, _cores: set[int]) -> None:
@@ -263,9 +262,7 @@ def test_who_wants_real_time() -> None:
         wants_real_time(True, simulated, is_real=False)
 
 
-def test_a_run_goes_on_without_the_permission_says_so_once_and_records_it(
-    refusing: Library, tmp_path: Path
-) -> None:
+def test_a_run_without_permission_says_so_and_records_it(refusing: Library, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Bridge("point_mass", ScriptedDevice(sway), realtime=True, recording=path) as bridge:
         with pytest.warns(UserWarning, match="real time") as warned:
@@ -307,7 +304,7 @@ def heap_reader() -> Callable[[], int]:
 
 @pytest.mark.parametrize(("pipelined", "controller"), [(False, "off"), (True, "damper")])
 @pytest.mark.parametrize("watched", ["by nobody", "by the recorder", "by recorder and viewer"])
-def test_ten_thousand_ticks_allocate_nothing_that_stays(
+def test_ticks_allocate_none(
     tmp_path: Path, pipelined: bool, controller: str, watched: str
 ) -> None:
     """Python's own numbers come and go; a tick that keeps one more object would show 10 000."""
@@ -352,44 +349,38 @@ def test_percentiles_are_latenesses_that_were_seen() -> None:
         lateness_of([], 0)
 
 
-def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others() -> None:
+def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """No step fits into a microsecond, every one of a point mass into a second."""
     scene, method = load_scene("point_mass"), METHODS["implicit"]
     with fast(scene, method="implicit") as bridge:
         coupling = bridge.setup.coupling
     prepare(scene, coupling, 1e-3, 1, method)
-    start = scene.data.qpos.copy(), scene.data.time, scene.data.qacc_warmstart.copy()
+    state = ("qpos", "time", "qacc_warmstart")
+    start = [np.copy(getattr(scene.data, name)) for name in state]
     with pytest.raises(SceneError, match=r"could hold about \S+ Hz"):
         check_pace(scene, method, 1e-9, 1, is_real=True)
     with pytest.warns(UserWarning, match=r"could hold about \S+ Hz"):
         check_pace(scene, method, 1e-9, 1, is_real=False)
     check_pace(scene, method, 1.0, 1, is_real=True)
-    for before, after in zip(
-        start, (scene.data.qpos, scene.data.time, scene.data.qacc_warmstart), strict=True
-    ):
-        np.testing.assert_array_equal(before, after)
-
-
-@pytest.mark.parametrize(("needed", "held"), [(6e-3, "130 Hz"), (1.04e-3, "770 Hz")])
-def test_the_rate_that_is_offered_is_a_plain_number(
-    monkeypatch: pytest.MonkeyPatch, needed: float, held: str
-) -> None:
-    monkeypatch.setattr(pace, "step_time", lambda *_: needed)
-    with pytest.raises(SceneError, match=f"needs .* ms .* could hold about {held}: "):
-        check_pace(load_scene("point_mass"), METHODS["implicit"], 1e-3, 1, is_real=True)
-
-
-def test_the_rate_that_is_offered_leaves_a_fifth_of_the_period() -> None:
-    assert rate_for(1e-3) == pytest.approx(SPARE / (1e-3 + BESIDE_THE_STEP))
-    assert (1e-3 + BESIDE_THE_STEP) * rate_for(1e-3) == pytest.approx(0.8)
-
-
-def test_a_bridge_refuses_before_the_device_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, before in zip(state, start, strict=True):
+        np.testing.assert_array_equal(before, getattr(scene.data, name))
+    # before the device is held
     device = ScriptedDevice(sway)
     device.info = replace(device.info, is_real=True)
     started: list[float] = []
     monkeypatch.setattr(device, "start", started.append)
-    bridge = Bridge("point_mass", device, rate=1e6, realtime=False)
     with pytest.raises(SceneError, match="could hold"):
-        bridge.__enter__()
+        Bridge("point_mass", device, rate=1e6, realtime=False).__enter__()
     assert not started
+
+
+@pytest.mark.parametrize(("needed", "held"), [(6e-3, "130 Hz"), (1.04e-3, "770 Hz")])
+def test_offered_rate_leaves_a_fifth_of_the_period_and_is_a_plain_number(
+    monkeypatch: pytest.MonkeyPatch, needed: float, held: str
+) -> None:
+    assert (needed + BESIDE_THE_STEP) * rate_for(needed) == pytest.approx(0.8)
+    monkeypatch.setattr(pace, "step_time", lambda *_: needed)
+    with pytest.raises(SceneError, match=f"needs .* ms .* could hold about {held}: "):
+        check_pace(load_scene("point_mass"), METHODS["implicit"], 1e-3, 1, is_real=True)

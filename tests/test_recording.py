@@ -7,9 +7,11 @@ import io
 import json
 import resource
 import shutil
+import struct
 import sys
 import tempfile
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +27,9 @@ from recording_cases import EPOCH, FILES, META, chunk_ends, random_rows, same, w
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.recording import Attachment, RecordingWriter, read_recording, repair
+from hapticbridge.recording import Attachment, Recording, RecordingWriter, read_recording, repair
 from hapticbridge.recording import format as layout
-from hapticbridge.recording.reader import _join
+from hapticbridge.recording.container import DamageError, Fields
 from hapticbridge.recording.writer import RESERVE
 
 
@@ -41,9 +43,7 @@ from hapticbridge.recording.writer import RESERVE
     data=st.binary(max_size=50),
 )
 @settings(max_examples=60)
-def test_any_record_metadata_and_attachment_survive_the_file(
-    records: list[bytes], meta: dict[str, str], data: bytes
-) -> None:
+def test_any_content_survives(records: list[bytes], meta: dict[str, str], data: bytes) -> None:
     rows = np.frombuffer(b"".join(records), TICK_DTYPE)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "run.mcap"
@@ -109,25 +109,17 @@ def test_schema_lists_every_field_with_its_type() -> None:
 
 
 def test_event_of_a_trip_is_written_whatever_it_holds() -> None:
-    event = {
-        "event": "trip",
-        "force": float("nan"),
-        "pose": np.array([1.0, np.inf]),
-        "count": np.int64(3),
-        "is_hard": np.bool_(True),
-        "deep": {"tuple": (1, None)},
-        "object": Path("a"),
+    held = {
+        "force": (float("nan"), "nan"),
+        "pose": (np.array([1.0, np.inf]), [1.0, "inf"]),
+        "count": (np.int64(3), 3),
+        "is_hard": (np.bool_(True), True),
+        "deep": ({"tuple": (1, None)}, {"tuple": [1, None]}),
+        "object": (Path("a"), "a"),
     }
-    assert json.loads(layout.event_payload(event, 5)) == {
-        "event": "trip",
-        "force": "nan",
-        "pose": [1.0, "inf"],
-        "count": 3,
-        "is_hard": True,
-        "deep": {"tuple": [1, None]},
-        "object": "a",
-        "time_ns": 5,
-    }
+    event = {"event": "trip", **{name: given for name, (given, _) in held.items()}}
+    written = {"event": "trip", **{name: read for name, (_, read) in held.items()}, "time_ns": 5}
+    assert json.loads(layout.event_payload(event, 5)) == written
 
 
 def test_repair_keeps_all_that_is_left_and_makes_it_whole(whole: Path, tmp_path: Path) -> None:
@@ -173,14 +165,6 @@ def test_whole_chunks_reach_the_file_before_it_is_closed(tmp_path: Path) -> None
     assert read_recording(path).ticks.size == 1000
 
 
-def test_runs_of_records_are_let_go_as_they_are_joined() -> None:
-    """A file read into memory would be there twice at the end: 0.5 GB of ten minutes at 1 kHz."""
-    rows = random_rows(10)
-    runs = [rows[:3], rows[3:3], rows[3:]]
-    assert _join(runs).tobytes() == rows.tobytes()
-    assert runs == []
-
-
 def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: Path) -> None:
     """Its index of chunks waits on disk; as the library keeps it, 44 chunks take 40 kB."""
     rows, path = random_rows(3000), tmp_path / "run.mcap"
@@ -207,9 +191,7 @@ def test_memory_of_the_writer_does_not_grow_with_the_length_of_a_run(tmp_path: P
     assert path.read_bytes()[ends[-1][0]] == Opcode.MESSAGE_INDEX
 
 
-def test_an_index_that_finds_no_room_ends_the_recording_in_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_index_without_room_ends_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = Path("/dev/full")
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full.open("wb", buffering=0))
     writer = RecordingWriter(tmp_path / "run.mcap", META, FILES, EPOCH)
@@ -220,9 +202,7 @@ def test_an_index_that_finds_no_room_ends_the_recording_in_a_sentence(
     assert recording.ticks.size > 0
 
 
-def test_a_folder_that_takes_no_other_file_still_takes_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folder_for_one_file_suffices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = tempfile.TemporaryFile
 
     def elsewhere(dir: Path | None = None, **options: Any) -> Any:  # noqa: A002
@@ -264,9 +244,7 @@ def mcap_with(topic: str, schema: str, text: bytes) -> bytes:
         (mcap_with("/tick", "hapticbridge/msg/Tick", b"int64 tick"), "has other fields"),
     ],
 )
-def test_file_that_is_no_recording_is_refused_in_one_sentence(
-    tmp_path: Path, content: bytes, reason: str
-) -> None:
+def test_file_no_recording_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=reason) as refusal:
@@ -275,37 +253,32 @@ def test_file_that_is_no_recording_is_refused_in_one_sentence(
     assert "\n" not in str(refusal.value)
 
 
-def test_path_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    for path, reason in (
+def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
+    path, meta, files = tmp_path / "run.mcap", META, FILES
+    wrong: Any = {"a": 3}
+    for place, about, attached, words in (
+        (tmp_path / "none" / "run.mcap", meta, files, r"the folder .* does not exist"),
+        (tmp_path, meta, files, "Is a directory"),
+        (Path("/dev/full"), meta, files, "No space left"),
+        (path, meta, (*files, files[2]), "two attachments are named 'empty'"),
+        (path, {"a": "\udc80"}, files, "valid Unicode"),
+        (path, wrong, files, "must be text, not 3"),
+    ):
+        with pytest.raises(RecordingError, match=words):
+            RecordingWriter(place, about, attached, EPOCH)
+    assert not path.exists()
+    for place, words in (
         (tmp_path / "none.mcap", "No such file"),
         (tmp_path, "it is a folder"),
         (Path("/dev/null"), "not a regular file"),
         (tmp_path / "a\0b", "null"),
     ):
-        with pytest.raises(RecordingError, match=reason):
-            read_recording(path)
-
-
-def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"the folder .* does not exist"):
-        RecordingWriter(tmp_path / "none" / "run.mcap", META, (), EPOCH)
-    with pytest.raises(RecordingError, match="Is a directory"):
-        RecordingWriter(tmp_path, META, (), EPOCH)
-    with pytest.raises(RecordingError, match="No space left"):
-        RecordingWriter("/dev/full", META, (), EPOCH)
-    with pytest.raises(RecordingError, match="two attachments are named 'empty'"):
-        RecordingWriter(tmp_path / "run.mcap", META, (*FILES, FILES[2]), EPOCH)
-    with pytest.raises(RecordingError, match="valid Unicode"):
-        RecordingWriter(tmp_path / "run.mcap", {"a": "\udc80"}, (), EPOCH)
-    with pytest.raises(RecordingError, match="must be text, not 3"):
-        RecordingWriter(tmp_path / "run.mcap", {"a": 3}, (), EPOCH)  # type: ignore[dict-item]
-    assert not (tmp_path / "run.mcap").exists()
+        with pytest.raises(RecordingError, match=words):
+            read_recording(place)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="room can be claimed on Linux alone")
-def test_room_for_the_end_is_claimed_ahead_and_given_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_room_for_the_end_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.mcap"
     writer = RecordingWriter(path, META, FILES, EPOCH)
     writer.write_ticks(np.zeros(1000, TICK_DTYPE))
@@ -337,3 +310,224 @@ def test_a_file_that_is_being_recorded_to_is_not_taken_over(tmp_path: Path) -> N
     assert len(read_recording(path).ticks) == 5
     RecordingWriter(path, {}, (), 0).close()
     assert len(read_recording(path).ticks) == 0
+
+
+def rewritten(path: Path, output: Path, change: Callable[[str, Any], Any]) -> None:
+    """Copies a recording with the library, changed, checksums anew, the old digest kept."""
+    with path.open("rb") as source, output.open("wb") as target:
+        reader, writer = SeekingReader(source), Writer(target)
+        summary = reader.get_summary()
+        assert summary is not None
+        writer.start()
+        for metadata in reader.iter_metadata():
+            kind = "metadata" if metadata.name == "hapticbridge" else "other"
+            writer.add_metadata(metadata.name, change(kind, dict(metadata.metadata)))
+        for item in reader.iter_attachments():
+            given = (item.name, item.media_type, bytearray(item.data))
+            writer.add_attachment(0, 0, *change("attachment", given))
+        ids = {"/foreign": writer.register_channel("/foreign", "json", 0)}
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            known = writer.register_schema(schema.name, schema.encoding, schema.data)
+            ids[channel.topic] = writer.register_channel(
+                channel.topic, channel.message_encoding, known
+            )
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            data = change(channel.topic, bytearray(message.data))
+            writer.add_message(ids[channel.topic], message.log_time, bytes(data), message.log_time)
+            writer.add_message(ids["/foreign"], message.log_time, b"{}", message.log_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def test_rewriting_with_foreign_channels_keeps_the_digest(whole: Path, tmp_path: Path) -> None:
+    rewritten(whole, tmp_path / "run.mcap", lambda kind, content: content)
+    recording = read_recording(tmp_path / "run.mcap")
+    assert same(recording.ticks, random_rows(1500))
+    assert recording.digest == recording.computed_digest == read_recording(whole).digest
+    assert recording.problems == ()
+
+
+def first_call(kind: str, edit: Callable[[Any], Any]) -> Callable[[str, Any], Any]:
+    remaining = [True]
+
+    def change(found: str, content: Any) -> Any:
+        if found == kind and remaining:
+            remaining.clear()
+            return edit(content)
+        return content
+
+    return change
+
+
+def flipped(position: int) -> Callable[[Any], Any]:
+    def edit(data: bytearray) -> bytearray:
+        data[position] ^= 1
+        return data
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("kind", "edit"),
+    [
+        ("metadata", lambda meta: {**meta, "period_s": "0.0010"}),
+        ("metadata", lambda meta: {**meta, "extra": ""}),
+        ("metadata", lambda meta: {k: v for k, v in meta.items() if k != "method"}),
+        ("metadata", lambda meta: {**meta, "method": meta["µ"], "µ": meta["method"]}),
+        ("attachment", lambda item: (item[0], item[1], item[2] + b" ")),
+        ("attachment", lambda item: (item[0] + "l", item[1], item[2])),
+        ("attachment", lambda item: (item[0], item[1] + "l", item[2])),
+        ("/event", lambda data: data.replace(b"start", b"stop!")),
+        *(("/tick", flipped(position)) for position in (4, 11, 77, 200, 403)),
+    ],
+)
+def test_digest_tells_any_change_although_all_checksums_are_right(
+    whole: Path, tmp_path: Path, kind: str, edit: Callable[[Any], Any]
+) -> None:
+    rewritten(whole, tmp_path / "run.mcap", first_call(kind, edit))
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.problems == ()
+    assert recording.digest == read_recording(whole).digest
+    assert recording.digest != recording.computed_digest
+
+
+def test_a_map_that_holds_a_key_twice_is_damaged() -> None:
+    def text(word: bytes) -> bytes:
+        return len(word).to_bytes(4, "little") + word
+
+    def read(entries: bytes) -> dict[str, str]:
+        data = text(entries)
+        return Fields(data, 0, len(data)).mapping()
+
+    entry = text(b"key") + text(b"value")
+    assert read(entry) == {"key": "value"}
+    with pytest.raises(DamageError, match="'key' twice"):
+        read(entry + text(b"key") + text(b"other"))
+
+
+def test_record_that_is_not_one_is_a_problem(whole: Path, tmp_path: Path) -> None:
+    for edit in (lambda data: data + b"x", flipped(1)):
+        rewritten(whole, tmp_path / "run.mcap", first_call("/tick", edit))
+        recording = read_recording(tmp_path / "run.mcap")
+        assert len(recording.problems) == 1
+        assert "a message on /tick is not one record" in recording.problems[0]
+        assert same(recording.ticks, random_rows(1500)[1:])
+
+
+def test_cut_anywhere_reads_to_the_last_whole_chunk(whole: Path, tmp_path: Path) -> None:
+    data, rows = whole.read_bytes(), random_rows(1500)
+    ends = chunk_ends(whole)
+    assert len(ends) >= 4
+    path = tmp_path / "cut.mcap"
+    edges = [edge + step for edge, _ in ends for step in (-1, 0, 1)]
+    offsets = {*edges, *range(ends[0][0], len(data), 9973), *range(len(data) - 40, len(data))}
+    for offset in sorted(offset for offset in offsets if ends[0][0] <= offset < len(data)):
+        path.write_bytes(data[:offset])
+        recording = read_recording(path)
+        assert recording.is_cut
+        assert recording.problems == ()
+        assert recording.meta["method"] == "implicit"
+        assert recording.attachments["model.mjb"] == FILES[1].data
+        assert same(recording.ticks, rows[: recording.ticks.size])
+        # what the whole chunks hold, but for their events, schemas and the records' heads
+        held = sum(size for end, size in ends if end <= offset) // (TICK_DTYPE.itemsize + 35)
+        assert held - 20 <= recording.ticks.size <= held
+    path.write_bytes(data)
+    assert not read_recording(path).is_cut
+
+
+def test_cut_before_first_chunk_keeps_metadata_or_is_refused(whole: Path, tmp_path: Path) -> None:
+    data = whole.read_bytes()
+    path = tmp_path / "cut.mcap"
+    kept = 0
+    for offset in (*range(0, 4000, 41), *range(4000, chunk_ends(whole)[0][0], 5003)):
+        path.write_bytes(data[:offset])
+        try:
+            recording = read_recording(path)
+        except RecordingError:
+            assert kept == 0
+            continue
+        kept += 1
+        assert recording.is_cut
+        assert recording.ticks.size == 0
+        assert recording.meta["epoch_ns"] == str(EPOCH)
+    assert kept
+
+
+def starts(path: Path) -> list[int]:
+    """Returns where each chunk begins."""
+    with path.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    assert summary is not None
+    return sorted(index.chunk_start_offset for index in summary.chunk_indexes)
+
+
+def changed(path: Path, data: bytes | bytearray) -> Recording:
+    path.write_bytes(data)
+    return read_recording(path)
+
+
+def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> None:
+    path, kept = tmp_path / "cut.mcap", whole.read_bytes()[: starts(whole)[2]]
+    recording = changed(path, kept + bytes(5000))
+    assert (recording.is_cut, recording.problems) == (True, ())
+    (problem, *_) = changed(path, kept + bytes(50) + b"x" + bytes(50)).problems
+    assert "nothing can be read from byte" in problem
+
+
+@given(data=st.data())
+@settings(max_examples=150)
+def test_no_damage_gives_more_than_a_recording_or_error(whole: Path, data: st.DataObject) -> None:
+    content = bytearray(whole.read_bytes())
+    size = len(content)
+    # the structure sits at both ends, so damage is drawn there as often as in the chunks
+    near = st.one_of(
+        st.integers(8, 4000), st.integers(size - 2500, size - 1), st.integers(8, size - 1)
+    )
+    for position in data.draw(st.lists(near, min_size=1, max_size=4, unique=True)):
+        content[position] ^= data.draw(st.integers(1, 255))
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(9, size)) :]
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        path.write_bytes(content)
+        try:
+            recording = read_recording(path)
+        except RecordingError:
+            return
+    assert recording.is_cut or recording.problems or recording.digest != recording.computed_digest
+
+
+@given(content=st.binary(max_size=300))
+def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        path.write_bytes(b"\x89MCAP0\r\n" + content)
+        with pytest.raises(RecordingError):
+            read_recording(path)
+
+
+def test_damaged_chunk_is_named_and_the_others_are_kept(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    data[chunk_ends(whole)[1][0] - 5000] ^= 0x10
+    recording = changed(tmp_path / "run.mcap", data)
+    assert not recording.is_cut
+    assert any("chunk 2 (at byte " in problem for problem in recording.problems)
+    assert recording.ticks["tick"][[0, -1]].tolist() == [0, 1499]
+    assert recording.digest != recording.computed_digest
+
+
+def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> None:
+    data, second = bytearray(whole.read_bytes()), starts(whole)[1]
+    data[second + 7] ^= 0x40
+    recording = changed(tmp_path / "run.mcap", data)
+    ticks = recording.ticks["tick"]
+    assert f"nothing can be read from byte {second} to byte" in recording.problems[0]
+    assert (np.diff(ticks) == 1).sum() == ticks.size - 2
+    assert 1000 < ticks.size < 1300
+
+
+def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    struct.pack_into("<Q", data, starts(whole)[0] + 9 + 16, 1 << 60)
+    assert any("beyond" in problem for problem in changed(tmp_path / "a.mcap", data).problems)

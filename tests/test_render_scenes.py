@@ -59,10 +59,3 @@ def test_every_scene_has_a_small_picture_that_shows_something(name: str) -> None
     with Image.open(file) as picture:
         assert picture.size <= (640, 400)
         assert np.asarray(picture.convert("L")).std() > 20
-
-
-def test_picture_of_all_scenes_is_small_and_800_pixels_wide() -> None:
-    file = ROOT / "scripts/figures/scenes.png"
-    assert file.stat().st_size < 300_000
-    with Image.open(file) as picture:
-        assert picture.width == 800

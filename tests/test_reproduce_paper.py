@@ -300,8 +300,8 @@ def test_figures_name_every_line(monkeypatch: pytest.MonkeyPatch) -> None:
         (transmission_line.section, ("B = 0.5 N s/m", "1 sample there and back")),
         (integrators.discrete_passivity_section, ("implicit midpoint",)),
     ):
-        (curve,) = section().curves
-        panels = [axes.get_legend_handles_labels()[1] for axes in curve.figure.axes]
+        figure = section().figure
+        panels = [axes.get_legend_handles_labels()[1] for axes in figure.axes]
         assert all(panels)
         labels = [label for panel in panels for label in panel]
         for name in names:

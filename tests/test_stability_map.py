@@ -5,20 +5,25 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from map_tables import without_rows, written
+from matplotlib.figure import Figure
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.maps import MAPS
 from hapticbridge.lab.maps.base import (
     VERDICTS,
-    Finding,
     Point,
+    Sentences,
     StabilityMap,
     draw_verdicts,
+    paragraph,
     run_map,
     verdict_numbers,
 )
@@ -44,11 +49,21 @@ def fail(point: Point) -> Mapping[str, float]:
     raise ValueError(f"nothing at {point['x']}")
 
 
-def read(table: Table) -> Finding:
-    return Finding(new_figure(4, 3), f"the largest is {table['y'].max():g}", {"rows": len(table)})
+def summarize(table: Table) -> Mapping[str, Any]:
+    return {"rows": len(table), "largest": table.numbers("y").max()}
 
 
-SQUARES = StabilityMap("squares", "numbers squared", 6, points, square, read)
+def draw(_table: Table, _boundary: Mapping[str, Any]) -> Figure:
+    return new_figure(4, 3)
+
+
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    yield "the largest is {largest:g}", boundary
+
+
+SQUARES = StabilityMap(
+    "squares", "Map ``squares``: numbers squared.", 6, points, square, summarize, draw, sentences
+)
 
 
 def test_a_map_writes_its_files_and_says_which_points_failed(tmp_path: Path) -> None:
@@ -58,8 +73,9 @@ def test_a_map_writes_its_files_and_says_which_points_failed(tmp_path: Path) -> 
     assert "three is no good" in files.table.read_text(encoding="utf-8")
     said = json.loads(files.boundary.read_text(encoding="utf-8"))
     assert said["points"] == 6
-    assert said["boundary"] == {"rows": 5}
-    assert said["paragraph"] == "the largest is 25"
+    assert said["boundary"] == {"rows": 5, "largest": 25.0}
+    assert said["about"] == "numbers squared"
+    assert said["paragraph"] == "the largest is 25."
     assert files.picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -69,7 +85,7 @@ def test_a_map_begun_again_computes_only_what_is_missing(tmp_path: Path) -> None
         calls.clear()
         files = run_map(SQUARES, tmp_path, points=8, executor=pool)
     assert sorted(point["x"] for point in calls) == [5.0, 6.0, 7.0]
-    assert files.finding.paragraph == "the largest is 49"
+    assert files.finding.paragraph == "the largest is 49."
 
 
 def test_a_map_can_keep_its_table_as_parquet(tmp_path: Path) -> None:
@@ -80,7 +96,7 @@ def test_a_map_can_keep_its_table_as_parquet(tmp_path: Path) -> None:
 
 
 def test_a_map_of_failures_is_an_error_that_says_the_first(tmp_path: Path) -> None:
-    broken = StabilityMap("broken", "", 4, points, fail, read)
+    broken = replace(SQUARES, name="broken", evaluate=fail)
     with ThreadPoolExecutor(1) as pool, pytest.raises(StudyError, match=r"nothing at 0\.0"):
         run_map(broken, tmp_path, executor=pool)
 
@@ -108,16 +124,16 @@ def test_a_file_that_cannot_be_written_is_noticed_before_the_sweep(tmp_path: Pat
     assert not (tmp_path / "squares.csv").exists()
 
 
-def read_nothing(table: Table) -> Finding:
-    return Finding(new_figure(4, 3), "", {"a": [float("nan"), 1.0], "b": {"c": float("inf")}})
+def unknown_numbers(_table: Table) -> Mapping[str, Any]:
+    return {"a": [float("nan"), 1.0], "b": {"c": float("inf")}}
 
 
-def read_badly(table: Table) -> Finding:
+def fail_to_read(_table: Table) -> Mapping[str, Any]:
     raise ZeroDivisionError
 
 
 def test_json_has_none_for_what_is_no_number(tmp_path: Path) -> None:
-    unknown = StabilityMap("unknown", "", 4, points, square, read_nothing)
+    unknown = replace(SQUARES, name="unknown", summarize=unknown_numbers)
     with ThreadPoolExecutor(1) as pool:
         files = run_map(unknown, tmp_path, executor=pool)
     said = json.loads(files.boundary.read_text(encoding="utf-8"))
@@ -125,10 +141,10 @@ def test_json_has_none_for_what_is_no_number(tmp_path: Path) -> None:
 
 
 def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
-    unread = StabilityMap("unread", "", 4, points, square, read_badly)
+    unread = replace(SQUARES, name="unread", summarize=fail_to_read)
     with ThreadPoolExecutor(1) as pool, pytest.raises(ZeroDivisionError):
         run_map(unread, tmp_path, executor=pool)
-    assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 5
+    assert (tmp_path / "unread.csv").read_text(encoding="utf-8").count("\n") == 7
 
 
 @pytest.mark.parametrize("what", ["mujoco", "sources"])
@@ -175,3 +191,18 @@ def test_command_maps_with_a_pool_of_processes(
     (said,) = json.loads(capsys.readouterr().out)
     assert said["map"] == "coupling"
     assert (tmp_path / "coupling.png").is_file()
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_a_table_without_a_computed_row_is_refused(name: str) -> None:
+    failed = [(point, "SceneError: no") for point in MAPS[name].points(4)]
+    with pytest.raises(StudyError, match="no point could be computed; first: SceneError: no"):
+        MAPS[name].read(written(failed))
+    with pytest.raises(StudyError, match=f"map '{name}': the table has no rows"):
+        MAPS[name].read(without_rows(written(failed)))
+
+
+def test_a_sentence_that_lacks_a_number_is_left_out() -> None:
+    numbers = {"a": 0.5, "b": None}
+    said = paragraph([("{a:.0%}", numbers), ("{b:.0%}", numbers), ("{c}", numbers), ("end", {})])
+    assert said == "50%. end."

@@ -1,4 +1,4 @@
-"""Audits many recordings, in parallel, into one table."""
+"""Audit of many recordings into one table, in parallel."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from hapticbridge.sweep.results import Interrupted, Table, check_format
 from hapticbridge.sweep.sweep import sweep
 
 FEW = 8
-"""Recordings below which no processes are started: each takes 3 s to start, as long as the audit
-of two minutes at 1 kHz."""
+"""Number of recordings below which no processes are started. Each takes 3 s to start, as long as
+the audit of two minutes at 1 kHz."""
 
 UNREADABLE = "unreadable"
-"""Verdict on a file that is no recording, or could not be read."""
+"""Verdict on a file that is not a recording or cannot be read."""
 
 _LONGEST_REASON = 1000
-"""Letters of a reason that are kept; a damaged file may have a problem in each of its chunks."""
+"""Largest number of characters of a reason; a damaged file may have a problem in each chunk."""
 
 _UNITS = {
     "margin": "1",
@@ -48,10 +48,10 @@ _UNITS = {
     "device_energy": "J",
     "slack": "J",
 }
-"""Units of what is measured in a table of audits."""
+"""Units of the numeric columns."""
 
 _REPORT = "report"
-"""Column that holds the whole report as JSON text."""
+"""Column with the whole report as JSON text."""
 
 
 def audit_all(
@@ -63,30 +63,30 @@ def audit_all(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
-    """Audits recordings and returns a row for each, the one nearest to a negative verdict first.
+    """Audits recordings; returns a row for each, sorted by margin.
 
-    Rows are sorted by ``margin`` (``AuditReport.margin``), from the smallest to the largest; before
-    all of them come files that could not be read, then recordings that are invalid. A file that is
-    cut is judged by what it holds, as ``audit`` alone does.
+    Rows run from the smallest margin (``AuditReport.margin``) to the largest, after unreadable
+    files and invalid recordings. A cut file is judged by its contents, as ``audit`` does.
 
-    Columns beside ``file``: ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
-    ``certified`` (yes, no or unknown), ``exit_code``, what ``AuditReport`` says otherwise, the
-    energies at the end in J, and ``report``, the whole report as JSON (empty if unreadable).
+    Columns besides ``file`` are ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
+    ``certified`` (yes, no or unknown) and ``exit_code``. The other fields of ``AuditReport`` and
+    the energies at the end in J follow. ``report`` holds the whole report as JSON (empty if
+    unreadable).
 
     Args:
         paths: Recordings; different files.
         strict: As for ``audit``.
-        jobs: Processes at most; 1 works in this one. By default as many as there are cores, and
-            this one for fewer than 8 recordings.
-        executor: Any executor, instead of processes.
-        scheduler: Address of a dask.distributed scheduler, likewise; its workers must see the files
-            under the same names.
-        progress: Called with the recordings done and all of them.
+        jobs: Largest number of processes; 1 works in this one. The default is the number of cores,
+            and 1 for fewer than 8 recordings.
+        executor: Executor to use instead of processes.
+        scheduler: Address of a dask.distributed scheduler to use instead of processes; its workers
+            must see the files under equal paths.
+        progress: Called with the number of recordings done and the total.
 
     Raises:
-        StudyError: The workers cannot be had.
+        StudyError: The workers cannot be started.
         RecordingError: There is no recording.
-        Interrupted: Ctrl-C; it has the rows of what was judged by then, sorted likewise.
+        Interrupted: Ctrl-C; it carries the rows so far, sorted by margin.
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
@@ -108,7 +108,7 @@ def audit_all(
 
 
 def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
-    """Audits one recording; returns its row of the table."""
+    """Audits one recording; returns its row."""
     try:
         report = audit(point["file"], strict=strict)
     except RecordingError as error:
@@ -142,21 +142,21 @@ def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
 
 
 def reports_of(table: Table) -> list[dict[str, object]]:
-    """Returns the whole reports of a table, in its order, without files that were unreadable."""
+    """Returns the reports of a table in its order, without unreadable files."""
     return [json.loads(text) for text in table.texts(_REPORT) if text]
 
 
 def check_table_name(path: Path) -> None:
-    """Checks that a table can be written under a name, before anything is computed for it.
+    """Checks that a table can be written to a file, before anything is computed for it.
 
     Raises:
-        StudyError: It ends otherwise than .parquet, .csv or .json, pyarrow is missing, or there is
-            no such folder.
+        StudyError: The extension is not .parquet, .csv or .json, pyarrow is missing, or the folder
+            does not exist.
     """
     form = path.suffix.removeprefix(".")
     if form not in ("parquet", "csv", "json"):
         endings = choices((".parquet", ".csv", ".json"))
-        raise StudyError(f"'{path}' does not end like a table; endings: {endings}")
+        raise StudyError(f"the table '{path}' must end in one of {endings}")
     if form != "json":
         check_format(form)
     if not path.absolute().parent.is_dir():
@@ -164,9 +164,9 @@ def check_table_name(path: Path) -> None:
 
 
 def write_audits(table: Table, path: Path) -> None:
-    """Writes a table of audits as Parquet, CSV or JSON (a list of rows), by the name's end.
+    """Writes a table of audits as Parquet, CSV or JSON (a list of rows), by the file's extension.
 
-    In Parquet a column of numbers has its unit in its metadata, as in an export.
+    In Parquet the metadata of a numeric column hold its unit, as in an export.
 
     Raises:
         StudyError: See ``check_table_name``, or the file cannot be written.
@@ -186,12 +186,12 @@ def write_audits(table: Table, path: Path) -> None:
 
 
 def worst_exit_code(table: Table) -> int:
-    """Returns the largest exit code: 2 if a file could not be read, 1 if a verdict is negative."""
+    """Returns the largest exit code: 2 for an unreadable file, 1 for a negative verdict."""
     return int(table.numbers("exit_code").max())
 
 
 def _with_failures(table: Table) -> Table:
-    """Gives a verdict to rows whose worker failed, so that they are not passed over in silence."""
+    """Gives a verdict to rows whose worker failed, so that they are reported."""
     if not table.failed.any():
         return table
     filled = {
@@ -206,27 +206,25 @@ def _with_failures(table: Table) -> Table:
 def _sorted(table: Table) -> Table:
     margins = table.numbers("margin")
     is_read = table.texts("verdict") != UNREADABLE
-    # NaN goes last in a sort, and here first; equal margins by name
+    # NaN margins come first here; equal margins are sorted by name
     order = np.lexsort((table.texts("file").astype(str), margins, ~np.isnan(margins), is_read))
     return table.select(order)
 
 
 ENDING = ".mcap"
-"""What recordings in a folder are known by, in small or capital letters."""
+"""Extension of the recordings in a folder, in either case."""
 
 
 def find_recordings(words: Iterable[str | Path]) -> list[Path]:
-    """Returns the recordings that files, folders and patterns name, each once.
+    """Returns the recordings named by files, folders and patterns, each once.
 
-    A folder stands for all files below it that end in ``.mcap``, in the order of their names. A
-    word that is no file and holds ``*``, ``?`` or ``[`` is a pattern, in which ``**`` stands for
-    any folders. Links to files are followed, links to folders below a folder are not: they may lead
-    in a circle. What does not exist, and a folder below that cannot be read, are kept: the audit
-    says so.
+    A folder stands for all files below it that end in ``.mcap``, sorted by name. A word that is not
+    a file and has ``*``, ``?`` or ``[`` is a pattern, in which ``**`` stands for any folders. Links
+    to files are followed. Links to folders below a folder are not, because they may form a circle.
+    Missing files and unreadable folders are kept, so that the audit reports them.
 
     Raises:
-        RecordingError: There is no recording in a folder, none that fits a pattern, or the pattern
-            is none.
+        RecordingError: A folder has no recording, or a pattern is invalid or matches none.
     """
     found: dict[Path, Path] = {}
     for word in words:
@@ -239,14 +237,14 @@ def find_recordings(words: Iterable[str | Path]) -> list[Path]:
         elif glob.has_magic(str(path)) and not path.exists():
             files = _fitting(path)
             if not files:
-                raise RecordingError(f"no recording fits '{path}'")
+                raise RecordingError(f"no recording matches '{path}'")
         for file in files:
             found.setdefault(file.resolve(), file)
     return list(found.values())
 
 
 def _below(folder: Path) -> list[Path]:
-    """Returns the recordings in and below a folder, and what of it cannot be read."""
+    """Returns the recordings in and below a folder, and its unreadable parts."""
     refused: list[Path] = []
 
     def refuse(error: OSError) -> None:
@@ -258,17 +256,17 @@ def _below(folder: Path) -> list[Path]:
         for name in names
         if name.lower().endswith(ENDING)
     ]
-    # a link after what it may lead to, which is then the one that is named
+    # links come after their possible targets, so that the target is the one named
     return sorted([*files, *refused], key=lambda file: (file.is_symlink(), file))
 
 
 def _fitting(pattern: Path) -> list[Path]:
-    """Returns the files that fit a pattern, and those below the folders that do."""
+    """Returns the files that match a pattern, and those below matching folders."""
     parts = pattern.parts
     first = next(index for index, part in enumerate(parts) if glob.has_magic(part))
     rest = str(Path(*parts[first:]))
     try:
         found = sorted(Path(*parts[:first]).glob(rest))
     except ValueError as error:
-        raise RecordingError(f"'{pattern}' is no pattern: {error}") from None
+        raise RecordingError(f"'{pattern}' is not a valid pattern: {error}") from None
     return [file for path in found for file in (_below(path) if path.is_dir() else [path])]

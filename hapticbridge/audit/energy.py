@@ -276,7 +276,7 @@ class EnergyBalance:
         gains = outside.laws(numbers)
         recorded = ticks["wrench_on_tool"]
         law = recorded
-        if parameters.has_law and parameters.laws == 1:
+        if parameters.has_law and parameters.law_evaluations == 1:
             law = wrench_by_law(ticks, gains, parameters.period, motion)
         works = (
             np.sum(recorded[:, :3] * motion.tool_step, axis=1),
@@ -285,7 +285,9 @@ class EnergyBalance:
         work = works[0] + works[1]
         # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = (
-            ticks["coupling_work"] if parameters.laws > 1 else summed(work, sums["coupling_work"])
+            ticks["coupling_work"]
+            if parameters.law_evaluations > 1
+            else summed(work, sums["coupling_work"])
         )
 
         sent = np.concatenate([before.sent[None], ticks["wrench_on_device"][:-1]])
@@ -384,7 +386,7 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
     """
     if not parameters.has_law:
         return np.zeros(len(gains)), np.zeros(len(gains))
-    n, share = parameters.laws, 1.0 if parameters.laws == 1 else SLACK_SHARE
+    n, share = parameters.law_evaluations, 1.0 if parameters.law_evaluations == 1 else SLACK_SHARE
     linear = gains[:, 0] / n + gains[:, 1] / parameters.period
     angular = gains[:, 2] / n + gains[:, 3] / parameters.period
     return share * linear, share * angular
@@ -392,7 +394,7 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
 
 def _unpaid_energy(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
     """Returns Σ w·δp − Σ b‖δp‖²/t + energy stored in scene and coupling, in the device's scale."""
-    if parameters.device_damping is None or (parameters.has_law and parameters.laws > 1):
+    if parameters.device_damping is None or (parameters.has_law and parameters.law_evaluations > 1):
         return np.zeros(len(given))
     return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
 

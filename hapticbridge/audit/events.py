@@ -140,7 +140,7 @@ class RunEvents:
                 parameters.period,
                 parameters.scale,
                 parameters.force_scale,
-                parameters.laws,
+                parameters.law_evaluations,
                 method,
             )
             for coupling in self.couplings

@@ -159,7 +159,7 @@ class Resimulator:
     @property
     def slack(self) -> float:
         """Energy that the environment may have created so far, in J."""
-        return float(self.binding.state["slack"][0])
+        return self.binding.slack
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Adds an event of a running run; events without effect on the simulation are ignored."""

@@ -379,7 +379,7 @@ def _unchecked(parameters: RunParameters, method: Method) -> str:
         return "the wrench comes from contacts: checked by re-simulation alone"
     if not method.has_law:
         return "the wrench is MuJoCo's constraint force: checked by re-simulation alone"
-    if parameters.laws > 1:
+    if parameters.law_evaluations > 1:
         return "the wrench is a mean over substeps: it and its work checked by re-simulation alone"
     return ""
 

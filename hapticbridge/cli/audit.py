@@ -30,7 +30,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.sweep.results import Interrupted, Table
-from hapticbridge.units import format_si
+from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
 
@@ -283,7 +283,7 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  events: {plain(listed)}")
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s")
     energies = [
-        f"{name.replace('_', ' ')} {format_si(e, 'J')}" for name, e in report.energies.items() if e
+        f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
     ]
     if energies:
         out.print(f"  {', '.join(energies)}")

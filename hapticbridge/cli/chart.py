@@ -10,19 +10,22 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import (
-    ChartFiles,
+from hapticbridge.lab.chart.catalogue import (
     Extent,
-    chosen_methods,
-    chosen_periods,
-    measure_chart,
     open_workload,
-    peer_settings,
+)
+from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS, measure_chart
+from hapticbridge.lab.chart.engine_run import peer_settings
+from hapticbridge.lab.chart.output import (
+    ChartFiles,
     prepared_files,
-    settings_for,
     write_chart,
 )
-from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS
+from hapticbridge.lab.chart.setting import (
+    chosen_methods,
+    chosen_periods,
+    settings_for,
+)
 from hapticbridge.lab.chart.work import WORK_ENDINGS, measure_work, write_work
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 

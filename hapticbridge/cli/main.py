@@ -40,13 +40,15 @@ COMMANDS = {
         "Scenes", "check", "Find what is wrong with a scene, and what a tick of it costs."
     ),
     "audit": Entry(
-        "Recordings", "judge", "Judge recorded runs offline: passive, active or invalid, and why."
+        "Recordings", "audit", "Judge recorded runs offline: passive, active or invalid, and why."
     ),
     "view": Entry("Recordings", "view", "Show a recorded run in a browser."),
     "render": Entry("Recordings", "render", "Draw a recorded run: a picture, or a film of it."),
-    "compare": Entry("Recordings", "data", "Find the first tick and field where two runs differ."),
-    "export": Entry("Recordings", "data", "Write a recording as Parquet, CSV or HDF5."),
-    "repair": Entry("Recordings", "judge", "Make a whole file of a recording that a crash cut."),
+    "compare": Entry(
+        "Recordings", "recordings", "Find the first tick and field where two runs differ."
+    ),
+    "export": Entry("Recordings", "recordings", "Write a recording as Parquet, CSV or HDF5."),
+    "repair": Entry("Recordings", "audit", "Make a whole file of a recording that a crash cut."),
     "devices": Entry("Devices", "devices", "List the haptic devices plugged in and supported."),
     "identify": Entry(
         "Devices", "identify", "Measure a device's mass, damping, friction, resolution and delay."

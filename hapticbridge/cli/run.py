@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 from rich.markup import escape
@@ -19,7 +19,6 @@ from rich.table import Table
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions
 from hapticbridge.cli.terminal import err, out, tell
-from hapticbridge.cli.view import tell_address
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
@@ -30,11 +29,10 @@ from hapticbridge.rendering import default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.summary import Summary, coupling_sentences, is_always_held
-from hapticbridge.units import format_si
-from hapticbridge.view import Address, Window
-from hapticbridge.view.window import BY
+from hapticbridge.units import format_energy, format_si
 
-# How ``hapticbridge run`` says what it will do, and what it did.
+if TYPE_CHECKING:
+    from hapticbridge.view import Window
 
 
 def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
@@ -131,8 +129,8 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
-        if joules:  # a scene without motors or springs has no news of them
-            table.add_row(name.replace("_", " "), format_si(joules, "J"))
+        if joules:  # exactly 0 without motors or springs
+            table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
@@ -299,8 +297,7 @@ class Run:
         refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
-        address = Address() if self.port is None else Address(self.port)
-        window = Window(address) if self.view else None
+        window = self._window() if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
             told = stack.enter_context(interrupting_on_signals())
@@ -352,14 +349,14 @@ class Run:
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
         )
         if window is not None:
-            window.on_command = partial(bridge.command, by=BY)
+            window.on_command = partial(bridge.command, by="view")
         if not self.as_json:
             announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
         told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
-            tell_address(window.url)
+            tell(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
@@ -373,6 +370,11 @@ class Run:
             )
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _window(self) -> Window:
+        from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
+
+        return Window(Address() if self.port is None else Address(self.port))
 
     def _coupling(self, info: DeviceInfo, options: BridgeOptions) -> Coupling:
         """Returns the default coupling with the user's gains."""

@@ -91,7 +91,7 @@ class Repeat:
     """Internal command that repeats recorded events; not accepted over the wire.
 
     Attributes:
-        events: Events of ``change.CHANGES`` in order, all applied before one tick.
+        events: Events of ``execution.CHANGES`` in order, all applied before one tick.
     """
 
     events: tuple[Mapping[str, Any], ...]

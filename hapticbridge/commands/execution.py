@@ -110,7 +110,7 @@ class EventApplier:
             if not self._method.has_coupling:
                 raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
             restore_state(self._model, self._data, self._start)
-            self._binding.take_reset()
+            self._binding.handle_reset()
 
 
 MOST_WAITING = 8

@@ -326,8 +326,8 @@ METHOD_ERROR = 0.001
 """Half-width, relative to the value, added to every mass, damping and friction, without unit. It
 covers errors that shift all parts of a run together, which the jackknife cannot detect, beyond the
 position's rounding and noise (``noise_share``). Measured on 40 simulated devices in runs of a
-minute, which average out random errors. The mass was off by 0.07 % at most, and by 0.005 % more than the
-rest of its interval; friction by 0.05 % of the force; damping by 0.01 % (median)."""
+minute, which average out random errors. The mass was off by 0.07 % at most, and by 0.005 % more
+than the rest of its interval; friction by 0.05 % of the force; damping by 0.01 % (median)."""
 
 SUM_ERROR = 3e-4
 """Half-width, relative to force over speed (RMS), added to every damping, without unit. It covers

@@ -1,14 +1,24 @@
-"""What the kernel's functions return, the flags they set, and MuJoCo's kinds of constraints."""
+"""Names and numbers that the kernel shares with scenes, methods and records."""
 
 from __future__ import annotations
 
-# What the bridge adds to a scene, by name.
+from enum import IntEnum
+from typing import Any, TypeAlias
+
+from hapticbridge.record import TickFlag
+
+State: TypeAlias = Any
+"""The kernel's whole state (``state.STATE_DTYPE``) as one record. Compiled functions get it by
+reference."""
+
+Part: TypeAlias = Any
+"""One sub-record of the state, such as ``energy``, by reference. Only one module writes to it."""
 
 HANDLE = "handle"
 """Name of the mocap body, and of its site, that the bridge adds to a scene."""
 
 WELD_NAME = "handle_weld"
-"""Name of the equality constraint that joins the grip to the handle, where a method wants one."""
+"""Name of the equality constraint that joins grip and handle for the method ``weld``."""
 
 COUPLING_ACTUATORS = tuple(
     f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
@@ -16,43 +26,62 @@ COUPLING_ACTUATORS = tuple(
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
 
 
-# The ways in which a wrench reaches the tool, as the kernel counts them.
+class Scheme(IntEnum):
+    """Path by which the coupling's wrench reaches the tool.
 
-COUPLED, HELD, WELD, DIRECT, LOSSLESS = 0, 1, 2, 3, 4
-"""How the wrench reaches the tool (``scheme``): by the coupling's actuators, which compute it while
-MuJoCo steps; by the same actuators as the wrench of the tick before, held; by an equality
-constraint; not at all, because the tool has no mass and is where the handle is; or half by the
-actuators and half carried over from the step before (``kernel.lossless``)."""
+    Attributes:
+        IMPLICIT: Six actuators compute it while MuJoCo steps, which solves them implicitly.
+        ZERO_ORDER_HOLD: Six actuators apply the wrench of the previous tick, held constant.
+        WELD: An equality constraint of MuJoCo applies it; there is no coupling law.
+        MASSLESS: The tool has no mass and is placed at the handle; there is no coupling.
+        MIDPOINT: The actuators apply half of it implicitly, and the other half is carried over
+            from the previous step (``kernel.lossless``).
+    """
+
+    IMPLICIT = 0
+    ZERO_ORDER_HOLD = 1
+    WELD = 2
+    MASSLESS = 3
+    MIDPOINT = 4
 
 
 def has_law(scheme: int) -> bool:
-    """Returns whether the coupling law gives the wrench."""
-    return scheme in (COUPLED, HELD, LOSSLESS)
+    """Returns True if the coupling law gives the wrench."""
+    return scheme in (Scheme.IMPLICIT, Scheme.ZERO_ORDER_HOLD, Scheme.MIDPOINT)
 
 
-def laws_per_tick(scheme: int, substeps: int) -> int:
-    """Returns how often per tick the wrench on the tool is computed."""
-    return 1 if scheme == HELD else substeps
+def law_evaluations(scheme: int, substeps: int) -> int:
+    """Returns the evaluations of the tool's wrench per tick."""
+    return 1 if scheme == Scheme.ZERO_ORDER_HOLD else substeps
 
 
 OK, BAD_SAMPLE, BAD_RESULT, HALF_DONE, RING_FULL = 0, 1, 2, 3, 4
-"""Go on; the device's sample is not finite; the simulation's result is not finite; go on, and of
-MuJoCo's step only the second half is left to do (``kernel.ahead``); the record found no room."""
+"""Results of the tick's stages: success; a sample that is not finite; a simulation result that is
+not finite; success with only the second half of MuJoCo's step left to do; no room in the ring."""
 
 JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
-"""Why a tick is refused before it is computed (``kernel.watch``): the device's pose jumped, time
-ran backwards, the coupling is too long or turned too far, the device was given too much energy."""
+"""Reasons of the guard to refuse a tick: the device's pose jumped; time ran backwards; the coupling
+is too long; it is turned too far; the device received too much energy."""
 
-FORCE_LIMITED, SLEW_LIMITED, RAMPING, CONTROLLER_ACTIVE, CONTACT, CLUTCH = 4, 8, 16, 32, 64, 128
-STALE_SAMPLE, TRIP, MIDPOINT, RESEATED = 256, 512, 1024, 2048
-"""Bits of ``TickFlag``: the compiler cannot read an enumeration."""
+FORCE_LIMITED = int(TickFlag.FORCE_LIMITED)
+SLEW_LIMITED = int(TickFlag.SLEW_LIMITED)
+RAMPING = int(TickFlag.RAMPING)
+CONTROLLER_ACTIVE = int(TickFlag.CONTROLLER_ACTIVE)
+CONTACT = int(TickFlag.CONTACT)
+CLUTCH = int(TickFlag.CLUTCH)
+STALE_SAMPLE = int(TickFlag.STALE_SAMPLE)
+TRIP = int(TickFlag.TRIP)
+RESEATED = int(TickFlag.RESEATED)
+LOSSLESS_TICK = int(TickFlag.MIDPOINT)
+"""Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 
 FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41
-"""Commands that hold as long as their bit is set in ``commanded``: no force, though the handle
-follows the device; or a clutch, as if a button for it were held."""
+"""Bits of commands in force, above the device's own buttons: the wrench is switched off while the
+handle follows the device; the handle stays as if a clutch button were held."""
 
 EQUALITY, LIMIT_JOINT, LIMIT_TENDON, CONTACT_PYRAMIDAL = 0, 3, 4, 6
-"""Kinds of constraint rows (``mjtConstraint``), likewise."""
+"""Kinds of constraint rows, numbered as in MuJoCo's ``mjtConstraint``."""
 
 LARGEST_CONTROL = 1e10
-"""mjMAXVAL, in N and N m. Beyond it the run has diverged anyway."""
+"""Largest control in N and N m, MuJoCo's mjMAXVAL. MuJoCo ignores a larger one; a run that reaches
+it has diverged."""

@@ -1,9 +1,19 @@
-"""A massless rigid tool that is where the handle is, and is pushed back by contact springs.
+"""Rendering methods that exist to be compared: zero-order hold, weld, and a tool without mass.
 
-Per contact, frictionless:  F = K_c p n,  V = ½ K_c p²
+Zero-order hold: the coupling law is evaluated after the step, and its wrench is applied as a force
+during the next tick.
+
+Weld: an equality constraint of MuJoCo joins grip and handle; its row forces give the wrench.
+
+Massless: the tool is placed at the handle and pushed back by one frictionless spring per contact,
+
+    F = K_c p n,    V = ½ K_c p²
 
 with p the penetration in m, n the contact's normal, K_c the contact stiffness in N/m. The tool has
-no mass, so the wrench of the hand on it is minus the sum of the contacts' wrenches.
+no mass, so the hand's wrench on it is minus the sum of the contacts' wrenches.
+
+To add a method, give it a ``Scheme``, its branch in ``drive_compared`` and ``compared_wrench``, and
+register it (``hapticbridge.lab.methods``).
 """
 
 from __future__ import annotations
@@ -15,9 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import EQUALITY
+from hapticbridge.kernel.codes import EQUALITY, Scheme, State
+from hapticbridge.kernel.coupling import command_handle_velocity, wrench_after_step
+from hapticbridge.kernel.handle import note_tool, tool_after_step, tool_motion
+from hapticbridge.kernel.ledger import set_contact_springs_energy
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.pose import (
+    Quaternion,
     Vector,
     add,
     conjugate,
@@ -34,30 +48,75 @@ from hapticbridge.pose import (
     vector_of,
 )
 
-# The wrench of a weld between grip and handle, from the forces of its constraint rows.
+
+@compiled
+def drive_compared(s: State, orientation: Quaternion) -> None:
+    """Makes the tool follow the handle in the next step of MuJoCo.
+
+    Args:
+        s: The bound state with the handle in its place.
+        orientation: The handle's orientation in this substep.
+    """
+    if s.run.scheme == Scheme.MASSLESS:
+        place_tool(s)
+    elif s.run.scheme == Scheme.ZERO_ORDER_HOLD:
+        hold_wrench(s, orientation)
+    else:
+        command_handle_velocity(s, orientation)
 
 
 @compiled
-def weld_wrench(state: NDArray[np.void]) -> tuple[Vector, Vector]:
+def compared_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns force, torque, and the tool's motion and rotation vector since the last call.
+
+    Args:
+        s: The bound state after a step of MuJoCo.
+        is_last: True for the last substep of the tick.
+    """
+    if s.run.scheme == Scheme.ZERO_ORDER_HOLD:
+        return wrench_after_step(s, is_last)
+    if s.run.scheme == Scheme.WELD:
+        wrench = weld_wrench(s)  # before the kinematics are refreshed
+        position, orientation, moved, turned = tool_after_step(s)
+    else:
+        wrench = balance_contacts(s)
+        position, orientation, moved, turned = tool_motion(s)
+    note_tool(s.pose, position, orientation)
+    return wrench[0], wrench[1], moved, turned
+
+
+@compiled
+def hold_wrench(s: State, orientation: Quaternion) -> None:
+    """Gives the actuators the wrench of the previous tick, in the handle's axes."""
+    to_handle = conjugate(orientation)
+    ctrl = floats(s.mj.ctrl + 8 * s.mj.coupling_ctrl_adr, 6)
+    w = s.loop.wrench_on_tool
+    store_vector(ctrl[0:3], rotated(to_handle, vector_of(w)))
+    store_vector(ctrl[3:6], rotated(to_handle, vector_of(w[3:6])))
+
+
+@compiled
+def weld_wrench(s: State) -> tuple[Vector, Vector]:
     """Returns force and torque of the weld on the tool, about the grip, in the world frame.
 
-    A weld of two sites has six rows. Three are the grip's position minus the handle's: their forces
-    λ act at the grip as they are. Three are the vector part of q̄_h ⊗ q_x, which a rotation ω of the
-    tool changes by ½ vec(q̄_h ⊗ (0, ω) ⊗ q_x): their torque is the transpose of that times λ.
+    A weld of two sites has six constraint rows. Three are the grip's position minus the handle's;
+    their forces λ act at the grip. Three are the vector part of q̄_h ⊗ q_x, which a rotation ω of
+    the tool changes by ½ vec(q̄_h ⊗ (0, ω) ⊗ q_x); their torque is the transpose of that map times
+    λ.
 
-    Must run before kinematics are refreshed: the step used the poses of its start.
+    Must run before the kinematics are refreshed, because the step used the poses of its start.
     """
-    s = state[0]
-    count = min(ints(s.ne, 1)[0], ints(s.nefc, 1)[0])
-    kinds, ids = ints(pointer_at(s.efc_type), count), ints(pointer_at(s.efc_id), count)
+    mj = s.mj
+    count = min(ints(mj.ne, 1)[0], ints(mj.nefc, 1)[0])
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     row = 0
-    while row < count and not (kinds[row] == EQUALITY and ids[row] == s.weld_id):
+    while row < count and not (kinds[row] == EQUALITY and ids[row] == mj.weld_id):
         row += 1
     if row + 6 > count:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    force = floats(pointer_at(s.efc_force), count)
-    grip = quaternion_of(floats(s.site_xquat + 32 * s.grip_site_id, 4))
-    to_handle = conjugate(quaternion_of(floats(s.site_xquat + 32 * s.handle_site_id, 4)))
+    force = floats(pointer_at(mj.efc_force), count)
+    grip = quaternion_of(floats(mj.site_xquat + 32 * mj.grip_site_id, 4))
+    to_handle = conjugate(quaternion_of(floats(mj.site_xquat + 32 * mj.handle_site_id, 4)))
     x = product(product(to_handle, (0.0, 1.0, 0.0, 0.0)), grip)
     y = product(product(to_handle, (0.0, 0.0, 1.0, 0.0)), grip)
     z = product(product(to_handle, (0.0, 0.0, 0.0, 1.0)), grip)
@@ -73,19 +132,19 @@ def weld_wrench(state: NDArray[np.void]) -> tuple[Vector, Vector]:
 
 
 FREE_TOOL = 7
-"""How many numbers ``tool_map`` returns for a tool on a free joint; for a planar one it is 22."""
+"""Count of numbers that ``tool_map`` returns for a tool on a free joint; for a planar tool 22."""
 
 
 def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Returns what ``place_tool`` needs to know of the tool, and where its coordinates lie.
+    """Returns the geometry that ``place_tool`` uses, and the addresses of the tool's coordinates.
 
-    A tool on a free joint: the grip's position in the body (3) and its orientation there (4). A
-    planar one, on two slides and then a hinge: the axes of the slides (6) and of the hinge (3), the
-    hinge's anchor (3), the grip's position (3) and orientation (4) in the world at ``qpos0``, and
-    ``qpos0`` of the three joints (3).
+    For a tool on a free joint, the geometry is the grip's position (3) and orientation (4) in the
+    body. For a planar tool on two slides and a hinge it is: the axes of the slides (6) and of the
+    hinge (3), the hinge's anchor (3), the grip's position (3) and orientation (4) in the world at
+    ``qpos0``, and ``qpos0`` of the three joints (3).
 
     Args:
-        model: A scene that ``scene.methods.check_massless_tool`` accepts.
+        model: A scene that ``scene.checks.check_massless_tool`` accepts.
         site_id: The grip.
     """
     body_id = int(model.site_bodyid[site_id])
@@ -107,21 +166,20 @@ def tool_map(model: mujoco.MjModel, site_id: int) -> tuple[NDArray[np.float64], 
 
 
 @compiled
-def place_tool(state: NDArray[np.void]) -> None:
+def place_tool(s: State) -> None:
     """Writes the tool's coordinates so that the grip is at the handle.
 
-    A planar tool follows as far as its joints let it: by the part of the handle's turn about the
-    hinge, and by the part of its motion along the slides.
+    A planar tool follows the handle's rotation about its hinge and its motion along its slides.
     """
-    s = state[0]
-    handle = vector_of(s.handle_position)
-    orientation = quaternion_of(s.handle_quaternion)
-    numbers = floats(s.tool_map, s.tool_map_size)
-    addresses = ints(s.tool_qpos, 3)
-    if s.tool_map_size == FREE_TOOL:
+    mj = s.mj
+    handle = vector_of(s.pose.handle_position)
+    orientation = quaternion_of(s.pose.handle_quaternion)
+    numbers = floats(mj.tool_map, mj.tool_map_size)
+    addresses = ints(mj.tool_qpos, 3)
+    if mj.tool_map_size == FREE_TOOL:
         body = product(orientation, conjugate(quaternion_of(numbers[3:])))
         position = subtract(handle, rotated(body, vector_of(numbers)))
-        qpos = floats(s.qpos + 8 * addresses[0], 7)
+        qpos = floats(mj.qpos + 8 * addresses[0], 7)
         store_vector(qpos, position)
         store_quaternion(qpos[3:7], body)
         return
@@ -133,35 +191,47 @@ def place_tool(state: NDArray[np.void]) -> None:
     left = subtract(handle, add(anchor, swung))
     for joint in range(2):
         slide = dot(vector_of(numbers[3 * joint :]), left)
-        floats(s.qpos + 8 * addresses[joint], 1)[0] = numbers[19 + joint] + slide
-    floats(s.qpos + 8 * addresses[2], 1)[0] = numbers[21] + angle
+        floats(mj.qpos + 8 * addresses[joint], 1)[0] = numbers[19 + joint] + slide
+    floats(mj.qpos + 8 * addresses[2], 1)[0] = numbers[21] + angle
 
 
 @compiled
-def balance_contacts(state: NDArray[np.void]) -> tuple[Vector, Vector]:
-    """Returns the wrench that balances the contacts on the tool, about the grip; sets the energies.
+def balance_contacts(s: State) -> tuple[Vector, Vector]:
+    """Returns the wrench that balances the contacts on the tool, about the grip.
 
-    The energies are those of the springs; a tool without mass has no kinetic one.
+    Also books the energy of the contact springs as the scene's storage.
     """
-    s = state[0]
-    grip = vector_of(floats(s.site_xpos + 24 * s.grip_site_id, 3))
-    is_tool = ints(s.geom_is_tool, s.ngeom)
+    mj = s.mj
+    grip = vector_of(floats(mj.site_xpos + 24 * mj.grip_site_id, 3))
+    is_tool = ints(mj.geom_is_tool, mj.ngeom)
     force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     energy = 0.0
-    for c in range(ints(s.ncon, 1)[0]):
-        contact = pointer_at(s.contact) + c * s.contact_size
-        depth = -floats(contact + s.contact_distance, 1)[0]
-        geoms = ints(contact + s.contact_geoms, 2)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = pointer_at(mj.contact) + c * mj.contact_size
+        depth = -floats(contact + mj.contact_distance, 1)[0]
+        geoms = ints(contact + mj.contact_geoms, 2)
         if depth <= 0.0 or geoms[0] < 0 or geoms[1] < 0:
             continue
         side = is_tool[geoms[1]] - is_tool[geoms[0]]
         if side == 0:
             continue
         # the normal points from the first geom to the second
-        normal = vector_of(floats(contact + s.contact_frame, 3))
-        push = scaled(side * s.contact_stiffness * depth, normal)
-        arm = subtract(vector_of(floats(contact + s.contact_point, 3)), grip)
+        normal = vector_of(floats(contact + mj.contact_frame, 3))
+        push = scaled(side * s.run.contact_stiffness * depth, normal)
+        arm = subtract(vector_of(floats(contact + mj.contact_point, 3)), grip)
         force, torque = subtract(force, push), subtract(torque, cross(arm, push))
-        energy += 0.5 * s.contact_stiffness * depth * depth
-    s.kinetic, s.potential = 0.0, energy
+        energy += 0.5 * s.run.contact_stiffness * depth * depth
+    set_contact_springs_energy(s.energy, energy)
     return force, torque
+
+
+def massless_tool(model: mujoco.MjModel, grip_site: int) -> dict[str, NDArray[np.generic]]:
+    """Returns the arrays that the method needs, by their names in the sub-record ``mj``."""
+    numbers, addresses = tool_map(model, grip_site)
+    tool = model.body_weldid[model.site_bodyid[grip_site]]
+    is_tool = model.body_weldid[model.geom_bodyid] == tool
+    return {
+        "tool_map": numbers,
+        "tool_qpos": addresses,
+        "geom_is_tool": np.ascontiguousarray(is_tool, dtype=np.int32),
+    }

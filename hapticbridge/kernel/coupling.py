@@ -1,162 +1,241 @@
-"""The wrench on the tool, and what of it reaches the device."""
+"""The virtual coupling: its law, the energy of its springs, and changes of its gains.
+
+With e = h − x and φ the rotation vector from tool to handle, the wrench on the tool is
+
+    f = K e + (B'/T) (δh − δx),    τ = K_r φ + (B'_r/T) (δφ_h − δφ_x)
+
+K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; h and x are the positions of handle and
+tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
+inside MuJoCo's step; the functions here evaluate it afterwards, at the poses that resulted.
+
+A change of the gains during a run does work. With gains that change from tick to tick, the identity
+behind BC97 (6) becomes
+
+    Σ f_k·d_{k+1} + Σ ‖d_k‖²_{b/T} = Σ f_k·δx_k + Σ (terms >= 0) + ½‖p_{N+1}‖²_{K_N}
+                                     − ½‖p_1‖²_{K_1} − Σ W_k,
+    W_k = ½‖p_k‖²_{K_k − K_{k−1}},    p_k = h_k − x_{k−1} = e_{k−1} + d_k
+
+with d the steps of the handle. It holds if b ⪰ K_k T/2 + B_k in every tick. W_k is the energy by
+which the spring grows between the steps of handle and tool. The command gives it to the device;
+softening the coupling takes it away. A change of B does no work, and the environment's balance (14)
+does not contain the gains. W is booked as ``energy.tuning_work``.
+
+Two facts bound W. The gains move in a straight line over ``tuning_ticks`` ticks, so W_k is at most
+½ (K_goal − K)/n ‖p‖² per tick; the damping that a device needs is convex in K and B, so no coupling
+on the line needs more than the larger end. The guard's energy limit counts W, because it counts all
+energy that the device received beyond the hand's.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import DIRECT, FORCE_LIMITED, LOSSLESS, SLEW_LIMITED, WELD
-from hapticbridge.kernel.compared_methods import balance_contacts, weld_wrench
-from hapticbridge.kernel.guard import rise
-from hapticbridge.kernel.handle import device_from_scene
-from hapticbridge.kernel.ledger import refresh_poses
-from hapticbridge.kernel.lossless import implicit_half, is_near, midpoint_torque
+from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.ledger import add_tuning_work
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.passivity_controller import control
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
     Quaternion,
     Vector,
     add,
-    canonical,
     conjugate,
+    dot,
     norm,
+    product,
+    quaternion_exp,
     quaternion_of,
     rotated,
     rotation_between,
     scaled,
-    store_quaternion,
     store_vector,
     subtract,
     vector_of,
 )
 
+Gains = tuple[float, float, float]
+"""Gains of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m. For
+rotation: factor, N m/rad, N m s/rad."""
+
+TUNED = (
+    "stiffness",
+    "damping",
+    "rotational_stiffness",
+    "rotational_damping",
+    "slack_stiffness",
+    "slack_rotational_stiffness",
+)
+"""Numbers of the state that depend on the coupling, besides the gains of its actuators."""
+
+COUPLING_DTYPE = np.dtype(
+    [
+        *((name, "<f8") for name in TUNED),
+        ("gains", "<f8", 6),  # of the actuators: three for forces, three for torques
+        ("tuning_goal", "<f8", 12),  # TUNED, then gains
+        ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
+    ]
+)
+"""Sub-record ``coupling``, written by this module alone."""
+
+_GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
+
+
+def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
+    """Returns the numbers of ``TUNED`` for a coupling; all are linear in it."""
+    coupling = parameters.coupling
+    law = (getattr(coupling, name) for name in TUNED[:4])
+    return (*law, *parameters.slack_gains())
+
+
+def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float, ...]) -> None:
+    """Fills in the coupling that a run starts with."""
+    for name, value in zip(TUNED, tuned_values(parameters), strict=True):
+        coupling[name] = value
+    coupling["gains"] = gains
+
+
+def set_tuning_goal(
+    coupling: Part, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int
+) -> None:
+    """Sets the coupling of ``parameters`` as the goal of the next ``ticks`` ticks."""
+    coupling["tuning_goal"] = (*tuned_values(parameters), *gains[0], *gains[1])
+    coupling["tuning_ticks"] = ticks
+
 
 @compiled
-def _law(
-    state: NDArray[np.void],
+def law_wrench(
+    s: State,
     handle: tuple[Vector, Quaternion],
     tool: tuple[Vector, Quaternion],
     moved: Vector,
     turned: Vector,
 ) -> tuple[Vector, Vector]:
-    """The coupling's force and torque on the tool, over one of the tick's ``laws``."""
-    s = state[0]
-    share, rate = 1.0 / s.laws, s.laws / s.period
+    """Returns the coupling's force and torque on the tool, for one evaluation of the law.
+
+    Args:
+        s: The bound state.
+        handle: Position in m and orientation at the end of the step.
+        tool: Position in m and orientation at the end of the step.
+        moved: Motion of the tool in m since the previous evaluation.
+        turned: Its rotation vector in rad.
+    """
+    k, count = s.coupling, s.run.law_evaluations
+    share, rate = 1.0 / count, count / s.run.period
     stretch = subtract(handle[0], tool[0])
     twist = rotation_between(tool[1], handle[1])
+    handle_step = scaled(share, vector_of(s.pose.handle_step))
+    handle_turn = scaled(share, vector_of(s.pose.handle_turn))
     force = add(
-        scaled(s.stiffness, stretch),
-        scaled(s.damping * rate, subtract(scaled(share, vector_of(s.handle_step)), moved)),
+        scaled(k.stiffness, stretch), scaled(k.damping * rate, subtract(handle_step, moved))
     )
     torque = add(
-        scaled(s.rotational_stiffness, twist),
-        scaled(
-            s.rotational_damping * rate,
-            subtract(scaled(share, vector_of(s.handle_turn)), turned),
-        ),
+        scaled(k.rotational_stiffness, twist),
+        scaled(k.rotational_damping * rate, subtract(handle_turn, turned)),
     )
     return force, torque
 
 
 @compiled
-def _handle_in_scene(state: NDArray[np.void]) -> tuple[Vector, Quaternion]:
-    """The handle's pose as the step that just ended had it."""
-    s = state[0]
-    m = s.handle_mocap_id
-    position = vector_of(floats(s.mocap_pos + 24 * m, 3))
-    return position, canonical(quaternion_of(floats(s.mocap_quat + 32 * m, 4)))
+def wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Evaluates the law after a step of MuJoCo, and notes the tool's new pose.
 
+    Args:
+        s: The bound state.
+        is_last: True for the last substep of the tick.
 
-@compiled
-def wrench_of_step(
-    state: NDArray[np.void], substep: int, is_last: bool
-) -> tuple[Vector, Vector, Vector, Vector]:
-    """Returns the wrench on the tool and the tool's motion since the last time it was asked.
-
-    Brings the tool's pose up to date on the way; ``close_tick`` goes on from what is noted here.
+    Returns:
+        Force, torque, and the tool's motion and rotation vector since the previous evaluation.
     """
-    s = state[0]
-    applied = half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    if s.scheme == LOSSLESS:  # while everything is still as the step had it
-        s.is_near = is_near(state)
-        s.was_midpoint = s.is_midpoint
-        if s.is_midpoint:
-            half = implicit_half(state)
-    elif s.scheme == WELD:
-        applied = weld_wrench(state)  # in the Jacobians of the step's start, as the step had them
-    elif s.scheme == DIRECT:
-        applied = balance_contacts(state)
-    if s.scheme != DIRECT:
-        refresh_poses(state)
-    grip = s.grip_site_id
-    position = vector_of(floats(s.site_xpos + 24 * grip, 3))
-    orientation = canonical(quaternion_of(floats(s.site_xquat + 32 * grip, 4)))
-    before = quaternion_of(s.tool_quaternion)
-    moved = subtract(position, vector_of(s.tool_position))
-    turned = rotation_between(before, orientation)
-    if s.has_law:
-        handle = (vector_of(s.handle_position), quaternion_of(s.handle_quaternion))
-        if not is_last:
-            handle = _handle_in_scene(state)
-        applied = _law(state, handle, (position, orientation), moved, turned)
-        if s.scheme == LOSSLESS and s.is_midpoint:
-            applied = applied[0], midpoint_torque(state, orientation, turned)
-            # the torque is carried in the tool's frame, so that it turns with the tool
-            half = half[0], rotated(orientation, rotated(conjugate(before), half[1]))
-            store_vector(s.applied_half[0:3], half[0])
-            store_vector(s.applied_half[3:6], half[1])
-    store_vector(s.tool_position, position)
-    store_quaternion(s.tool_quaternion, orientation)
-    return applied[0], applied[1], moved, turned
+    position, orientation, moved, turned = tool_after_step(s)
+    handle = handle_of_step(s, is_last)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    note_tool(s.pose, position, orientation)
+    return force, torque, moved, turned
 
 
 @compiled
-def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
-    length = norm(v)
-    if length > limit:
-        return scaled(limit / length, v), True
-    return v, False
+def command_handle_velocity(s: State, orientation: Quaternion) -> None:
+    """Writes the handle's velocity in its own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T, as control.
 
-
-@compiled
-def _slewed(v: Vector, before: Vector, rise: float) -> tuple[Vector, bool]:
-    change = subtract(v, before)
-    length = norm(change)
-    if length > rise:
-        return add(before, scaled(rise / length, change)), True
-    return v, False
-
-
-@compiled
-def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
-    """Turns the wrench on the tool into the one on the device.
-
-    In this order: scale, passivity controller, limit by norm, slew limit, and what fades or starts
-    the wrench as a whole.
+    The actuators need it because a mocap body has no velocity of its own.
     """
-    s = state[0]
-    s.flags |= s.watch_flags
-    on_device = scaled(-s.force_scale, device_from_scene(s.axes, force))
-    torque_on_device = scaled(-s.force_scale / s.scale, device_from_scene(s.axes, torque))
-    asked = norm(on_device)
-    on_device, torque_on_device = control(state, on_device, torque_on_device)
-    on_device, is_limited = _limited(on_device, s.force_limit)
-    torque_on_device, is_torque_limited = _limited(torque_on_device, s.torque_limit)
-    if is_limited or is_torque_limited:
-        s.flags |= FORCE_LIMITED
-    last, last_torque = vector_of(s.slewed), vector_of(s.slewed[3:6])
-    on_device, is_slewed = _slewed(on_device, last, s.force_rise)
-    torque_on_device, is_torque_slewed = _slewed(torque_on_device, last_torque, s.torque_rise)
-    if is_slewed or is_torque_slewed:
-        s.flags |= SLEW_LIMITED
-    store_vector(s.slewed[0:3], on_device)
-    store_vector(s.slewed[3:6], torque_on_device)
-    share = rise(state)
-    if s.silent_ticks > 0:
-        share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
-    if share != 1.0:
-        on_device, torque_on_device = scaled(share, on_device), scaled(share, torque_on_device)
-    s.passed = min(norm(on_device) / asked, 1.0) if asked > 0.0 else share
-    store_vector(s.wrench_on_device[0:3], on_device)
-    store_vector(s.wrench_on_device[3:6], torque_on_device)
+    to_handle = conjugate(orientation)
+    ctrl = floats(s.mj.ctrl + 8 * s.mj.coupling_ctrl_adr, 6)
+    rate = 1.0 / s.run.period
+    store_vector(ctrl[0:3], scaled(rate, rotated(to_handle, vector_of(s.pose.handle_step))))
+    store_vector(ctrl[3:6], scaled(rate, rotated(to_handle, vector_of(s.pose.handle_turn))))
+
+
+@compiled
+def _spring_energy(stiffness: float, length: float, limit: float) -> float:
+    """Returns ∫ min(K e, F) de, the energy of a spring whose force is limited to F."""
+    elastic = min(length, limit / stiffness) if stiffness > 0.0 else 0.0
+    return 0.5 * stiffness * elastic * elastic + min(stiffness * length, limit) * (length - elastic)
+
+
+@compiled
+def releasable_energy(s: State) -> float:
+    """Returns r V(e) + r V(φ) in J, the energy that the springs can release to the device.
+
+    r = force_scale / scale; V is limited by the largest force and torque on the device.
+    """
+    pose, run = s.pose, s.run
+    ratio = run.force_scale / run.scale
+    stretch = norm(subtract(vector_of(pose.handle_position), vector_of(pose.tool_position)))
+    tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
+    twist = norm(rotation_between(tool, handle))
+    linear = _spring_energy(s.coupling.stiffness, stretch, run.force_limit / run.force_scale)
+    angular = _spring_energy(s.coupling.rotational_stiffness, twist, run.torque_limit / ratio)
+    return float(ratio * (linear + angular))
+
+
+@compiled
+def set_gains(s: State, share: float) -> None:
+    """Gives the coupling's actuators a share of their gains."""
+    mj = s.mj
+    for axis in range(6):
+        first = 0 if axis < 3 else 3
+        actuator = mj.coupling_actuator_id + axis
+        floats(mj.gainprm + 8 * _GAINS * actuator, 1)[0] = share * s.coupling.gains[first]
+        bias = floats(mj.biasprm + 8 * _GAINS * actuator, 3)
+        bias[1] = -share * s.coupling.gains[first + 1]
+        bias[2] = -share * s.coupling.gains[first + 2]
+
+
+@compiled
+def retune(s: State) -> None:
+    """Moves the gains one tick nearer to their goal, and books the work on the spring.
+
+    Needs the handle's new pose and the tool's old one. With n evaluations of the law per tick the
+    handle has made the first of its n steps by then.
+    """
+    k, goal, left = s.coupling, s.coupling.tuning_goal, s.coupling.tuning_ticks
+    stiffness, rotational = k.stiffness, k.rotational_stiffness
+    share = 1.0 / left
+    k.stiffness += share * (goal[0] - k.stiffness)
+    k.damping += share * (goal[1] - k.damping)
+    k.rotational_stiffness += share * (goal[2] - k.rotational_stiffness)
+    k.rotational_damping += share * (goal[3] - k.rotational_damping)
+    k.slack_stiffness += share * (goal[4] - k.slack_stiffness)
+    k.slack_rotational_stiffness += share * (goal[5] - k.slack_rotational_stiffness)
+    for i in range(6):
+        k.gains[i] += share * (goal[6 + i] - k.gains[i])
+    if left == 1:  # without the error of rounding
+        k.stiffness, k.damping = goal[0], goal[1]
+        k.rotational_stiffness, k.rotational_damping = goal[2], goal[3]
+        k.slack_stiffness, k.slack_rotational_stiffness = goal[4], goal[5]
+        for i in range(6):
+            k.gains[i] = goal[6 + i]
+    k.tuning_ticks = left - 1
+    set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)
+
+    pose = s.pose
+    ahead = 1.0 - 1.0 / s.run.law_evaluations
+    stretch = subtract(vector_of(pose.handle_position), scaled(ahead, vector_of(pose.handle_step)))
+    stretch = subtract(stretch, vector_of(pose.tool_position))
+    back = quaternion_exp(scaled(-ahead, vector_of(pose.handle_turn)))
+    orientation = product(back, quaternion_of(pose.handle_quaternion))
+    twist = rotation_between(quaternion_of(pose.tool_quaternion), orientation)
+    add_tuning_work(s.energy, 0.5 * (k.stiffness - stiffness) * dot(stretch, stretch))
+    add_tuning_work(s.energy, 0.5 * (k.rotational_stiffness - rotational) * dot(twist, twist))

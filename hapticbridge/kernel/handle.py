@@ -1,4 +1,4 @@
-"""Where a device's pose puts the handle, and vectors between the axes of device and scene."""
+"""Poses of device, handle and tool: the map from device to scene, and the steps of a tick."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import FORCE_OFF, LOSSLESS
-from hapticbridge.kernel.guard import held_energy
-from hapticbridge.kernel.mujoco_c import floats
+from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.mujoco_c import floats, mj_kinematics
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
     Quaternion,
@@ -16,137 +15,38 @@ from hapticbridge.pose import (
     add,
     canonical,
     conjugate,
-    dot,
     product,
     quaternion_exp,
     quaternion_of,
     rotation_between,
     scaled,
+    store_quaternion,
+    store_vector,
     subtract,
     vector_of,
 )
 
-# A coupling that is changed while the run goes on, and the work that the change does.
-#
-# The spring K e belongs to nobody's storage but the coupling's own. With gains that change from
-# tick to tick, f_k = K_k e_k + (B_k/T) (d_k − δx_k), the identity behind BC97 (6) becomes
-#
-# Σ f_k·d_{k+1} + Σ ‖d_k‖²_{b/T} = Σ f_k·δx_k + Σ (what was >= 0 before) + ½‖p_{N+1}‖²_{K_N} −
-# ½‖p_1‖²_{K_1} − Σ W_k, W_k = ½‖p_k‖²_{K_k − K_{k−1}}, p_k = h_k − x_{k−1} = e_{k−1} + d_k
-#
-# (d handle steps, δx tool steps, e = h − x), provided that b ⪰ K_k T/2 + B_k holds in every
-# tick. So W_k, the energy by which the spring grows between the handle's step and the tool's, is
-# what whoever turns the gains gives to the device (softening takes it away), and it is all: a
-# change of B does no work, and the environment's own balance (14) does not see the gains. W is
-# booked as the command's, ``tuning_work``, and neither as the environment's nor as the device's.
-#
-# Two things bound it. Gains move in a straight line over ``tuning_ticks`` ticks, so W_k per tick
-# is at most ½ (K_goal − K)/n ‖p‖²; and every coupling in between needs no more damping than one
-# of the ends, because the need is convex in K and B. And the guard's energy limit counts all
-# that the device was given beyond what the hand put in: W is in it. So that an hour of
-# dissipation does not pay for what a command does, each command caps what the hand has saved up
-# by then (``forget_dissipation``).
-
-Gains = tuple[float, float, float]
-"""Of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m (rotation: N m,
-N m/rad and N m s/rad per unit of control)."""
-
-TUNED = (
-    "stiffness",
-    "damping",
-    "rotational_stiffness",
-    "rotational_damping",
-    "slack_stiffness",
-    "slack_rotational_stiffness",
+POSE_DTYPE = np.dtype(
+    [
+        ("device_origin", "<f8", 7),
+        ("handle_origin", "<f8", 7),
+        ("device_position", "<f8", 3),
+        ("device_quaternion", "<f8", 4),
+        ("handle_position", "<f8", 3),
+        ("handle_quaternion", "<f8", 4),
+        ("tool_position", "<f8", 3),
+        ("tool_quaternion", "<f8", 4),
+        ("handle_step", "<f8", 3),
+        ("handle_turn", "<f8", 3),
+    ]
 )
-"""What of the state a change of the coupling changes, beside the gains of its actuators."""
-
-_GAINS = 10  # doubles that an actuator has for its gain, and for its bias (mjNGAIN, mjNBIAS)
-
-
-def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
-    """Returns the numbers of ``TUNED`` for a coupling; all are linear in it."""
-    coupling = parameters.coupling
-    law = (getattr(coupling, name) for name in TUNED[:4])
-    return (*law, *parameters.slack_gains())
-
-
-def forget_dissipation(state: NDArray[np.void]) -> None:
-    """Caps what the hand may have put in before a command, for the guard's energy limit.
-
-        given ← max(given, −(surplus + r V + r max(S − S_0 − U, 0))),   r = force_scale/scale
-
-    V is the energy of coupling springs whose wrench stops growing at the limits, S − S_0 what the
-    scene has taken up: both may come back to the hand. Not so U, what the scene took up while the
-    force was off by command, nor V then, for the coupling is re-seated before it is felt again.
-    What is gone for good may not either: else a hand that has rubbed away 1 J could be given as
-    much by a slider that is moved, or a force that is turned off and on, at the right moments.
-
-    Args:
-        state: The bound state, between two ticks.
-    """
-    s = state[0]
-    ratio = float(s["force_scale"] / s["scale"])
-    kept = max(float(s["kinetic"] + s["potential"] - s["start_energy"] - s["unfelt"]), 0.0)
-    held = 0.0 if s["commanded"] & FORCE_OFF else held_energy(state)
-    s["given"] = max(float(s["given"]), -(float(s["surplus"]) + held + ratio * kept))
-
-
-@compiled
-def set_gains(state: NDArray[np.void], share: float) -> None:
-    """Gives the coupling's actuators a share of their gains."""
-    s = state[0]
-    for axis in range(6):
-        first = 0 if axis < 3 else 3
-        actuator = s.coupling_actuator_id + axis
-        floats(s.gainprm + 8 * _GAINS * actuator, 1)[0] = share * s.gains[first]
-        bias = floats(s.biasprm + 8 * _GAINS * actuator, 3)
-        bias[1], bias[2] = -share * s.gains[first + 1], -share * s.gains[first + 2]
-
-
-@compiled
-def retune(state: NDArray[np.void]) -> None:
-    """Takes the gains one tick nearer to their goal, and books what that does to the spring.
-
-    Needs the handle's new pose and the tool's old one. Over several laws a tick the handle has made
-    the first of its steps by then.
-    """
-    s = state[0]
-    left = s.tuning_ticks
-    goal = s.tuning_goal
-    stiffness, rotational = s.stiffness, s.rotational_stiffness
-    share = 1.0 / left
-    s.stiffness += share * (goal[0] - s.stiffness)
-    s.damping += share * (goal[1] - s.damping)
-    s.rotational_stiffness += share * (goal[2] - s.rotational_stiffness)
-    s.rotational_damping += share * (goal[3] - s.rotational_damping)
-    s.slack_stiffness += share * (goal[4] - s.slack_stiffness)
-    s.slack_rotational_stiffness += share * (goal[5] - s.slack_rotational_stiffness)
-    for i in range(6):
-        s.gains[i] += share * (goal[6 + i] - s.gains[i])
-    if left == 1:  # rounding must not keep it off its goal
-        s.stiffness, s.damping = goal[0], goal[1]
-        s.rotational_stiffness, s.rotational_damping = goal[2], goal[3]
-        s.slack_stiffness, s.slack_rotational_stiffness = goal[4], goal[5]
-        for i in range(6):
-            s.gains[i] = goal[6 + i]
-    s.tuning_ticks = left - 1
-    set_gains(state, 0.5 if s.scheme == LOSSLESS and s.is_midpoint else 1.0)
-    s.has_positions = 0  # what was computed ahead knew the old gains
-
-    ahead = 1.0 - 1.0 / s.laws
-    stretch = subtract(vector_of(s.handle_position), scaled(ahead, vector_of(s.handle_step)))
-    stretch = subtract(stretch, vector_of(s.tool_position))
-    back = quaternion_exp(scaled(-ahead, vector_of(s.handle_turn)))
-    orientation = product(back, quaternion_of(s.handle_quaternion))
-    twist = rotation_between(quaternion_of(s.tool_quaternion), orientation)
-    s.tuning_work += 0.5 * (s.stiffness - stiffness) * dot(stretch, stretch)
-    s.tuning_work += 0.5 * (s.rotational_stiffness - rotational) * dot(twist, twist)
+"""Sub-record ``pose``, written by this module alone. Positions in m, quaternions (w, x, y, z);
+``handle_step`` in m and ``handle_turn`` in rad are the handle's motion in the present tick."""
 
 
 @compiled
 def scene_from_device(axes: NDArray[np.float64], v: Vector) -> Vector:
-    """Returns A v, A row by row."""
+    """Returns A v, with A row by row."""
     return (
         axes[0] * v[0] + axes[1] * v[1] + axes[2] * v[2],
         axes[3] * v[0] + axes[4] * v[1] + axes[5] * v[2],
@@ -156,7 +56,7 @@ def scene_from_device(axes: NDArray[np.float64], v: Vector) -> Vector:
 
 @compiled
 def device_from_scene(axes: NDArray[np.float64], v: Vector) -> Vector:
-    """Returns Aᵀ v, A row by row."""
+    """Returns Aᵀ v, with A row by row."""
     return (
         axes[0] * v[0] + axes[3] * v[1] + axes[6] * v[2],
         axes[1] * v[0] + axes[4] * v[1] + axes[7] * v[2],
@@ -166,19 +66,134 @@ def device_from_scene(axes: NDArray[np.float64], v: Vector) -> Vector:
 
 @compiled
 def handle_pose(
-    state: NDArray[np.void], position: Vector, quaternion: Quaternion
+    run: Part, pose: Part, position: Vector, quaternion: Quaternion
 ) -> tuple[Vector, Quaternion]:
     """Maps a device pose into the scene.
 
         h = h_0 + scale · A (p − p_0),    R_h = A (R R_0ᵀ) Aᵀ R_h0
 
-    A is the rotation from the device's axes to the scene's, subscript 0 the pose at the start.
+    A is the rotation from the device's axes to the scene's; subscript 0 marks the origins.
     """
-    s = state[0]
-    offset = subtract(position, vector_of(s.device_origin))
-    moved = scaled(s.scale, scene_from_device(s.axes, offset))
-    origin = s.handle_origin
-    start = quaternion_of(s.device_origin[3:7])
-    axes = quaternion_of(s.axes_quaternion)
+    offset = subtract(position, vector_of(pose.device_origin))
+    moved = scaled(run.scale, scene_from_device(run.axes, offset))
+    origin = pose.handle_origin
+    start = quaternion_of(pose.device_origin[3:7])
+    axes = quaternion_of(run.axes_quaternion)
     turn = product(product(axes, product(quaternion, conjugate(start))), conjugate(axes))
     return add(vector_of(origin), moved), canonical(product(turn, quaternion_of(origin[3:7])))
+
+
+def bind_poses(run: Part, pose: Part, parameters: RunParameters) -> None:
+    """Fills in the origins, and the poses of device and handle before the first tick."""
+    pose["device_origin"], pose["handle_origin"] = (
+        parameters.device_origin,
+        parameters.handle_origin,
+    )
+    x, y, z, qw, qx, qy, qz = parameters.device_start
+    pose["device_position"], pose["device_quaternion"] = (x, y, z), (qw, qx, qy, qz)
+    position, quaternion = handle_pose(run, pose, (x, y, z), (qw, qx, qy, qz))
+    pose["handle_position"], pose["handle_quaternion"] = position, quaternion
+
+
+def set_tool(pose: Part, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
+    """Sets the tool's pose at the start or after a reset."""
+    pose["tool_position"] = position
+    pose["tool_quaternion"] = quaternion if quaternion[0] >= 0 else -quaternion
+
+
+@compiled
+def move_device(pose: Part, position: Vector, quaternion: Quaternion) -> None:
+    """Notes the device's new pose."""
+    store_vector(pose.device_position, position)
+    store_quaternion(pose.device_quaternion, quaternion)
+
+
+@compiled
+def move_handle(pose: Part, position: Vector, quaternion: Quaternion) -> None:
+    """Notes the handle's new pose, and its step and turn since the previous tick."""
+    store_vector(pose.handle_step, subtract(position, vector_of(pose.handle_position)))
+    turn = rotation_between(quaternion_of(pose.handle_quaternion), quaternion)
+    store_vector(pose.handle_turn, turn)
+    store_vector(pose.handle_position, position)
+    store_quaternion(pose.handle_quaternion, quaternion)
+
+
+@compiled
+def anchor_handle(pose: Part, position: Vector, quaternion: Quaternion) -> None:
+    """Re-anchors the handle: a device pose belongs to the tool's present pose from now on."""
+    store_vector(pose.device_origin[0:3], position)
+    store_quaternion(pose.device_origin[3:7], quaternion)
+    store_vector(pose.handle_origin[0:3], vector_of(pose.tool_position))
+    store_quaternion(pose.handle_origin[3:7], quaternion_of(pose.tool_quaternion))
+
+
+def move_handle_to_tool(pose: Part) -> None:
+    """Puts the handle to the tool's pose, so that the coupling is not stretched."""
+    pose["handle_position"] = pose["tool_position"]
+    pose["handle_quaternion"] = pose["tool_quaternion"]
+
+
+@compiled
+def note_tool(pose: Part, position: Vector, quaternion: Quaternion) -> None:
+    """Notes the tool's new pose."""
+    store_vector(pose.tool_position, position)
+    store_quaternion(pose.tool_quaternion, quaternion)
+
+
+@compiled
+def grip_pose(mj: Part) -> tuple[Vector, Quaternion]:
+    """Returns the grip's pose as MuJoCo's kinematics left it."""
+    grip = mj.grip_site_id
+    position = vector_of(floats(mj.site_xpos + 24 * grip, 3))
+    return position, canonical(quaternion_of(floats(mj.site_xquat + 32 * grip, 4)))
+
+
+@compiled
+def tool_motion(s: State) -> tuple[Vector, Quaternion, Vector, Vector]:
+    """Returns the grip's pose, and its motion and rotation vector since it was last noted."""
+    position, orientation = grip_pose(s.mj)
+    moved = subtract(position, vector_of(s.pose.tool_position))
+    turned = rotation_between(quaternion_of(s.pose.tool_quaternion), orientation)
+    return position, orientation, moved, turned
+
+
+@compiled
+def tool_after_step(s: State) -> tuple[Vector, Quaternion, Vector, Vector]:
+    """Brings the bodies' poses to the end of the step, and returns ``tool_motion``.
+
+    ``mj_step`` leaves the poses of the step's start.
+    """
+    mj_kinematics(s.mj.model, s.mj.data)
+    return tool_motion(s)
+
+
+@compiled
+def place_handle(s: State, substep: int) -> Quaternion:
+    """Puts the handle's mocap body to its pose in this substep; returns its orientation.
+
+    The handle moves uniformly within a tick and reaches its new pose in the last substep.
+    """
+    mj = s.mj
+    pose = s.pose
+    position = vector_of(pose.handle_position)
+    orientation = quaternion_of(pose.handle_quaternion)
+    remaining = (s.run.substeps - 1 - substep) / s.run.substeps
+    if remaining > 0.0:
+        position = subtract(position, scaled(remaining, vector_of(pose.handle_step)))
+        back = quaternion_exp(scaled(-remaining, vector_of(pose.handle_turn)))
+        orientation = product(back, orientation)
+    m = mj.handle_mocap_id
+    store_vector(floats(mj.mocap_pos + 24 * m, 3), position)
+    store_quaternion(floats(mj.mocap_quat + 32 * m, 4), orientation)
+    return orientation
+
+
+@compiled
+def handle_of_step(s: State, is_last: bool) -> tuple[Vector, Quaternion]:
+    """Returns the handle's pose in the step that just ended."""
+    mj = s.mj
+    if is_last:
+        return vector_of(s.pose.handle_position), quaternion_of(s.pose.handle_quaternion)
+    m = mj.handle_mocap_id
+    position = vector_of(floats(mj.mocap_pos + 24 * m, 3))
+    return position, canonical(quaternion_of(floats(mj.mocap_quat + 32 * m, 4)))

@@ -1,16 +1,21 @@
-"""The coupling's port: storage after a step, the work of the coupling, and what is allowed.
+"""The energy balance of the environment: storage, the works of all ports, and the verdict.
 
-What the environment may have created until tick k is held against BC97 (14) and against the slack
-that the coupling leaves.
+    E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − W_actuators − W_external
+
+S is the energy that the scene stores, f and τ the coupling's wrench on the tool, δx and δφ the
+tool's motion in tick k; energies and works in J, wrenches in N and N m, motions in m and rad.
+Σ E_k <= 0 means that the simulation created no energy, BC97 (14).
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import CONTACT_PYRAMIDAL, EQUALITY, LIMIT_TENDON
+from hapticbridge.kernel.codes import CONTACT_PYRAMIDAL, EQUALITY, LIMIT_TENDON, Part, State
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -19,31 +24,76 @@ from hapticbridge.kernel.mujoco_c import (
     mj_energy_pos,
     mj_energy_vel,
     mj_fwd_kinematics,
-    mj_kinematics,
     mj_make_constraint,
     mj_make_m,
     pointer_at,
 )
-from hapticbridge.pose import add, cross, dot, quaternion_of, rotation_between, subtract, vector_of
+from hapticbridge.pose import (
+    Vector,
+    add,
+    cross,
+    dot,
+    quaternion_of,
+    rotation_between,
+    subtract,
+    vector_of,
+)
 
-# Work of the scene's own mocap bodies, which somebody moves between two steps.
+ENERGY_DTYPE = np.dtype(
+    [
+        ("kinetic", "<f8"),
+        ("potential", "<f8"),
+        ("start_energy", "<f8"),
+        ("coupling_work", "<f8"),
+        ("actuator_work", "<f8"),
+        ("external_work", "<f8"),
+        ("tuning_work", "<f8"),
+        ("environment_energy", "<f8"),
+        ("device_energy", "<f8"),
+        ("device_dissipation", "<f8"),
+        ("throughput", "<f8"),
+        ("slack", "<f8"),
+        ("slack_share", "<f8"),
+        ("first_unstrict", "<i8"),
+        ("first_active", "<i8"),
+        ("first_kick", "<i8"),
+        ("mocap_has_moved", "<i8"),
+        ("equality_rows", "<i8"),
+    ]
+)
+"""Sub-record ``energy``, written by this module alone. Energies and works in J, since the start;
+``first_*`` are the ticks at which a condition first failed, -1 before; the last two hold what a
+moved mocap body leaves until the step is done."""
+
+
+def start_energies(energy: Part) -> None:
+    """Takes the present storage as that of the start."""
+    energy["start_energy"] = energy["kinetic"] + energy["potential"]
+    for name in ("first_unstrict", "first_active", "first_kick"):
+        energy[name] = -1
+
+
+# Work of the scene's own mocap bodies, which are moved between two steps
 
 
 @compiled
-def note_moved_mocap_bodies(state: NDArray[np.void]) -> None:
-    """Before the step: finds the scene's mocap bodies that were moved, and their direct work.
+def note_moved_mocap_bodies(s: State) -> None:
+    """Finds the scene's mocap bodies that were moved before a step, and books their direct work.
 
-    Moving one changes at once the potential energy of what hangs on it (springs, weights): that
-    difference is work done by whoever moved it. What it does through contacts, limits and equality
-    constraints is only known after the step (``meter_ports``).
+    A move changes the potential energy of attached springs and weights at once; the change is work
+    of the external port. The work through contacts, limits and equality constraints is known only
+    after the step (``meter_ports``).
     """
-    s = state[0]
-    s.mocap_has_moved = 0
-    positions, quaternions = floats(s.mocap_pos, 3 * s.nmocap), floats(s.mocap_quat, 4 * s.nmocap)
-    previous = floats(s.mocap_previous, 7 * s.nmocap)
-    shift = floats(s.mocap_shift, 6 * s.nmocap)
-    for m in range(s.nmocap):
-        if m == s.handle_mocap_id:
+    mj = s.mj
+    s.energy.mocap_has_moved = 0
+    positions, quaternions = (
+        floats(mj.mocap_pos, 3 * mj.nmocap),
+        floats(mj.mocap_quat, 4 * mj.nmocap),
+    )
+    previous = floats(mj.mocap_previous, 7 * mj.nmocap)
+    shift = floats(mj.mocap_shift, 6 * mj.nmocap)
+    for m in range(mj.nmocap):
+        if m == mj.handle_mocap_id:
             continue
         has_moved = False
         for i in range(3):
@@ -59,61 +109,66 @@ def note_moved_mocap_bodies(state: NDArray[np.void]) -> None:
                 previous[7 * m + i] = positions[3 * m + i]
             for i in range(4):
                 previous[7 * m + 3 + i] = quaternions[4 * m + i]
-            s.mocap_has_moved = 1
+            s.energy.mocap_has_moved = 1
         else:
             for i in range(3, 6):
                 shift[6 * m + i] = 0.0
-    if s.mocap_has_moved:
-        _keep_residuals(state)
-        mj_fwd_kinematics(s.model, s.data)
-        mj_com_pos(s.model, s.data)
-        mj_energy_pos(s.model, s.data)
-        s.external_work += floats(s.energy, 2)[0] - s.potential
+    if s.energy.mocap_has_moved:
+        _keep_residuals(s)
+        mj_fwd_kinematics(mj.model, mj.data)
+        mj_com_pos(mj.model, mj.data)
+        mj_energy_pos(mj.model, mj.data)
+        s.energy.external_work += floats(mj.energy, 2)[0] - s.energy.potential
 
 
 @compiled
-def _keep_residuals(state: NDArray[np.void]) -> None:
-    """Keeps the residuals of equality constraints and tendon lengths as before the move."""
-    s = state[0]
-    s.equality_rows = 0
-    if s.equality_capacity > 0:
-        mj_make_constraint(s.model, s.data)  # positions are still those before the move
-        s.equality_rows = min(ints(s.ne, 1)[0], s.equality_capacity)
-        residuals = floats(pointer_at(s.efc_pos), s.equality_rows)
-        floats(s.equality_before, s.equality_rows)[:] = residuals
-    if s.ntendon > 0:
-        floats(s.tendon_before, s.ntendon)[:] = floats(s.ten_length, s.ntendon)
+def _keep_residuals(s: State) -> None:
+    """Keeps the residuals of equality constraints and the tendon lengths from before the move."""
+    mj = s.mj
+    s.energy.equality_rows = 0
+    if mj.equality_capacity > 0:
+        mj_make_constraint(mj.model, mj.data)  # positions are still those before the move
+        s.energy.equality_rows = min(ints(mj.ne, 1)[0], mj.equality_capacity)
+        residuals = floats(pointer_at(mj.efc_pos), s.energy.equality_rows)
+        floats(mj.equality_before, s.energy.equality_rows)[:] = residuals
+    if mj.ntendon > 0:
+        floats(mj.tendon_before, mj.ntendon)[:] = floats(mj.ten_length, mj.ntendon)
 
 
 @compiled
-def mocap_work(state: NDArray[np.void]) -> float:
-    """Work of moved mocap bodies through constraints: −Σ λ_i δr_i.
+def mocap_work(s: State) -> float:
+    """Returns the work of moved mocap bodies through constraints, −Σ λ_i δr_i in J.
 
-    λ_i is the force of a constraint row at the step that follows the move, as f_k goes with
-    x_k − x_{k−1} in the coupling's port; δr_i is by how much the move changed its residual: an
-    equality's error, a tendon's length, a contact's distance. Rows without a residual (friction,
-    also that of contacts) take no work from the move: to MuJoCo a mocap body has no velocity, so it
-    drags nothing along.
+    λ_i is the force of constraint row i in the step that follows the move, δr_i the change of its
+    residual by the move: an equality's error, a tendon's length or a contact's distance. Rows
+    without a residual (friction, also in contacts) take no work from the move. MuJoCo gives a mocap
+    body no velocity, so it drags nothing along.
 
-    For the same reason the damper of such a row acts against rest, not against the mocap body. A
-    slow move is exact (a lift costs m g h), but a fast one through a weld or a contact lags, and
-    what the row then gives to the scene beyond λ δr is counted as created: the environment may be
-    called active, and rightly, because MuJoCo's constraint is.
+    For that reason the damper of such a row acts against rest, not against the mocap body. Slow
+    moves are exact (a lift costs m g h). A fast move through a weld or a contact lags, and energy
+    that the row supplies beyond λ δr counts as generated. The verdict may then be active, which is
+    right: MuJoCo's constraint is active.
     """
-    s = state[0]
-    force = floats(pointer_at(s.efc_force), ints(s.nefc, 1)[0])
-    residual = floats(pointer_at(s.efc_pos), force.size)
-    kinds, ids = ints(pointer_at(s.efc_type), force.size), ints(pointer_at(s.efc_id), force.size)
+    mj = s.mj
+    force = floats(pointer_at(mj.efc_force), ints(mj.nefc, 1)[0])
+    residual = floats(pointer_at(mj.efc_pos), force.size)
+    kinds, ids = (
+        ints(pointer_at(mj.efc_type), force.size),
+        ints(pointer_at(mj.efc_id), force.size),
+    )
     work = 0.0
-    if ints(s.ne, 1)[0] == s.equality_rows:
-        before = floats(s.equality_before, s.equality_rows)
-        for i in range(s.equality_rows):
+    if ints(mj.ne, 1)[0] == s.energy.equality_rows:
+        before = floats(mj.equality_before, s.energy.equality_rows)
+        for i in range(s.energy.equality_rows):
             # the handle's weld is the coupling's port: its residual changes with the handle
-            if not (kinds[i] == EQUALITY and ids[i] == s.weld_id):
+            if not (kinds[i] == EQUALITY and ids[i] == mj.weld_id):
                 work -= force[i] * (residual[i] - before[i])
-    if s.ntendon > 0:
-        lengths, tendon_before = floats(s.ten_length, s.ntendon), floats(s.tendon_before, s.ntendon)
-        ranges = floats(s.tendon_range, 2 * s.ntendon)
+    if mj.ntendon > 0:
+        lengths, tendon_before = (
+            floats(mj.ten_length, mj.ntendon),
+            floats(mj.tendon_before, mj.ntendon),
+        )
+        ranges = floats(mj.tendon_range, 2 * mj.ntendon)
         for i in range(force.size):
             if kinds[i] == LIMIT_TENDON:
                 t = ids[i]
@@ -121,26 +176,26 @@ def mocap_work(state: NDArray[np.void]) -> float:
                 to_upper = abs(residual[i] - (ranges[2 * t + 1] - lengths[t]))
                 sign = 1.0 if to_lower <= to_upper else -1.0
                 work -= sign * force[i] * (lengths[t] - tendon_before[t])
-    for c in range(ints(s.ncon, 1)[0]):
-        work -= _contact_work(state, pointer_at(s.contact) + c * s.contact_size, force)
+    for c in range(ints(mj.ncon, 1)[0]):
+        work -= _contact_work(s, pointer_at(mj.contact) + c * mj.contact_size, force)
     return work
 
 
 @compiled
-def _contact_work(state: NDArray[np.void], contact: int, force: NDArray[np.float64]) -> float:
-    """λ δr of one contact: its normal force times the change of distance by the move."""
-    s = state[0]
-    row = ints(contact + s.contact_row, 1)[0]
-    geoms = ints(contact + s.contact_geoms, 2)
+def _contact_work(s: State, contact: int, force: NDArray[np.float64]) -> float:
+    """Returns λ δr of one contact, its normal force times the change of distance by the move."""
+    mj = s.mj
+    row = ints(contact + mj.contact_row, 1)[0]
+    geoms = ints(contact + mj.contact_geoms, 2)
     if row < 0 or geoms[0] < 0 or geoms[1] < 0:
         return 0.0
-    point, frame = floats(contact + s.contact_point, 3), floats(contact + s.contact_frame, 3)
-    body_of, mocap_of = ints(s.geom_bodyid, s.ngeom), ints(s.body_mocap, s.nbody)
-    positions, shift = floats(s.mocap_pos, 3 * s.nmocap), floats(s.mocap_shift, 6 * s.nmocap)
+    point, frame = floats(contact + mj.contact_point, 3), floats(contact + mj.contact_frame, 3)
+    body_of, mocap_of = ints(mj.geom_bodyid, mj.ngeom), ints(mj.body_mocap, mj.nbody)
+    positions, shift = (floats(mj.mocap_pos, 3 * mj.nmocap), floats(mj.mocap_shift, 6 * mj.nmocap))
     change = 0.0
     for side in range(2):
         m = mocap_of[body_of[geoms[side]]]
-        if m < 0 or m == s.handle_mocap_id:
+        if m < 0 or m == mj.handle_mocap_id:
             continue
         p, d = 3 * m, 6 * m
         arm = subtract(vector_of(point), vector_of(positions[p:]))
@@ -150,31 +205,31 @@ def _contact_work(state: NDArray[np.void], contact: int, force: NDArray[np.float
     if change == 0.0:
         return 0.0
     rows = 1
-    if ints(pointer_at(s.efc_type), force.size)[row] == CONTACT_PYRAMIDAL:
-        rows = 2 * (ints(contact + s.contact_dim, 1)[0] - 1)  # every edge carries the normal
+    if ints(pointer_at(mj.efc_type), force.size)[row] == CONTACT_PYRAMIDAL:
+        rows = 2 * (ints(contact + mj.contact_dim, 1)[0] - 1)  # every edge carries the normal
     normal = 0.0
     for i in range(row, row + rows):
         normal += force[i]
     return normal * change
 
 
-# Work that enters the environment in one MuJoCo step through ports other than the coupling.
+# Work that enters the environment in one MuJoCo step through ports other than the coupling
 #
 # MuJoCo's ``discrete`` step solves M (v⁺ − v)/h = f(q, v) − … in the positions and Jacobians of
-# its start, and moves by h v⁺. The work of a generalised force Q in that step is therefore h Q ·
-# v⁺, with the Q that the step really used: for a stiff servo that is its force at the end of the
-# step, not ``actuator_force``, which is the one at the start.
+# its start, and moves by h v⁺. A generalised force Q therefore does the work h Q·v⁺, with the Q
+# that the step used. For a stiff servo that is its force at the end of the step;
+# ``actuator_force`` is the force at the start.
 
 
 @compiled
-def moment_dot(state: NDArray[np.void], output: int, vector_address: int) -> float:
+def moment_dot(s: State, output: int, vector_address: int) -> float:
     """Returns one row of the actuator moment times a vector over the degrees of freedom."""
-    s = state[0]
-    nnz = ints(s.moment_rownnz, output + 1)[output]
-    adr = ints(s.moment_rowadr, output + 1)[output]
-    columns = ints(s.moment_colind, adr + nnz)
-    moment = floats(s.actuator_moment, adr + nnz)
-    vector = floats(vector_address, s.nv)
+    mj = s.mj
+    nnz = ints(mj.moment_rownnz, output + 1)[output]
+    adr = ints(mj.moment_rowadr, output + 1)[output]
+    columns = ints(mj.moment_colind, adr + nnz)
+    moment = floats(mj.actuator_moment, adr + nnz)
+    vector = floats(vector_address, mj.nv)
     total = 0.0
     for i in range(adr, adr + nnz):
         total += moment[i] * vector[columns[i]]
@@ -182,180 +237,228 @@ def moment_dot(state: NDArray[np.void], output: int, vector_address: int) -> flo
 
 
 @compiled
-def _actuator_work(state: NDArray[np.void]) -> float:
-    """Work of the scene's own actuators: h Σ (F − k h m·v − (h²k_p + h k_v) m·a) m·v⁺.
+def _actuator_work(s: State) -> float:
+    """Returns the work of the scene's own actuators in J.
 
-    F is the force at the start, m the moment, a = (v⁺ − v)/h. The two corrections take F to the
-    end of the step; MuJoCo keeps them in ``efm_ak`` = h k_p and ``efm_as`` = h² k_p + h k_v for the
-    actuators in its effective metric. ``qfrc_actuator`` is used for the sum because it has the
-    limits of joints applied; the coupling's share is taken out again.
+        W = h Σ (F − h k_p m·v − (h² k_p + h k_v) m·a) m·v⁺
+
+    F is the force at the step's start, m the moment, a = (v⁺ − v)/h, h the time step, k_p and k_v
+    the gains of a servo. The two corrections take F to the end of the step. MuJoCo keeps them for
+    the actuators in its effective metric: ``efm_ak`` = h k_p, ``efm_as`` = h² k_p + h k_v. The sum
+    uses ``qfrc_actuator``, which respects the joints' force limits, and subtracts the coupling.
     """
-    s = state[0]
-    h = s.timestep
-    qvel, force = floats(s.qvel, s.nv), floats(s.qfrc_actuator, s.nv)
+    mj = s.mj
+    h = s.run.timestep
+    qvel, force = floats(mj.qvel, mj.nv), floats(mj.qfrc_actuator, mj.nv)
     power = 0.0
-    for i in range(s.nv):
+    for i in range(mj.nv):
         power += force[i] * qvel[i]
-    first = s.coupling_output_adr
-    forces = floats(s.actuator_force, first + 6)
+    first = mj.coupling_output_adr
+    forces = floats(mj.actuator_force, first + 6)
     for output in range(first, first + 6):
-        power -= forces[output] * moment_dot(state, output, s.qvel)
-    count = ints(s.nefmA, 1)[0]
+        power -= forces[output] * moment_dot(s, output, mj.qvel)
+    count = ints(mj.nefmA, 1)[0]
     if count > 0:
-        ids = ints(pointer_at(s.efm_aid), count)
-        scales = floats(pointer_at(s.efm_as), count)
-        stiffnesses = floats(pointer_at(s.efm_ak), count)
+        ids = ints(pointer_at(mj.efm_aid), count)
+        scales = floats(pointer_at(mj.efm_as), count)
+        stiffnesses = floats(pointer_at(mj.efm_ak), count)
         for k in range(count):
             actuator = ids[k]
-            if s.coupling_actuator_id <= actuator < s.coupling_actuator_id + 6:
+            if mj.coupling_actuator_id <= actuator < mj.coupling_actuator_id + 6:
                 continue
-            adr = ints(s.outadr, actuator + 1)[actuator]
-            num = ints(s.outnum, actuator + 1)[actuator]
+            adr = ints(mj.outadr, actuator + 1)[actuator]
+            num = ints(mj.outnum, actuator + 1)[actuator]
             for output in range(adr, adr + num):
-                end = moment_dot(state, output, s.qvel)
-                change = moment_dot(state, output, s.qacc)
+                end = moment_dot(s, output, mj.qvel)
+                change = moment_dot(s, output, mj.qacc)
                 power -= (stiffnesses[k] * (end - h * change) + scales[k] * change) * end
     return float(h * power)
 
 
 @compiled
-def add_body_wrenches(state: NDArray[np.void], result: int, clears: bool = False) -> bool:
-    """Adds ``xfrc_applied``, as generalised forces at the positions as they are, to an address.
+def add_body_wrenches(s: State, result: int, clears: bool = False) -> bool:
+    """Adds ``xfrc_applied`` as generalised forces, at the present positions, to an array.
 
     Args:
-        state: The bound state.
-        result: Address of a number per degree of freedom.
-        clears: Whether to clear these first, where a body is loaded.
+        s: The bound state.
+        result: Address of ``nv`` numbers.
+        clears: True to set these to zero first if a body is loaded.
 
     Returns:
-        Whether a body is loaded; else nothing was written.
+        True if a body is loaded; otherwise nothing was written.
     """
-    s = state[0]
-    wrenches = floats(s.xfrc_applied, 6 * s.nbody)
+    mj = s.mj
+    wrenches = floats(mj.xfrc_applied, 6 * mj.nbody)
     found = False
-    for body in range(1, s.nbody):
+    for body in range(1, mj.nbody):
         is_loaded = False
         for i in range(6 * body, 6 * body + 6):
             is_loaded = is_loaded or wrenches[i] != 0.0
         if is_loaded:
             if clears and not found:
-                floats(result, s.nv)[:] = 0.0
+                floats(result, mj.nv)[:] = 0.0
             found = True
-            force = s.xfrc_applied + 48 * body
+            force = mj.xfrc_applied + 48 * body
             mj_apply_ft(
-                s.model, s.data, force, force + 24, s.xipos + 24 * body, np.int32(body), result
+                mj.model, mj.data, force, force + 24, mj.xipos + 24 * body, np.int32(body), result
             )
     return found
 
 
 @compiled
-def _applied_work(state: NDArray[np.void]) -> float:
-    """Work of ``qfrc_applied``, ``xfrc_applied`` and passive gravity compensation."""
-    s = state[0]
-    nv = s.nv
-    qvel, applied = floats(s.qvel, nv), floats(s.qfrc_applied, nv)
+def _applied_work(s: State) -> float:
+    """Returns the work of applied forces, body wrenches and passive gravity compensation in J."""
+    mj = s.mj
+    nv = mj.nv
+    qvel, applied = floats(mj.qvel, nv), floats(mj.qfrc_applied, nv)
     power = 0.0
     for i in range(nv):
         power += applied[i] * qvel[i]
-    if s.has_gravity_compensation:
+    if mj.has_gravity_compensation:
         compensation, is_passive = (
-            floats(s.qfrc_gravcomp, nv),
-            floats(s.passive_gravcomp_dofs, nv),
+            floats(mj.qfrc_gravcomp, nv),
+            floats(mj.passive_gravcomp_dofs, nv),
         )
         for i in range(nv):
             power += compensation[i] * is_passive[i] * qvel[i]
     # positions are still those of the step's start, where MuJoCo applied the wrenches
-    if add_body_wrenches(state, s.scratch, clears=True):
-        generalised = floats(s.scratch, nv)
+    if add_body_wrenches(s, mj.scratch, clears=True):
+        generalised = floats(mj.scratch, nv)
         for i in range(nv):
             power += generalised[i] * qvel[i]
-    return float(s.timestep * power)
+    return float(s.run.timestep * power)
 
 
 @compiled
-def meter_ports(state: NDArray[np.void]) -> None:
-    """Adds the work of the step that just ended to the actuator and the external port.
+def meter_ports(s: State) -> None:
+    """Adds the work of the step that just ended to the actuator port and the external port.
 
-    Must run before kinematics are refreshed: moments, Jacobians and points of attack are those of
-    the step's start, as the step used them.
+    Must run before the kinematics are refreshed: the step used moments, Jacobians and points of
+    attack of its start.
     """
-    s = state[0]
-    if s.has_actuators:
-        s.actuator_work += _actuator_work(state)
-    s.external_work += _applied_work(state)
-    if s.mocap_has_moved:
-        s.external_work += mocap_work(state)
-        s.mocap_has_moved = 0
+    if s.mj.has_actuators:
+        s.energy.actuator_work += _actuator_work(s)
+    s.energy.external_work += _applied_work(s)
+    if s.energy.mocap_has_moved:
+        s.energy.external_work += mocap_work(s)
+        s.energy.mocap_has_moved = 0
 
+
+# Storage, the ports of coupling and device, and the verdict
 
 ENERGY_TOLERANCE = 1e-9
-"""An environment is strict while Σ E_k <= 1e-9 J + 1e-9 Σ|f·δx|: rounding of a sum of many small
-works, not physics. Larger hides real creation, smaller reports rounding."""
+"""Energy in J, and share of Σ|f·δx|, that an environment may generate and still count as strict.
+It covers the rounding of a sum of many small works. A larger value hides real generation, a smaller
+one reports rounding."""
 
 
 @compiled
-def refresh_poses(state: NDArray[np.void]) -> None:
-    """Brings the bodies' poses to the state after the step (``mj_step`` leaves those before)."""
-    s = state[0]
-    mj_kinematics(s.model, s.data)
+def refresh_energies(s: State) -> None:
+    """Computes kinetic and potential energy for the state after the step.
 
-
-@compiled
-def refresh_energies(state: NDArray[np.void]) -> None:
-    """Brings the energies to the state after the step.
-
-    Kinetic energy needs the inertia matrix, potential energy the positions and, where there are
-    any, tendon lengths. Where MuJoCo's position stage has run since the step, all that is there.
+    Kinetic energy needs the inertia matrix, potential energy the positions and the tendon lengths.
+    MuJoCo's position stage has computed them if it ran since the step.
     """
-    s = state[0]
-    if not s.has_positions:
-        if s.has_tendons_or_flexes:
-            mj_fwd_kinematics(s.model, s.data)
+    mj = s.mj
+    if not s.loop.has_positions:
+        if mj.has_tendons_or_flexes:
+            mj_fwd_kinematics(mj.model, mj.data)
         else:
-            mj_com_pos(s.model, s.data)
-        mj_make_m(s.model, s.data)
-    mj_energy_pos(s.model, s.data)
-    mj_energy_vel(s.model, s.data)
-    energy = floats(s.energy, 2)
-    s.potential, s.kinetic = energy[0], energy[1]
+            mj_com_pos(mj.model, mj.data)
+        mj_make_m(mj.model, mj.data)
+    mj_energy_pos(mj.model, mj.data)
+    mj_energy_vel(mj.model, mj.data)
+    energy = floats(mj.energy, 2)
+    s.energy.potential, s.energy.kinetic = energy[0], energy[1]
 
 
 @compiled
-def add_coupling_work(state: NDArray[np.void], work: float) -> None:
-    """Adds f·δx + τ·δφ to the coupling's port, for as long as that wrench acted."""
-    s = state[0]
-    s.coupling_work += work
-    s.throughput += abs(work)
+def set_kinetic_energy(energy: Part, kinetic: float) -> None:
+    """Replaces the kinetic energy by that of the velocity which a method balances."""
+    energy.kinetic = kinetic
 
 
 @compiled
-def judge_environment(state: NDArray[np.void]) -> None:
-    """Closes the tick's balance and holds the environment against (14) and the slack.
+def set_contact_springs_energy(energy: Part, potential: float) -> None:
+    """Sets the storage of a tool without mass: its contact springs alone."""
+    energy.kinetic, energy.potential = 0.0, potential
 
-    E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − actuators − external
-    slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
 
-    with the gains of ``RunParameters.slack_gains``: K + B/T and K_r + B_r/T with one law a tick.
+@compiled
+def add_coupling_work(energy: Part, work: float) -> None:
+    """Adds the work f·δx + τ·δφ on the tool, in J."""
+    energy.coupling_work += work
+    energy.throughput += abs(work)
 
-    Where there is no coupling law (a weld, a tool without mass), the environment may satisfy (14)
-    and the device still be kicked: there, what it was given is held against what its damping burns,
-    b ‖δp_k‖² over the time between two samples at least, and against what the scene gave up.
+
+@compiled
+def add_tuning_work(energy: Part, work: float) -> None:
+    """Adds the work of a command that changes the coupling's spring, in J."""
+    energy.tuning_work += work
+
+
+def add_reset_work(energy: Part, work: float) -> None:
+    """Adds the storage that a reset of the scene put in, in J, to the external port."""
+    energy["external_work"] += work
+
+
+@compiled
+def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> None:
+    """Adds the work on the device, and the least dissipation of its damper, b ‖δp‖²/t.
+
+    Over a time t the damper dissipates ∫ b v² dt >= b ‖δp‖²/t, for every motion that ends δp away.
+    Before the first tick and in a pause, the time that the device took to move is unknown; its
+    dissipation then counts as zero.
+
+    Args:
+        s: The bound state with the previous wrench on the device.
+        moved: δp in m since the previous tick.
+        turned: Its rotation vector in rad.
+        interval: t in s since the device's last new sample.
     """
-    s = state[0]
-    moved, turned = vector_of(s.motion), vector_of(s.motion[3:6])
-    s.slack += 0.5 * s.slack_stiffness * dot(moved, moved)
-    s.slack += 0.5 * s.slack_rotational_stiffness * dot(turned, turned)
-    stored = (s.kinetic + s.potential) - s.start_energy
-    s.environment_energy = stored - s.coupling_work - s.actuator_work - s.external_work
-    allowed = ENERGY_TOLERANCE * (1.0 + s.throughput)
-    if s.watches_device:
-        # what left the scene towards the device must come from the scene, or be burnt there
-        gained = (s.force_scale / s.scale) * (stored - s.actuator_work - s.external_work)
-        if s.first_kick < 0 and s.device_energy - s.device_burnt + gained > allowed:
-            s.first_kick = s.tick
-    if s.environment_energy > allowed:
-        if s.first_unstrict < 0:
-            s.first_unstrict = s.tick
-        s.slack_share = max(s.slack_share, s.environment_energy / (s.slack + allowed))
-        if s.environment_energy > s.slack + allowed and s.first_active < 0:
-            s.first_active = s.tick
+    w, energy = s.loop.wrench_on_device, s.energy
+    energy.device_energy += dot(vector_of(w), moved) + dot(vector_of(w[3:6]), turned)
+    if s.loop.tick > s.guard.ramp_start:
+        energy.device_dissipation += s.run.device_damping / interval * dot(moved, moved)
+        energy.device_dissipation += (
+            s.run.device_rotational_damping / interval * dot(turned, turned)
+        )
+
+
+@compiled
+def judge_environment(s: State) -> bool:
+    """Closes the tick's balance and compares it with (14) and with the slack.
+
+        slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
+
+    g in N/m and g_r in N m/rad are those of ``RunParameters.slack_gains``: K + B/T and K_r + B_r/T
+    with one evaluation of the law per tick.
+
+    Without a coupling law (a weld, a tool without mass) the device can receive too much energy even
+    if (14) holds. For these methods, the energy sent to the device is compared with its damper's
+    dissipation plus the energy that the scene released.
+
+    Returns:
+        True if the balance is finite.
+    """
+    energy = s.energy
+    moved, turned = vector_of(s.loop.motion), vector_of(s.loop.motion[3:6])
+    energy.slack += 0.5 * s.coupling.slack_stiffness * dot(moved, moved)
+    energy.slack += 0.5 * s.coupling.slack_rotational_stiffness * dot(turned, turned)
+    stored = (energy.kinetic + energy.potential) - energy.start_energy
+    created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
+    energy.environment_energy = created
+    allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput)
+    if s.run.watches_device:
+        ratio = s.run.force_scale / s.run.scale
+        gained = ratio * (stored - energy.actuator_work - energy.external_work)
+        excess = energy.device_energy - energy.device_dissipation + gained
+        if energy.first_kick < 0 and excess > allowed:
+            energy.first_kick = s.loop.tick
+    if created > allowed:
+        if energy.first_unstrict < 0:
+            energy.first_unstrict = s.loop.tick
+        energy.slack_share = max(energy.slack_share, created / (energy.slack + allowed))
+        if created > energy.slack + allowed and energy.first_active < 0:
+            energy.first_active = s.loop.tick
+    return math.isfinite(created)

@@ -1,23 +1,27 @@
 """The lossless coupling: half of the wrench solved implicitly, half carried over.
 
-With K/2 and B'/2 in MuJoCo's implicit step and the other half of the last wrench applied, a tool
-away from contact keeps the midpoint rule's energy balance to rounding, and is second order.
-MuJoCo's velocity u is then half a wrench late; the velocity whose energy is balanced is
+MuJoCo's implicit step applies K/2 and B'/2; the other half of the last wrench is applied as a
+force. Away from contact the tool then keeps the energy balance of the midpoint rule to rounding,
+and the scheme is of second order. MuJoCo's velocity u lags by half a wrench. The balanced one is
 
     v_k = u_k + (T/2) M⁻¹ [2 J_kᵀ r_k − c(q_k, u_k) + p_k],      S_k = ½ v_kᵀ M v_k + potential
 
-with r the wrench that is carried over, c MuJoCo's bias (Coriolis, gyroscopic, gravity) and p the
-passive and applied forces. In the step after it
+with r the carried wrench (N, N m), J the grip's Jacobian, M the inertia matrix, c MuJoCo's bias
+(Coriolis, gyroscopic, gravity), p the passive and applied forces, T the period in s and S the
+storage in J. The next step applies
 
     qfrc_applied = J_kᵀ r_k + c(q_k, u_k) − c(q_k, v_k)
 
-puts the bias at v where MuJoCo takes it at u. What the user applies enters as the mean of now and
-before. In contact half of a wrench that is a step late would create energy, so the tool changes
-over to the implicit form before it touches, and back after it has been free for a while; both ways
-keep S. B' stays the same, so that one device condition holds on both sides: with more in contact, a
-device that bears only the less would be thrown off for ever (``passivity.compensation``).
+so that the bias acts at v where MuJoCo evaluates it at u. Forces that the user applies enter as the
+mean of their present and previous values.
 
-The trees that the tool does not belong to are MuJoCo's alone: for them v = u.
+In contact, half a wrench that is one step late would generate energy. The tool therefore changes to
+the implicit form before it touches, and back after it has been free for ``HOLDOFF`` ticks. Both
+changes keep S. B' is equal on both sides, so one device condition covers both. With a larger B' in
+contact, a device that bears only the smaller one would be thrown off forever
+(``theory.compensation``).
+
+Kinematic trees other than the tool's belong to MuJoCo alone: for them v = u.
 """
 
 from __future__ import annotations
@@ -31,9 +35,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import LIMIT_JOINT, LIMIT_TENDON
-from hapticbridge.kernel.handle import set_gains
-from hapticbridge.kernel.ledger import add_body_wrenches, moment_dot
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    LIMIT_JOINT,
+    LIMIT_TENDON,
+    LOSSLESS_TICK,
+    Part,
+    State,
+)
+from hapticbridge.kernel.coupling import law_wrench, set_gains
+from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.ledger import add_body_wrenches, moment_dot, set_kinetic_energy
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -60,276 +72,379 @@ from hapticbridge.pose import (
     vector_of,
 )
 
-# The velocity v at which a lossless step's energy is balanced, and what is carried to the next.
-#
-# Formulas and symbols: ``kernel.lossless``.
+_OWN_VECTORS = (
+    "last_written",
+    "carried_force",
+    "external",
+    "velocity",
+    "half_step",
+    "bias_at_u",
+    "bias_at_v",
+    "generalised",
+    "work_buffer",
+)
+_ADDRESSES = (
+    "qfrc_written",
+    "qfrc_passive",
+    "geom_in_tree",
+    "joint_in_tree",
+    "dof_in_tree",
+    "wrench_buffer",
+)
 
-LARGEST_SHARE_BACK = 1e-3
-"""Share of the tool's kinetic energy that a tick gives back at most, no unit: a speed of 0.05 %,
-hundreds of times what free motion needs. More would be felt where there is next to no motion."""
+LOSSLESS_DTYPE = np.dtype(
+    [
+        *((name, "<i8") for name in _OWN_VECTORS + _ADDRESSES),
+        ("has_passive", "<i8"),
+        ("is_never_free", "<i8"),
+        ("is_midpoint", "<i8"),
+        ("was_midpoint", "<i8"),
+        ("is_near", "<i8"),
+        ("is_constrained", "<i8"),
+        ("holdoff", "<i8"),
+        ("ticks", "<i8"),
+        ("active_contacts", "<i8"),
+        ("energy_debt", "<f8"),
+        ("twist", "<f8", 3),
+        ("applied_half", "<f8", 6),
+    ]
+)
+"""Sub-record ``lossless``, written by this module alone.
+
+Addresses of vectors over the degrees of freedom come first. ``is_midpoint`` and ``was_midpoint``
+are the form of the next and of the last step; ``holdoff`` counts the ticks until the tool may be
+lossless again; ``energy_debt`` in J is generated energy that is still to be taken back; ``twist``
+in rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
+
+# The velocity v at which a lossless step's energy is balanced, and the force carried over
+
+MAX_SHARE_BACK = 1e-3
+"""Largest share of the tool's kinetic energy that a tick takes back; no unit. It changes the speed
+by 0.05 %, hundreds of times the need of free motion. A larger share would be felt in slow
+motion."""
 
 
 @compiled
-def write_bias(state: NDArray[np.void], velocity: int, result: int) -> None:
-    """Writes c(q_k, v) for a velocity by address; MuJoCo's own velocity stays as it is."""
-    s = state[0]
-    qvel, given, kept = floats(s.qvel, s.nv), floats(velocity, s.nv), floats(s.kept, s.nv)
-    for i in range(s.nv):
-        kept[i] = qvel[i]
-        qvel[i] = given[i]
-    mj_com_vel(s.model, s.data)
-    mj_rne(s.model, s.data, np.int32(0), result)
-    for i in range(s.nv):
-        qvel[i] = kept[i]
+def write_bias(s: State, velocity: int, result: int) -> None:
+    """Writes c(q_k, v) for a velocity at an address; MuJoCo's own velocity is left unchanged."""
+    mj = s.mj
+    qvel, other, saved = (
+        floats(mj.qvel, mj.nv),
+        floats(velocity, mj.nv),
+        floats(s.lossless.work_buffer, mj.nv),
+    )
+    for i in range(mj.nv):
+        saved[i] = qvel[i]
+        qvel[i] = other[i]
+    mj_com_vel(mj.model, mj.data)
+    mj_rne(mj.model, mj.data, np.int32(0), result)
+    for i in range(mj.nv):
+        qvel[i] = saved[i]
 
 
 @compiled
-def carry(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
-    """Writes J_kᵀ r_k for a wrench in the world frame, about the grip."""
-    s = state[0]
-    generalised, wrench = floats(s.generalised, s.nv), floats(s.wrench_buffer, 6)
+def carry(s: State, force: Vector, torque: Vector) -> None:
+    """Writes J_kᵀ r_k for a wrench r_k in the world frame, about the grip."""
+    mj, lossless = s.mj, s.lossless
+    generalised, wrench = (floats(lossless.generalised, mj.nv), floats(lossless.wrench_buffer, 6))
     generalised[:] = 0.0
     for i in range(3):
         wrench[i], wrench[3 + i] = force[i], torque[i]
     mj_apply_ft(
-        s.model,
-        s.data,
-        s.wrench_buffer,
-        s.wrench_buffer + 24,
-        s.site_xpos + 24 * s.grip_site_id,
-        np.int32(s.grip_body_id),
-        s.generalised,
+        mj.model,
+        mj.data,
+        lossless.wrench_buffer,
+        lossless.wrench_buffer + 24,
+        mj.site_xpos + 24 * mj.grip_site_id,
+        np.int32(mj.grip_body_id),
+        lossless.generalised,
     )
 
 
 @compiled
-def write_external(state: NDArray[np.void], result: int) -> None:
-    """Writes what the user applies, to joints and to bodies, as generalised forces."""
-    s = state[0]
-    users, external = floats(s.qfrc_applied, s.nv), floats(result, s.nv)
-    for i in range(s.nv):
+def write_external(s: State, result: int) -> None:
+    """Writes the user's forces on joints and wrenches on bodies as generalised forces."""
+    mj = s.mj
+    users, external = floats(mj.qfrc_applied, mj.nv), floats(result, mj.nv)
+    for i in range(mj.nv):
         external[i] = users[i]
-    add_body_wrenches(state, result)
+    add_body_wrenches(s, result)
 
 
 @compiled
-def write_half_step(state: NDArray[np.void]) -> None:
-    """Writes (T/2) M⁻¹ [2 Jᵀr − c(q, u) + p] of the tool's tree.
+def write_half_step(s: State) -> None:
+    """Writes (T/2) M⁻¹ [2 Jᵀr − c(q, u) + p] for the tool's tree.
 
-    Needs ``carry``, the bias and ``write_external``.
+    Needs the results of ``carry``, ``write_bias`` and ``write_external``.
     """
-    s = state[0]
-    carried, bias = floats(s.generalised, s.nv), floats(s.bias_at_u, s.nv)
-    passive, external = floats(s.qfrc_passive, s.nv), floats(s.external, s.nv)
-    kick, half = floats(s.kept, s.nv), floats(s.half_step, s.nv)
-    for i in range(s.nv):
-        kick[i] = 2.0 * carried[i] - bias[i] + external[i]
-        if s.has_passive:
-            kick[i] += passive[i]
-    mj_solve_m(s.model, s.data, s.half_step, s.kept, np.int32(1))
-    in_tree = ints(s.dof_in_tree, s.nv)
-    for i in range(s.nv):
-        half[i] *= 0.5 * s.period * in_tree[i]
+    mj, lossless = s.mj, s.lossless
+    carried, bias = floats(lossless.generalised, mj.nv), floats(lossless.bias_at_u, mj.nv)
+    passive, external = (floats(lossless.qfrc_passive, mj.nv), floats(lossless.external, mj.nv))
+    impulse, half = floats(lossless.work_buffer, mj.nv), floats(lossless.half_step, mj.nv)
+    for i in range(mj.nv):
+        impulse[i] = 2.0 * carried[i] - bias[i] + external[i]
+        if lossless.has_passive:
+            impulse[i] += passive[i]
+    mj_solve_m(mj.model, mj.data, lossless.half_step, lossless.work_buffer, np.int32(1))
+    in_tree = ints(lossless.dof_in_tree, mj.nv)
+    for i in range(mj.nv):
+        half[i] *= 0.5 * s.run.period * in_tree[i]
 
 
 @compiled
-def keep_carried(state: NDArray[np.void]) -> None:
-    """Writes what the next step applies: Jᵀr + c(q, u) − c(q, v), on the tool's tree."""
-    s = state[0]
-    write_bias(state, s.velocity, s.bias_at_v)
-    own, carried = floats(s.carried_force, s.nv), floats(s.generalised, s.nv)
-    at_u, at_v = floats(s.bias_at_u, s.nv), floats(s.bias_at_v, s.nv)
-    in_tree = ints(s.dof_in_tree, s.nv)
-    for i in range(s.nv):
+def keep_carried(s: State) -> None:
+    """Writes the force that the next step applies: Jᵀr + c(q, u) − c(q, v), on the tool's tree."""
+    mj, lossless = s.mj, s.lossless
+    write_bias(s, lossless.velocity, lossless.bias_at_v)
+    own, carried = (floats(lossless.carried_force, mj.nv), floats(lossless.generalised, mj.nv))
+    at_u, at_v = floats(lossless.bias_at_u, mj.nv), floats(lossless.bias_at_v, mj.nv)
+    in_tree = ints(lossless.dof_in_tree, mj.nv)
+    for i in range(mj.nv):
         own[i] = in_tree[i] * (carried[i] + at_u[i] - at_v[i])
 
 
 @compiled
-def settle(state: NDArray[np.void], work: float) -> None:
-    """Finds v_k from u_k and the kinetic energy at v_k; needs ``carry``.
+def balance_midpoint(s: State) -> None:
+    """Computes v_k from u_k and the kinetic energy at v_k; needs the result of ``carry``."""
+    mj, lossless = s.mj, s.lossless
+    write_bias(s, mj.qvel, lossless.bias_at_u)
+    write_external(s, lossless.external)
+    if lossless.has_passive:
+        mj_passive(mj.model, mj.data)
+    write_half_step(s)
+    v, u, half = (
+        floats(lossless.velocity, mj.nv),
+        floats(mj.qvel, mj.nv),
+        floats(lossless.half_step, mj.nv),
+    )
+    for i in range(mj.nv):
+        v[i] = u[i] + half[i]
+    balance(s)
+    keep_carried(s)
+
+
+@compiled
+def balance(s: State) -> None:
+    """Takes the kinetic energy at v, and takes generated energy back from the tool's motion."""
+    lossless = s.lossless
+    mj = s.mj
+    v = floats(lossless.velocity, mj.nv)
+    momentum, in_tree = floats(lossless.work_buffer, mj.nv), ints(lossless.dof_in_tree, mj.nv)
+    mj_mul_m(mj.model, mj.data, lossless.work_buffer, lossless.velocity)
+    own = others = 0.0
+    for i in range(mj.nv):
+        energy = 0.5 * v[i] * momentum[i]
+        own += energy * in_tree[i]
+        others += energy * (1 - in_tree[i])
+    kinetic = own + others
+    set_kinetic_energy(s.energy, kinetic - _take_back(s, kinetic, own))
+
+
+@compiled
+def _take_back(s: State, kinetic: float, own: float) -> float:
+    """Slows the tool by the energy that the lossless form generated, so that (14) holds.
+
+    If inertia and Jacobian turn, the form keeps S to third order only: 1e-10 J per tick at the
+    speed of a hand. That is 1e-7 of the tool's kinetic energy, and leaves the order unchanged.
 
     Args:
-        state: The bound state.
-        work: Of the coupling in this step, in J, which is not in its sum yet.
+        s: The bound state; the coupling's work in this step is not in its sum yet.
+        kinetic: Kinetic energy of the scene at v in J.
+        own: The part of it in the tool's tree, in J.
+
+    Returns:
+        The energy taken, in J.
     """
-    s = state[0]
-    write_bias(state, s.qvel, s.bias_at_u)
-    write_external(state, s.external)
-    if s.has_passive:
-        mj_passive(s.model, s.data)
-    write_half_step(state)
-    v, u, half = floats(s.velocity, s.nv), floats(s.qvel, s.nv), floats(s.half_step, s.nv)
-    for i in range(s.nv):
-        v[i] = u[i] + half[i]
-    balance(state, work)
-    keep_carried(state)
-
-
-@compiled
-def balance(state: NDArray[np.void], work: float) -> None:
-    """Takes the kinetic energy at v and gives back what was created."""
-    s = state[0]
-    v = floats(s.velocity, s.nv)
-    momentum, in_tree = floats(s.kept, s.nv), ints(s.dof_in_tree, s.nv)
-    mj_mul_m(s.model, s.data, s.kept, s.velocity)
-    mine = others = 0.0
-    for i in range(s.nv):
-        energy = 0.5 * v[i] * momentum[i]
-        mine += energy * in_tree[i]
-        others += energy * (1 - in_tree[i])
-    s.kinetic = mine + others
-    _give_back(state, work, mine)
-
-
-@compiled
-def _give_back(state: NDArray[np.void], work: float, kinetic: float) -> None:
-    """Slows the tool down by what the lossless form has created, so that (14) holds.
-
-    Where inertia and Jacobian turn, the form keeps S to third order only: 1e-10 J a tick at what a
-    hand does. That is some 1e-7 of the tool's kinetic energy, and leaves the order as it is.
-    """
-    s = state[0]
-    stored = s.kinetic + s.potential - s.start_energy
-    surplus = stored - s.coupling_work - work - s.actuator_work - s.external_work
-    s.lossless_debt = max(0.0, s.lossless_debt + surplus - s.environment_energy)
-    owed = min(s.lossless_debt, surplus, LARGEST_SHARE_BACK * kinetic)
-    if owed <= 0.0:
-        return
-    slower = math.sqrt(1.0 - owed / kinetic)
-    v, u, in_tree = floats(s.velocity, s.nv), floats(s.qvel, s.nv), ints(s.dof_in_tree, s.nv)
-    for i in range(s.nv):
+    mj = s.mj
+    energy, lossless = s.energy, s.lossless
+    stored = kinetic + energy.potential - energy.start_energy
+    surplus = (
+        stored
+        - energy.coupling_work
+        - s.loop.law_work
+        - energy.actuator_work
+        - energy.external_work
+    )
+    lossless.energy_debt = max(0.0, lossless.energy_debt + surplus - energy.environment_energy)
+    taken = min(lossless.energy_debt, surplus, MAX_SHARE_BACK * own)
+    if taken <= 0.0:
+        return 0.0
+    slower = math.sqrt(1.0 - taken / own)
+    nv = mj.nv
+    v, u, in_tree = (
+        floats(lossless.velocity, nv),
+        floats(mj.qvel, nv),
+        ints(lossless.dof_in_tree, nv),
+    )
+    for i in range(nv):
         if in_tree[i]:
             u[i] -= (1.0 - slower) * v[i]  # the next step starts from u
             v[i] *= slower
-    write_bias(state, s.qvel, s.bias_at_u)
-    s.kinetic -= owed
-    s.lossless_debt -= owed
+    write_bias(s, mj.qvel, lossless.bias_at_u)
+    lossless.energy_debt -= taken
+    return float(taken)
 
 
-# The coupling's wrench where half of it is solved implicitly: its law, and what was applied.
+# The coupling's wrench by the midpoint rule, and the half that the actuators applied
 
 
 @compiled
-def implicit_half(state: NDArray[np.void]) -> tuple[Vector, Vector]:
-    """Returns the wrench on the tool that the coupling's actuators applied in the step, as a mean.
+def implicit_half(s: State) -> tuple[Vector, Vector]:
+    """Returns the mean wrench that the coupling's actuators applied to the tool in the step.
 
-    ``actuator_force`` is theirs at the start of the step; two terms of MuJoCo's effective metric
-    take it to the end (see ``ports``). The axes are the handle's. Must run before kinematics are
-    refreshed.
+    ``actuator_force`` is their force at the step's start; two terms of MuJoCo's effective metric
+    take it to the end (``ledger._actuator_work``). Must run before the kinematics are refreshed.
     """
-    s = state[0]
-    h = s.timestep
-    first = s.coupling_output_adr
-    forces = floats(s.actuator_force, first + 6)
+    mj = s.mj
+    h = s.run.timestep
+    first = mj.coupling_output_adr
+    forces = floats(mj.actuator_force, first + 6)
     f = np.empty(6)
     for axis in range(6):
-        stiffness, damping = s.stiffness, s.damping
+        stiffness, damping = s.coupling.stiffness, s.coupling.damping
         if axis >= 3:
-            stiffness, damping = s.rotational_stiffness, s.rotational_damping
-        end = moment_dot(state, first + axis, s.qvel)
-        change = moment_dot(state, first + axis, s.qacc)
+            stiffness, damping = s.coupling.rotational_stiffness, s.coupling.rotational_damping
+        end = moment_dot(s, first + axis, mj.qvel)
+        change = moment_dot(s, first + axis, mj.qacc)
         in_position, in_velocity = 0.5 * h * stiffness, 0.5 * h * (h * stiffness + damping)
         f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
-    handle = quaternion_of(s.handle_quaternion)
+    handle = quaternion_of(s.pose.handle_quaternion)
     return rotated(handle, vector_of(f)), rotated(handle, vector_of(f[3:6]))
 
 
 @compiled
-def midpoint_torque(state: NDArray[np.void], tool: Quaternion, turned: Vector) -> Vector:
+def midpoint_torque(s: State, tool: Quaternion, turned: Vector) -> Vector:
     """Returns the coupling's torque on the tool, in the world frame, by the midpoint rule.
 
-    In the tool's frame τ = K_r (φ_k + φ_{k−1})/2 + (B_r/T) [½ (R_kᵀ + R_{k−1}ᵀ) δφ_h − R_kᵀ δφ_x]
-    with B_r = B'_r + K_r T/2; the force needs no other rule, because in translation
-    K (e_k + e_{k−1})/2 + (B/T) δe = K e_k + (B'/T) δe.
+    In the tool's frame, with B_r = B'_r + K_r T/2,
+
+        τ = K_r (φ_k + φ_{k−1})/2 + (B_r/T) [½ (R_kᵀ + R_{k−1}ᵀ) δφ_h − R_kᵀ δφ_x]
+
+    The force keeps its law: K (e_k + e_{k−1})/2 + (B/T) δe = K e_k + (B'/T) δe in translation.
 
     Args:
-        state: The bound state, still with the tool's orientation before the step.
+        s: The bound state, still with the tool's orientation before the step.
         tool: Its orientation after it.
-        turned: How it turned, δφ_x.
+        turned: Its rotation vector δφ_x in rad.
     """
-    s = state[0]
-    to_before, to_after = conjugate(quaternion_of(s.tool_quaternion)), conjugate(tool)
-    before, after = vector_of(s.twist), twist_in_tool(state, tool)
-    turn = vector_of(s.handle_turn)
+    to_before, to_after = conjugate(quaternion_of(s.pose.tool_quaternion)), conjugate(tool)
+    before, after = vector_of(s.lossless.twist), twist_in_tool(s, tool)
+    turn = vector_of(s.pose.handle_turn)
     handles = scaled(0.5, add(rotated(to_after, turn), rotated(to_before, turn)))
-    rate = (s.rotational_damping + 0.5 * s.period * s.rotational_stiffness) / s.period
-    spring = scaled(0.5 * s.rotational_stiffness, add(after, before))
+    rate = (
+        s.coupling.rotational_damping + 0.5 * s.run.period * s.coupling.rotational_stiffness
+    ) / s.run.period
+    spring = scaled(0.5 * s.coupling.rotational_stiffness, add(after, before))
     damper = scaled(rate, subtract(handles, rotated(to_after, turned)))
     return rotated(tool, add(spring, damper))
 
 
 @compiled
-def twist_in_tool(state: NDArray[np.void], tool: Quaternion) -> Vector:
+def twist_in_tool(s: State, tool: Quaternion) -> Vector:
     """Returns φ, the rotation vector from the tool to the handle, in the tool's frame."""
-    handle = quaternion_of(state[0].handle_quaternion)
+    handle = quaternion_of(s.pose.handle_quaternion)
     return rotated(conjugate(tool), rotation_between(tool, handle))
 
 
 @compiled
-def note_twist(state: NDArray[np.void]) -> None:
-    """Notes φ as it is: before the first tick, and for the next one."""
-    s = state[0]
-    store_vector(s.twist, twist_in_tool(state, quaternion_of(s.tool_quaternion)))
-
-
-# Whether the tool is near to something, touches it, or is at a joint's limit.
-
-REACH = 5e-4
-"""Distance in m within which a contact counts as near: how far a tool at 0.5 m/s comes in a tick of
-1 ms. Less lets a fast tool touch before the change, more makes the tool implicit sooner and longer.
-
-To change over only when the next step would have the contact's force, told from the distance and
-the approach at its start, errs less (tapping on a wall at 4 Hz 0.25 of the implicit form instead of
-0.31, at 1 Hz 0.35 instead of 0.50) and is not done: a peg led into its hole then uses 1.4 % of the
-slack instead of 0.9 %, and 2 of 20 hands on a planar peg (0 of another 100) use 0.01 % of it that
-use none so: chosen after seeing both, for strictness."""
+def note_twist(s: State) -> None:
+    """Notes the present φ for the next tick."""
+    store_vector(s.lossless.twist, twist_in_tool(s, quaternion_of(s.pose.tool_quaternion)))
 
 
 @compiled
-def is_near(state: NDArray[np.void]) -> bool:
-    """Tells whether the step saw the tool touch something, be near to it, or at a joint's limit.
+def wrench_after_step(s: State) -> tuple[Vector, Vector, Vector, Vector]:
+    """Evaluates the lossless coupling after a step of MuJoCo, and notes the tool's new pose.
 
-    Notes in ``is_held`` whether a constraint force acted on its tree.
-
-    Contacts within ``REACH`` are there without a force, because the geoms' gap says so.
+    Returns:
+        Force, torque, and the tool's motion and rotation vector in the step.
     """
-    s = state[0]
-    found = held = bool(s.is_never_free)
-    s.active_contacts = 0
-    contacts = pointer_at(s.contact)
-    for c in range(ints(s.ncon, 1)[0]):
-        contact = contacts + s.contact_size * c
-        is_active = ints(contact + s.contact_row, 1)[0] >= 0
-        s.active_contacts += is_active
-        for geom in ints(contact + s.contact_geoms, 2):
+    lossless = s.lossless
+    half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    lossless.is_near = is_near(s)
+    lossless.was_midpoint = lossless.is_midpoint
+    lossless.ticks += lossless.was_midpoint
+    if lossless.is_midpoint:
+        half = implicit_half(s)
+    position, orientation, moved, turned = tool_after_step(s)
+    tool = position, orientation
+    force, torque = law_wrench(s, handle_of_step(s, True), tool, moved, turned)
+    if lossless.is_midpoint:
+        torque = midpoint_torque(s, orientation, turned)
+        # the torque is carried in the tool's frame, so that it turns with the tool
+        to_before = conjugate(quaternion_of(s.pose.tool_quaternion))
+        store_vector(lossless.applied_half[0:3], half[0])
+        store_vector(lossless.applied_half[3:6], rotated(orientation, rotated(to_before, half[1])))
+    note_tool(s.pose, position, orientation)
+    return force, torque, moved, turned
+
+
+@compiled
+def lossless_flag(lossless: Part) -> int:
+    """Returns the record's flag of a lossless tick, or 0."""
+    return LOSSLESS_TICK if lossless.was_midpoint else 0
+
+
+# Contacts and joint limits near the tool
+
+REACH = 5e-4
+"""Distance in m within which a contact counts as near. A tool at 0.5 m/s moves so far in a tick of
+1 ms. A smaller value lets a fast tool touch before the change; a larger one makes the tool implicit
+sooner and longer.
+
+A change only when the next step would have a contact force, predicted from distance and approach
+speed, errs less: tapping on a wall at 4 Hz 0.25 of the implicit form instead of 0.31, at 1 Hz 0.35
+instead of 0.50. It uses more slack: a peg led into its hole 1.4 % instead of 0.9 %, and 2 of 20
+hands on a planar peg (0 of another 100) 0.01 % instead of none. The strict variant was chosen after
+both had been seen."""
+
+
+@compiled
+def is_near(s: State) -> bool:
+    """Returns True if the step saw the tool near a contact, in contact, or at a joint's limit.
+
+    Contacts within ``REACH`` exist without a force, because the geoms' gap includes them. Also
+    notes whether a constraint force acted on the tool's tree, and counts contacts with a force.
+    """
+    mj = s.mj
+    lossless = s.lossless
+    found = constrained = bool(lossless.is_never_free)
+    lossless.active_contacts = 0
+    contacts = pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + mj.contact_size * c
+        is_active = ints(contact + mj.contact_row, 1)[0] >= 0
+        lossless.active_contacts += is_active
+        for geom in ints(contact + mj.contact_geoms, 2):
             # a flex is no geom
-            if geom < 0 or ints(s.geom_in_tree, s.ngeom)[geom] != 0:
-                found, held = True, held or is_active
-    count = ints(s.nefc, 1)[0]
-    kinds, ids = ints(pointer_at(s.efc_type), count), ints(pointer_at(s.efc_id), count)
+            if geom < 0 or ints(lossless.geom_in_tree, mj.ngeom)[geom] != 0:
+                found, constrained = True, constrained or is_active
+    count = ints(mj.nefc, 1)[0]
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     for row in range(count):
-        is_joint = kinds[row] == LIMIT_JOINT and ints(s.joint_in_tree, s.njnt)[ids[row]] != 0
+        in_tree = ints(lossless.joint_in_tree, mj.njnt)
+        is_joint = kinds[row] == LIMIT_JOINT and in_tree[ids[row]] != 0
         if is_joint or kinds[row] == LIMIT_TENDON:
-            found = held = True
-    s.is_held = held
+            found = constrained = True
+    lossless.is_constrained = constrained
     return found
 
 
-# The kinematic tree that the tool belongs to: all that its grip can move through joints alone.
+# The tool's kinematic tree: all bodies that its grip can move through joints alone
 
 _OBJECTS = mujoco.mjtObj
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolTree:
-    """What belongs to the tool's tree.
+    """Membership in the tool's kinematic tree.
 
     Attributes:
-        dofs: Per degree of freedom of the model.
-        joints: Per joint.
-        geoms: Per geom.
-        is_never_free: Whether friction in a joint, an equality constraint, a tendon with friction
-            or an actuator other than the coupling's always acts on it.
+        dofs: True for each degree of freedom of the model in the tree.
+        joints: True for each joint in the tree.
+        geoms: True for each geom in the tree.
+        is_never_free: True if joint friction, an equality constraint, a tendon with friction or an
+            actuator other than the coupling's always acts on the tree.
     """
 
     dofs: NDArray[np.bool_]
@@ -363,10 +478,10 @@ def tree_of_tool(model: mujoco.MjModel, body: int, own: Container[int] = ()) -> 
 
 
 def _is_driven(model: mujoco.MjModel, bodies: NDArray[np.bool_], own: Container[int]) -> bool:
-    """Tells whether an actuator of the scene acts on the tree; what cannot be told counts as yes.
+    """Returns True if an actuator of the scene acts on the tree; unknown transmissions count.
 
-    MuJoCo takes the whole of its force in a step where half would be due, and a servo's implicitly:
-    beside a lossless coupling that creates energy (8 mJ in 1 s in a measured case).
+    MuJoCo applies the whole force of an actuator in a step that is due half of it, and a servo's
+    force implicitly. Beside a lossless coupling that generates energy: 8 mJ in 1 s as measured.
     """
     transmission = mujoco.mjtTrn
     owner = {
@@ -386,7 +501,7 @@ def _is_driven(model: mujoco.MjModel, bodies: NDArray[np.bool_], own: Container[
 
 
 def has_passive_forces(model: mujoco.MjModel) -> bool:
-    """Tells whether springs, dampers, gravity compensation or a fluid act anywhere."""
+    """Returns True if springs, dampers, gravity compensation or a fluid act on any body."""
     return bool(
         np.any(model.jnt_stiffness)
         or np.any(model.dof_damping)
@@ -399,7 +514,7 @@ def has_passive_forces(model: mujoco.MjModel) -> bool:
 
 
 def _touches(model: mujoco.MjModel, equality: int, bodies: NDArray[np.bool_]) -> bool:
-    """Tells whether an equality constraint holds the tree; what cannot be told counts as yes."""
+    """Returns True if an equality constraint acts on the tree; unknown kinds count."""
     ids = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
     ids = ids[ids >= 0]
     if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT:  # of joints the object's type says none
@@ -411,102 +526,158 @@ def _touches(model: mujoco.MjModel, equality: int, bodies: NDArray[np.bool_]) ->
     return True
 
 
-HOLD_TICKS = 5
-"""Ticks without anything near before the tool is lossless again, no unit. In twelve random hands on
-a wall 5 and 20 changed over equally often, in a peg's hole 17 and 10 times in 5 s; the largest jump
-of the wrench is that of the implicit form with both. More keeps the implicit form's damping longer
-after a contact: tapping on a wall errs by 33 µm at 5 ticks and by 48 µm at 20."""
+# Binding, and the change between the two forms
+
+HOLDOFF = 5
+"""Ticks without a near contact before the tool is lossless again. Twelve random hands on a wall
+changed form equally often with 5 and 20 ticks; in a peg's hole they changed 17 and 10 times in 5 s.
+The largest jump of the wrench is that of the implicit form with both. A larger value keeps the
+implicit form's damping longer after a contact: tapping on a wall errs by 33 µm at 5 ticks and by
+48 µm at 20."""
+
+
+def bind_lossless(
+    lossless: Part, model: mujoco.MjModel, data: mujoco.MjData, grip: int, first_actuator: int
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in addresses and facts about the tool's tree.
+
+    Args:
+        lossless: The sub-record.
+        model: The prepared scene.
+        data: Its data; ``qfrc_applied`` holds the user's forces.
+        grip: Body that carries the grip.
+        first_actuator: First of the coupling's six actuators.
+
+    Returns:
+        Arrays that must outlive the state. ``user_forces`` replaces ``qfrc_applied`` as the place
+        of the user's forces, because the method writes its own forces to the latter.
+    """
+    nv = max(model.nv, 1)
+    own = range(first_actuator, first_actuator + len(COUPLING_ACTUATORS))
+    tree = tree_of_tool(model, grip, own)
+    owned: dict[str, NDArray[np.generic]] = {
+        "geom_in_tree": np.ascontiguousarray(tree.geoms, dtype=np.int32),
+        "joint_in_tree": np.ascontiguousarray(tree.joints, dtype=np.int32),
+        "dof_in_tree": np.ascontiguousarray(tree.dofs, dtype=np.int32),
+        "wrench_buffer": np.zeros(6),
+    }
+    owned |= {name: np.zeros(nv) for name in _OWN_VECTORS}
+    owned["last_written"][: model.nv] = data.qfrc_applied
+    for name, array in owned.items():
+        lossless[name] = array.ctypes.data
+    lossless["qfrc_written"] = data.qfrc_applied.ctypes.data
+    lossless["qfrc_passive"] = data.qfrc_passive.ctypes.data
+    lossless["is_never_free"] = tree.is_never_free
+    lossless["has_passive"] = has_passive_forces(model)
+    return owned | {"user_forces": owned["last_written"].copy()}
+
+
+def restart_lossless(s: State) -> None:
+    """Starts in the implicit form again after the scene was reset; nothing is carried over."""
+    lossless, nv = s["lossless"], int(s["mj"]["nv"])
+    lossless["is_midpoint"] = lossless["is_near"] = lossless["holdoff"] = 0
+    forces = floats(int(lossless["qfrc_written"]), nv)
+    floats(int(s["mj"]["qfrc_applied"]), nv)[:] = forces
+    floats(int(lossless["last_written"]), nv)[:] = forces
+    floats(int(lossless["carried_force"]), nv)[:] = 0.0
+    set_gains(s, 1.0)
+    note_twist(s)
 
 
 @compiled
-def apply_carried(state: NDArray[np.void]) -> None:
-    """Before the step: applies what is carried over, beside what the user applies.
+def apply_carried(s: State) -> None:
+    """Applies the carried force before the step, beside the user's forces.
 
-    The user writes the same array. What is not what was written here last is the user's. Where
-    that changes from p to p', a lossless step takes ½(p + p'): then v gains T M⁻¹ p', and the work
-    h p'·u of the external port is exact. With all of p', a force that varies would create energy.
+    The user writes to the array that this method also writes to; a value that differs from the
+    method's last one is the user's. If the user's force changes from p to p', a lossless step takes
+    ½ (p + p'). Then v gains T M⁻¹ p', and the work h p'·u of the external port is exact. With all
+    of p', a varying force would generate energy.
     """
-    s = state[0]
-    applied, users = floats(s.qfrc_written, s.nv), floats(s.qfrc_applied, s.nv)
-    own, last = floats(s.carried_force, s.nv), floats(s.last_written, s.nv)
-    for i in range(s.nv):
+    mj, lossless = s.mj, s.lossless
+    applied, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)
+    own, last = floats(lossless.carried_force, mj.nv), floats(lossless.last_written, mj.nv)
+    for i in range(mj.nv):
         if applied[i] != last[i]:
             users[i] = applied[i]
         applied[i] = users[i] + own[i]
-    if s.is_midpoint:
-        write_external(state, s.kept)
-        before, after = floats(s.external, s.nv), floats(s.kept, s.nv)
-        in_tree = ints(s.dof_in_tree, s.nv)
-        for i in range(s.nv):
+    if lossless.is_midpoint:
+        write_external(s, lossless.work_buffer)
+        before, after = (floats(lossless.external, mj.nv), floats(lossless.work_buffer, mj.nv))
+        in_tree = ints(lossless.dof_in_tree, mj.nv)
+        for i in range(mj.nv):
             applied[i] += 0.5 * in_tree[i] * (before[i] - after[i])
-    for i in range(s.nv):
+    for i in range(mj.nv):
         last[i] = applied[i]
 
 
 @compiled
-def leave(state: NDArray[np.void]) -> None:
-    """Goes over to the implicit form: u becomes v, nothing is carried over."""
-    s = state[0]
-    u, v = floats(s.qvel, s.nv), floats(s.velocity, s.nv)
-    own = floats(s.carried_force, s.nv)
-    for i in range(s.nv):
+def _leave(s: State) -> None:
+    """Changes to the implicit form: u becomes v, and no force is carried over."""
+    mj, lossless = s.mj, s.lossless
+    u, v = floats(mj.qvel, mj.nv), floats(lossless.velocity, mj.nv)
+    own = floats(lossless.carried_force, mj.nv)
+    for i in range(mj.nv):
         u[i] = v[i]
         own[i] = 0.0
-    set_gains(state, 1.0)
-    s.is_midpoint = 0
+    set_gains(s, 1.0)
+    lossless.is_midpoint = 0
 
 
 @compiled
-def _enter(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
-    """Goes over to the lossless form: the velocity becomes v, and u follows from it.
+def _enter(s: State, force: Vector, torque: Vector) -> None:
+    """Changes to the lossless form: the velocity becomes v, and u follows from it.
 
-    u = v − (T/2) M⁻¹ [Jᵀf − c(q, u) + p] stands on both sides; two passes leave O(T³).
+    u = v − (T/2) M⁻¹ [Jᵀf − c(q, u) + p] has u on both sides; two passes leave an error of O(T³).
     """
-    s = state[0]
-    if not s.has_positions:
-        mj_factor_m(s.model, s.data)
-    carry(state, scaled(0.5, force), scaled(0.5, torque))
-    u, v, half = floats(s.qvel, s.nv), floats(s.velocity, s.nv), floats(s.half_step, s.nv)
-    for i in range(s.nv):
+    mj, lossless = s.mj, s.lossless
+    if not s.loop.has_positions:
+        mj_factor_m(mj.model, mj.data)
+    carry(s, scaled(0.5, force), scaled(0.5, torque))
+    u, v, half = (
+        floats(mj.qvel, mj.nv),
+        floats(lossless.velocity, mj.nv),
+        floats(lossless.half_step, mj.nv),
+    )
+    for i in range(mj.nv):
         v[i] = u[i]
-    write_external(state, s.external)
-    if s.has_passive:
-        mj_passive(s.model, s.data)
+    write_external(s, lossless.external)
+    if lossless.has_passive:
+        mj_passive(mj.model, mj.data)
     for _ in range(2):
-        write_bias(state, s.qvel, s.bias_at_u)
-        write_half_step(state)
-        for i in range(s.nv):
+        write_bias(s, mj.qvel, lossless.bias_at_u)
+        write_half_step(s)
+        for i in range(mj.nv):
             u[i] = v[i] - half[i]
-    write_bias(state, s.qvel, s.bias_at_u)
-    keep_carried(state)
-    set_gains(state, 0.5)
-    s.is_midpoint = 1
+    write_bias(s, mj.qvel, lossless.bias_at_u)
+    keep_carried(s)
+    set_gains(s, 0.5)
+    lossless.is_midpoint = 1
 
 
 @compiled
-def finish_lossless(state: NDArray[np.void]) -> None:
-    """Ends a step: balances it at v, carries the rest of the wrench over, changes the form.
+def finish_lossless(s: State) -> None:
+    """Ends a step: balances its energy at v, carries half of the wrench over, changes the form.
 
-    Needs the poses and energies after the step, and what ``wrench_of_step`` noted: the wrench, its
-    work (``law_work``, not in its sum yet), what the actuators applied, and what was near.
+    Needs the poses and energies after the step, and the notes of ``wrench_after_step``.
     """
-    s = state[0]
-    force, torque = vector_of(s.wrench_on_tool), vector_of(s.wrench_on_tool[3:6])
-    if s.was_midpoint:
-        if not s.has_positions:
-            mj_factor_m(s.model, s.data)
-        rest = subtract(force, vector_of(s.applied_half))
-        carry(state, rest, subtract(torque, vector_of(s.applied_half[3:6])))
-        settle(state, s.law_work)
-    elif not s.is_held:
-        # free, but not yet or no longer lossless: that balances to first order only
-        v, u = floats(s.velocity, s.nv), floats(s.qvel, s.nv)
-        for i in range(s.nv):
+    mj = s.mj
+    lossless, wrench = s.lossless, s.loop.wrench_on_tool
+    force, torque = vector_of(wrench), vector_of(wrench[3:6])
+    if lossless.was_midpoint:
+        if not s.loop.has_positions:
+            mj_factor_m(mj.model, mj.data)
+        rest = subtract(force, vector_of(lossless.applied_half))
+        carry(s, rest, subtract(torque, vector_of(lossless.applied_half[3:6])))
+        balance_midpoint(s)
+    elif not lossless.is_constrained:
+        # free, but not lossless at present: the balance holds to first order only
+        v, u = floats(lossless.velocity, mj.nv), floats(mj.qvel, mj.nv)
+        for i in range(mj.nv):
             v[i] = u[i]
-        balance(state, s.law_work)
-    s.hold = HOLD_TICKS if s.is_near else max(s.hold - 1, 0)
-    if s.was_midpoint and s.is_near:
-        leave(state)
-    elif not s.was_midpoint and s.hold == 0:
-        _enter(state, force, torque)
-    note_twist(state)
+        balance(s)
+    lossless.holdoff = HOLDOFF if lossless.is_near else max(lossless.holdoff - 1, 0)
+    if lossless.was_midpoint and lossless.is_near:
+        _leave(s)
+    elif not lossless.was_midpoint and lossless.holdoff == 0:
+        _enter(s, force, torque)
+    note_twist(s)

@@ -1,9 +1,8 @@
-"""MuJoCo's C library as the compiled tick sees it: functions by symbol, fields by address.
+"""MuJoCo's C library for compiled code: functions by symbol, fields by address.
 
-This is the one place that uses MuJoCo's private ``_address`` and the layout of its structs. The
-layout is taken from the package's own description of them (``mujoco.introspect``) and checked
-against the Python bindings whenever a scene is bound, so another version of MuJoCo is either right
-or refused.
+Only this module uses MuJoCo's private ``_address`` and the layout of its structs. The layout comes
+from the package's own description (``mujoco.introspect``) and is compared with the Python bindings
+whenever a scene is bound. Another version of MuJoCo is therefore either right or refused.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import LOSSLESS
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.codes import Part
 
 
 def _library() -> Path:
@@ -127,13 +125,13 @@ _FIRST_DIVERGED, _LAST_DIVERGED = min(_DIVERGED), max(_DIVERGED)
 
 
 @compiled
-def has_warned(state: NDArray[np.void]) -> bool:
-    """Returns whether MuJoCo found a position, velocity, acceleration or control that is no number.
+def has_warned(mj: Part) -> bool:
+    """Returns True if MuJoCo found a position, velocity, acceleration or control that is no number.
 
-    It also counts what is larger than mjMAXVAL = 1e10, which is still finite but no motion.
+    MuJoCo also counts values above mjMAXVAL = 1e10, which are finite but no motion.
     """
-    # mjWarningStat: two integers, of which the second counts
-    counts = ints(state[0].warnings, 2 * _LAST_DIVERGED + 2)
+    # mjWarningStat: two integers, the second is the count
+    counts = ints(mj.warnings, 2 * _LAST_DIVERGED + 2)
     total = 0
     for kind in range(_FIRST_DIVERGED, _LAST_DIVERGED + 1):
         total += counts[2 * kind + 1]
@@ -177,12 +175,12 @@ def _struct(name: str) -> Any:
 
 
 def field_address(data: mujoco.MjData, name: str) -> int:
-    """Returns where a field of ``mjData`` lies in memory (for a pointer: of the pointer itself)."""
+    """Returns the address of a field of ``mjData``; for a pointer, that of the pointer itself."""
     return int(data._address + getattr(_struct("mjData"), name).offset)
 
 
 def contact_layout() -> dict[str, int]:
-    """Returns the size of ``mjContact`` and the offsets of what a tick reads of it, in bytes."""
+    """Returns the size of ``mjContact`` and the offsets that a tick reads, in bytes."""
     contact = _struct("mjContact")
     fields = {
         "distance": "dist",
@@ -222,80 +220,140 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     return int(model._address), int(data._address)
 
 
-# Where in a model and its data the tick finds what it needs, and the gains that it starts with.
+_DATA_ARRAYS = (
+    "qpos",
+    "qvel",
+    "qacc",
+    "ctrl",
+    "mocap_pos",
+    "mocap_quat",
+    "site_xpos",
+    "site_xquat",
+    "xipos",
+    "ten_length",
+    "qfrc_actuator",
+    "qfrc_applied",
+    "qfrc_gravcomp",
+    "xfrc_applied",
+    "actuator_force",
+    "moment_rownnz",
+    "moment_rowadr",
+    "moment_colind",
+    "actuator_moment",
+    "energy",
+    "solver_niter",
+)
+_DATA_FIELDS = (
+    "ncon",
+    "nisland",
+    "nefmA",
+    "efm_aid",
+    "efm_as",
+    "efm_ak",
+    "ne",
+    "nefc",
+    "efc_type",
+    "efc_id",
+    "efc_pos",
+    "efc_force",
+    "contact",
+)
+_OWNED = (
+    "passive_gravcomp_dofs",
+    "body_mocap",
+    "geom_bodyid",
+    "tendon_range",
+    "scratch",
+    "mocap_previous",
+    "mocap_shift",
+    "equality_before",
+    "tendon_before",
+    "outadr",
+    "outnum",
+)
+_MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
+_SIZES = ("nq", "nv", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
+_CONTACT = ("size", "distance", "point", "frame", "geoms", "dim", "row")
+_IDS = (
+    "handle_mocap_id",
+    "handle_site_id",
+    "grip_site_id",
+    "grip_body_id",
+    "weld_id",
+    "coupling_actuator_id",
+    "coupling_output_adr",
+    "coupling_ctrl_adr",
+)
+_FACTS = (
+    "equality_capacity",
+    "tool_map_size",
+    "has_actuators",
+    "has_gravity_compensation",
+    "has_tendons_or_flexes",
+)
+
+MJ_DTYPE = np.dtype(
+    [
+        (name, "<i8")
+        for name in (
+            *("model", "data", "warnings", "gainprm", "biasprm"),
+            *_DATA_ARRAYS,
+            *_DATA_FIELDS,
+            *_OWNED,
+            *_MASSLESS,
+            *_SIZES,
+            *(f"contact_{name}" for name in _CONTACT),
+            *_IDS,
+            *_FACTS,
+        )
+    ]
+)
+"""Sub-record ``mj``, bound once: addresses, sizes and ids of a model and its data.
+
+The names are MuJoCo's. An address of ``_DATA_FIELDS`` is that of the field in ``mjData``, because
+arrays in MuJoCo's arena move between steps. Filled in by ``state.BoundKernel``."""
 
 
-def gains_of(model: mujoco.MjModel, first: int, parameters: RunParameters) -> tuple[float, ...]:
-    """Returns the whole gains of the coupling's actuators: of those that push, then that turn."""
-    if parameters.scheme == LOSSLESS:  # the model may have half of them
-        coupling = parameters.coupling
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return b, k, b, br, kr, br
-    gains: list[float] = []
-    for actuator in (first, first + 3):
-        bias = model.actuator_biasprm[actuator]
-        gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]
-    return tuple(gains)
-
-
-def bind_addresses(
-    model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.void]
-) -> dict[str, NDArray[np.generic]]:
-    """Fills in the addresses and sizes that the tick needs of a model and its data.
+def model_addresses(
+    model: mujoco.MjModel, data: mujoco.MjData
+) -> tuple[dict[str, int], dict[str, NDArray[np.generic]]]:
+    """Returns the addresses and sizes of a model and its data, by their names in ``MJ_DTYPE``.
 
     Returns:
-        The arrays that must outlive the state, beside model and data themselves, by name.
+        The numbers, and the arrays that must outlive the state, whose addresses go under their
+        names.
 
     Raises:
-        SceneError: See ``native.addresses``.
+        SceneError: The layout of ``mjData`` is another one (``addresses``).
     """
-    state["model"], state["data"] = addresses(model, data)
-    buffer_fields = (
-        "qpos qvel qacc ctrl mocap_pos mocap_quat site_xpos site_xquat xipos ten_length "
-        "qfrc_actuator qfrc_applied qfrc_gravcomp xfrc_applied actuator_force moment_rownnz "
-        "moment_rowadr moment_colind actuator_moment energy solver_niter"
-    )
-    for name in buffer_fields.split():
-        state[name] = getattr(data, name).ctypes.data
-    struct_fields = (
-        "ncon nisland nefmA efm_aid efm_as efm_ak ne nefc efc_type efc_id efc_pos efc_force contact"
-    )
-    for name in struct_fields.split():
-        state[name] = field_address(data, name)
-    state["warnings"] = field_address(data, "warning")
-    state["gainprm"] = model.actuator_gainprm.ctypes.data
-    state["biasprm"] = model.actuator_biasprm.ctypes.data
+    model_address, data_address = addresses(model, data)
+    values: dict[str, int] = {"model": model_address, "data": data_address}
+    values |= {name: getattr(data, name).ctypes.data for name in _DATA_ARRAYS}
+    values |= {name: field_address(data, name) for name in _DATA_FIELDS}
+    values["warnings"] = field_address(data, "warning")
+    values["gainprm"] = model.actuator_gainprm.ctypes.data
+    values["biasprm"] = model.actuator_biasprm.ctypes.data
+    values |= {name: getattr(model, name) for name in _SIZES}
+    values |= {f"contact_{name}": value for name, value in contact_layout().items()}
+    values["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
+    values["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
+    # a flex may take more rows than 6 per equality, as many as it has now
+    values["equality_capacity"] = max(6 * model.neq, data.ne)
 
     # actgravcomp hands a joint's gravity compensation to its actuators; the rest is passive
-    passive = np.ascontiguousarray(
-        1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64), dtype=np.float64
-    )
-    # what is fixed to a mocap body, or jointed to it, moves with it
-    body_mocap = np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32)
-    # flexes may take more rows than 6 an equality, as many as they have now
-    equality_capacity = max(6 * model.neq, data.ne)
+    passive = 1.0 - model.jnt_actgravcomp[model.dof_jntid].astype(np.float64)
     owned: dict[str, NDArray[np.generic]] = {
-        "passive_gravcomp_dofs": passive,
-        "body_mocap": body_mocap,
+        "passive_gravcomp_dofs": np.ascontiguousarray(passive, dtype=np.float64),
+        # a body that is fixed or jointed to a mocap body moves with it
+        "body_mocap": np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32),
         "geom_bodyid": np.ascontiguousarray(model.geom_bodyid, dtype=np.int32),
         "tendon_range": np.ascontiguousarray(model.tendon_range, dtype=np.float64),
         "scratch": np.zeros(max(model.nv, 1)),
         "mocap_previous": np.zeros((max(model.nmocap, 1), 7)),
         "mocap_shift": np.zeros((max(model.nmocap, 1), 6)),
-        "equality_before": np.zeros(max(equality_capacity, 1)),
+        "equality_before": np.zeros(max(values["equality_capacity"], 1)),
         "tendon_before": np.zeros(max(model.ntendon, 1)),
         "outadr": np.ascontiguousarray(model.actuator_outadr, dtype=np.int32),
         "outnum": np.ascontiguousarray(model.actuator_outnum, dtype=np.int32),
     }
-    for name, array in owned.items():
-        state[name] = array.ctypes.data
-
-    for name in ("nq", "nv", "nbody", "ngeom", "nmocap", "ntendon", "nsensor"):
-        state[name] = getattr(model, name)
-    state["equality_capacity"] = equality_capacity
-    for name, value in contact_layout().items():
-        state[f"contact_{name}"] = value
-    state["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
-    state["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
-    return owned
+    return values, owned

@@ -1,4 +1,4 @@
-"""Everything beside scene and device motion that decides what a run computes."""
+"""Parameters of a run: all numbers besides scene and device motion that its results depend on."""
 
 from __future__ import annotations
 
@@ -14,22 +14,20 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import COUPLED, DIRECT, HELD, LOSSLESS, WELD, has_law, laws_per_tick
-
-# What the guard does within a tick, as numbers: part of what decides what a run computes.
+from hapticbridge.kernel.codes import Scheme, has_law, law_evaluations
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
-"""Passivity controllers as recordings number them: none; damping against the motion, and a tank
-behind it, for what both ports owe; damping for what the environment's port owes alone. Recordings
-of earlier versions have a 2 where a tank acted by itself."""
+"""Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
+behind it, for the energy debt of both ports; damping for the debt of the environment's port alone.
+Recordings of earlier versions have 2 for a tank by itself."""
 
 _TANK_ALONE = 2
 
-MOST_BUTTONS = 32
-"""Buttons that a mask may name; no handle has more."""
+MAX_BUTTONS = 32
+"""Largest count of buttons in a mask. No handle has more."""
 
 LATER = frozenset({"reach", "ramp_energy"})
-"""What came after the first recordings with a guard, which do without."""
+"""Fields missing in the first recordings with a guard; they default to infinity."""
 
 _POSITIVE = ("force_rise", "torque_rise", "longest_stall")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
@@ -44,32 +42,34 @@ _NOT_NEGATIVE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
-    """What the guard does within a tick; everything is off by default.
+    """Limits and thresholds of the guard within a tick; all are off by default.
+
+    The names are those of the metadata ``guard`` of a recording.
 
     Attributes:
         controller: ``OFF``, ``DAMPER`` or ``ENVIRONMENT``.
-        credit: Damping in N s/m that the energy account takes the device to burn.
-        rotational_credit: Likewise in N m s/rad.
+        credit: Damping in N s/m that the passivity observer assumes the device to have.
+        rotational_credit: Damping in N m s/rad that it assumes in rotation.
         most_damping: Largest damping in N s/m that the controller adds on an axis.
-        most_rotational_damping: Likewise in N m s/rad.
+        most_rotational_damping: Largest damping in N m s/rad that it adds on an axis.
         surplus: Largest energy in J that earlier dissipation may pay for.
-        force_rise: Largest change of the force from tick to tick in N.
-        torque_rise: Likewise in N m.
-        stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0: never.
-        fade_ticks: Ticks in which it fades to zero.
+        force_rise: Largest change of the force per tick in N.
+        torque_rise: Largest change of the torque per tick in N m.
+        stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
+        fade_ticks: Ticks in which the wrench fades to zero.
         clutch: Mask of buttons; while one is held, the device moves without the handle.
-        dead_man: Mask of buttons of which one must be held; 0: none need be.
-        longest_stall: Time in s between two samples after which the coupling is re-seated.
-        reseats: Whether a device that moved before the first tick is re-seated.
+        dead_man: Mask of buttons of which one must be held; 0 for none.
+        longest_stall: Time in s between two samples after which the handle is re-anchored.
+        reseats: True if a device that moved before the first tick is re-anchored.
         speed: Speed of the device in m/s above which the run is stopped.
-        turn_speed: Likewise in rad/s.
-        stretch: Length of the coupling in m above which it is stopped.
-        angle: Angle between handle and tool in rad, likewise.
-        energy: Energy in J given to the device beyond what the hand put in, likewise.
-        reach: Distance in m of the device from the origin of its frame beyond which it moves
+        turn_speed: Angular speed of the device in rad/s above which the run is stopped.
+        stretch: Length of the coupling in m above which the run is stopped.
+        angle: Angle between handle and tool in rad above which the run is stopped.
+        energy: Energy in J given to the device beyond the hand's above which the run is stopped.
+        reach: Distance in m from the origin of the device's frame beyond which the device moves
             without the handle and without force.
-        ramp_energy: Energy in J that the coupling may hold while the wrench rises at full pace; see
-            ``kernel.ramp``.
+        ramp_energy: Energy in J of the coupling up to which the ramp rises at full pace
+            (``kernel.guard``).
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -113,22 +113,23 @@ class GuardParameters:
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
-        for name, least in (("stale_ticks", 0), ("fade_ticks", 1), ("clutch", 0), ("dead_man", 0)):
+        smallest = {"stale_ticks": 0, "fade_ticks": 1, "clutch": 0, "dead_man": 0}
+        for name, minimum in smallest.items():
             value = getattr(self, name)
-            if not isinstance(value, int) or not least <= value < 2**MOST_BUTTONS:
-                raise HapticBridgeError(f"guard: {name} is {value!r}; it must be >= {least}")
+            if not isinstance(value, int) or not minimum <= value < 2**MAX_BUTTONS:
+                raise HapticBridgeError(f"guard: {name} is {value!r}; it must be >= {minimum}")
 
     def to_json(self) -> str:
-        """Returns it as a recording keeps it: what is infinite is null."""
+        """Returns the text for a recording's metadata; infinity becomes null."""
         values = asdict(self)
         return json.dumps({k: None if v == math.inf else v for k, v in values.items()})
 
     @classmethod
     def from_json(cls, text: str) -> GuardParameters:
-        """Reads what ``to_json`` wrote.
+        """Reads a text that ``to_json`` wrote.
 
         Raises:
-            HapticBridgeError: The text is not that, or a value is out of range.
+            HapticBridgeError: The text does not name a guard, or a value is out of range.
         """
         try:
             values = dict(read_json(text))
@@ -146,36 +147,36 @@ def _is_number(value: object) -> bool:
 
 
 UNGUARDED = GuardParameters()
-"""Of runs that nobody feels, and of recordings made before there was a guard."""
+"""Guard parameters of runs without a device, and of recordings older than the guard."""
 
 
 SLACK_SHARE = 0.5
-"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack where n > 1 laws are computed in a tick; no
-unit. A larger one needs more device damping (infinite at 1 and B = 0), a smaller one calls an
-environment active sooner."""
+"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack with n > 1 evaluations of the law per tick; no
+unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
+environment counts as active sooner."""
 
-MOST_SUBSTEPS = 100
-"""MuJoCo steps per tick at most; more would not fit into any period that can be felt."""
+MAX_SUBSTEPS = 100
+"""Largest number of MuJoCo steps per tick. More do not fit into the period of a haptic loop."""
 
 
 def checked_substeps(substeps: int, error: type[HapticBridgeError] = HapticBridgeError) -> int:
-    """Returns a number of MuJoCo steps per tick, 1 to ``MOST_SUBSTEPS``.
+    """Returns a number of MuJoCo steps per tick, 1 to ``MAX_SUBSTEPS``.
 
     Raises:
-        HapticBridgeError: It is not; of the kind asked for.
+        HapticBridgeError: It is out of range; the class is ``error``.
     """
-    return Arguments(error).whole("substeps", substeps, least=1, most=MOST_SUBSTEPS)
+    return Arguments(error).whole("substeps", substeps, least=1, most=MAX_SUBSTEPS)
 
 
 def refuse_substeps(scheme: int, substeps: int) -> None:
-    """Refuses more than one MuJoCo step per tick for a scheme that takes but one.
+    """Refuses several MuJoCo steps per tick for a scheme that allows one.
 
     Raises:
-        HapticBridgeError: Says why the scheme takes but one.
+        HapticBridgeError: The message gives the reason.
     """
     reasons = {
-        DIRECT: "a tool without mass has no motion to divide",
-        LOSSLESS: "a lossless coupling carries half of a tick's wrench over to the next",
+        Scheme.MASSLESS: "a tool without mass has no motion to divide",
+        Scheme.MIDPOINT: "a lossless coupling carries half of a tick's wrench over to the next",
     }
     if substeps != 1 and scheme in reasons:
         raise HapticBridgeError(f"substeps is {substeps!r}; {reasons[scheme]}, so it must be 1")
@@ -183,16 +184,16 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParameters:
-    """Everything beside scene and device motion that decides what a run computes.
+    """All numbers besides scene and device motion that the results of a run depend on.
 
     Attributes:
         grip: Name of the site on the tool.
         period: T in s.
         substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B' of the law, which is not what is felt (``rendering.Method.used``).
+        coupling: K and B' of the law (``rendering.Method.used``), not the effective coupling.
         scale: Handle motion per device motion, without unit.
         force_scale: Force on the device per force on the tool, without unit. Power is equal on both
-            sides where it equals ``scale``; torques return by force_scale / scale.
+            sides if it equals ``scale``; torques are scaled by force_scale / scale.
         axes: Row-major rotation from the device's frame to the scene's.
         force_limit: Largest force norm on the device in N.
         torque_limit: Largest torque norm on the device in N m.
@@ -200,14 +201,15 @@ class RunParameters:
         device_origin: Device pose (x, y, z, qw, qx, qy, qz) that maps to ``handle_origin``.
         handle_origin: Handle pose of the same form, in the scene.
         device_start: Device pose of the same form before the first tick.
-        scheme: How the wrench reaches the tool, one of ``kernel.scheme``'s five.
-        felt: The coupling that the tool is really held by, where it is not ``coupling`` (a weld);
-            the device condition is judged by it.
-        contact_stiffness: K_c in N/m per contact of a tool without mass, > 0 for it, else 0.
-        device_damping: b of the device in N s/m, None where unknown, in rotation too, or where the
-            motion is prescribed. What the device was given is held against what this burns.
-        device_rotational_damping: In N m s/rad, None likewise, or where nothing turns.
-        guarding: What the guard does within a tick.
+        scheme: Path of the wrench to the tool.
+        felt: Effective coupling as measured, for a weld; None if it follows from ``coupling``. The
+            device condition uses it.
+        contact_stiffness: K_c in N/m per contact of a tool without mass; 0 for other methods.
+        device_damping: b of the device in N s/m; None for a prescribed motion, or if a damping is
+            unknown. Its dissipation is compared with the energy delivered.
+        device_rotational_damping: Rotational damping in N m s/rad; None without rotation, or if
+            ``device_damping`` is.
+        guarding: Limits and thresholds of the guard.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -226,7 +228,7 @@ class RunParameters:
     device_origin: tuple[float, ...]
     handle_origin: tuple[float, ...]
     device_start: tuple[float, ...]
-    scheme: int = COUPLED
+    scheme: int = Scheme.IMPLICIT
     felt: Coupling | None = None
     contact_stiffness: float = 0.0
     device_damping: float | None = None
@@ -240,13 +242,13 @@ class RunParameters:
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
-        if self.scheme not in (COUPLED, HELD, WELD, DIRECT, LOSSLESS):
+        if self.scheme not in list(Scheme):
             raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 4")
         stiffness = self.contact_stiffness
         if (
             not math.isfinite(stiffness)
             or stiffness < 0
-            or (stiffness > 0) != (self.scheme == DIRECT)
+            or (stiffness > 0) != (self.scheme == Scheme.MASSLESS)
         ):
             raise HapticBridgeError(
                 f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
@@ -269,53 +271,53 @@ class RunParameters:
             raise _no_rotation(self.axes)
 
     @property
-    def laws(self) -> int:
-        """How often per tick the wrench on the tool is computed."""
-        return laws_per_tick(self.scheme, self.substeps)
+    def law_evaluations(self) -> int:
+        """Evaluations of the tool's wrench per tick."""
+        return law_evaluations(self.scheme, self.substeps)
 
     @property
     def has_law(self) -> bool:
-        """Whether the coupling law gives the wrench."""
+        """True if the coupling law gives the wrench."""
         return has_law(self.scheme)
 
     def slack_gains(self) -> tuple[float, float]:
-        """Returns gain g in N/m and its rotational counterpart in N m/rad: slack = Σ ½ g ‖δx_k‖².
+        """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
 
-        g = K + B/T with one law a tick, half of K/n + B/T with n > 1; zero where no coupling law
-        gives the wrench (a weld, a tool without mass): the proof that affords a slack needs one.
-        With several laws a tick, ½‖δx_i‖²_{K + nB/T} per law would be affordable at no device
-        damping where B = 0; half of it is (``certificate.required_damping``), and of the motions
-        δx_i the records only tell their sum, over which uniform motion is least.
+        g = K + B/T with one evaluation of the law per tick, and half of K/n + B/T with n > 1. Zero
+        without a coupling law (a weld, a tool without mass), because the proof of a slack needs
+        one. With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device
+        damping at B = 0; half of it does not (``certificate.required_damping``). The records hold
+        the sum of the motions δx_i alone, and uniform motion gives the least slack for a sum.
         """
         if not self.has_law:
             return 0.0, 0.0
         coupling = self.coupling
-        share = 1.0 if self.laws == 1 else SLACK_SHARE
+        share = 1.0 if self.law_evaluations == 1 else SLACK_SHARE
         return (
-            share * (coupling.stiffness / self.laws + coupling.damping / self.period),
+            share * (coupling.stiffness / self.law_evaluations + coupling.damping / self.period),
             share
             * (
-                coupling.rotational_stiffness / self.laws
+                coupling.rotational_stiffness / self.law_evaluations
                 + coupling.rotational_damping / self.period
             ),
         )
 
 
 _ROUNDING = 4 * np.finfo(np.float64).eps
-"""How far from a rotation the polar factor may be by rounding; no unit."""
+"""Largest deviation of the polar factor from a rotation by rounding; no unit."""
 
 
 def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
     """Returns the 9 numbers, row by row, of the rotation nearest to a matrix.
 
-    Axes are written with few digits (0.707107); the polar factor makes them a rotation to the last
-    one, so that positions, orientations and forces turn by the same.
+    Axes are written with few digits (0.707107). The polar factor makes them a rotation to the last
+    digit, so that positions, orientations and forces turn by equal angles.
 
     Args:
         matrix: 3 × 3, or 9 numbers; orthogonal to 1e-5 and right-handed.
 
     Raises:
-        HapticBridgeError: It is not.
+        HapticBridgeError: The matrix is no rotation.
     """
     try:
         given = np.asarray(matrix, dtype=np.float64)
@@ -325,7 +327,7 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
         square = given.reshape(3, 3)
         off = np.abs(square @ square.T - np.eye(3)).max()
         if off < 1e-5 and np.linalg.det(square) > 0:
-            if off < _ROUNDING:  # once more would turn the last digits of one that was recorded
+            if off < _ROUNDING:  # a second time would change the last digits of a recorded one
                 return tuple(square.ravel().tolist())
             left, _, right = np.linalg.svd(square)
             return tuple((left @ right).ravel().tolist())

@@ -1,112 +1,203 @@
-"""The energy account of both ports, and the controller that keeps it balanced.
+"""Passivity observer and passivity controller: energy at the device, and the damping against it.
 
-What is held is known exactly one tick later: the wrench w_{k-1} did the work w_{k-1}·δp_k on the
-device, whatever happened in between.
+The observer knows the energy of a tick exactly one tick later: the wrench w_{k−1} did the work
+w_{k−1}·δp_k on the device, for any motion in between.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT
+from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF, Part, State
+from hapticbridge.kernel.coupling import releasable_energy
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, scaled
 
 THRESHOLD = 1e-5
-"""In J. The controller acts on a debt above it. Rounding and the first-order error of turning tools
-stay below; a limit cycle that a hand could feel (0.1 mm at 2400 N/m) holds it in one swing."""
+"""Energy debt in J above which the controller acts. Rounding and the first-order error of turning
+tools stay below it. A limit cycle that a hand can feel (0.1 mm at 2400 N/m) reaches it in one
+swing."""
 
 TANK_START = 5e-3
-"""In J: what the tank holds at first. It must lend what a spring gives back before the account has
-seen it: 5 N at 2400 N/m hold 5 mJ. More lets a larger kick pass, less softens contacts."""
+"""Energy in J that the tank holds at first. It lends what a spring returns before the observer has
+seen it: 5 N at 2400 N/m store 5 mJ. A larger value lets a larger impulse pass; a smaller one
+softens contacts."""
 
 SWINGS, WINDOW = 4, 8
-"""So many reversals of the motion within so many ticks tell that an axis swings from sample to
-sample. A mass of 0.1 kg on 40 000 N/m reverses once in five ticks, a worst hand in each."""
+"""Reversals of the motion, and the ticks within which they count as swinging from sample to sample.
+A mass of 0.1 kg on 40 000 N/m reverses once in five ticks, a worst-case hand in every tick."""
 
 BOUND = 1.6
-"""Of b/T, without unit: 2 is the stiffness at which a damper alone, held by the worst hand, swings
-for ever; at 1.6 a swing loses 40 % from tick to tick. Less makes walls soft for longer."""
+"""Largest change of the force per device motion, as a multiple of b/T; no unit. At 2, a damper
+alone held by the worst-case hand swings forever; at 1.6 a swing loses 40 % per tick. A smaller
+value makes walls soft for longer."""
+
+OBSERVER_DTYPE = np.dtype(
+    [
+        ("controller", "<i8"),
+        ("flags", "<i8"),
+        ("assumed_damping", "<f8"),
+        ("assumed_rotational_damping", "<f8"),
+        ("max_damping", "<f8"),
+        ("max_rotational_damping", "<f8"),
+        ("energy_credit_limit", "<f8"),
+        ("observed_energy", "<f8"),
+        ("energy_to_device", "<f8"),
+        ("excess_energy_to_device", "<f8"),
+        ("stored_while_force_off", "<f8"),
+        ("generated_energy", "<f8"),
+        ("previous_generated", "<f8"),
+        ("previous_net_storage", "<f8"),
+        ("injected_damping", "<f8"),
+        ("injected_rotational_damping", "<f8"),
+        ("axis_energy", "<f8", 6),
+        ("device_velocity", "<f8", 6),
+        ("reversals", "<i8", 6),
+    ]
+)
+"""Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
+N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``reversals`` holds one bit per
+tick."""
 
 
-@compiled
-def unpaid(state: NDArray[np.void]) -> float:
-    """Returns in J what the device was given beyond what the hand put in, by the last count.
-
-        given + r min(S − S_0, 0),   r = force_scale/scale
-
-    ``given`` is w·δp − b δp²/t summed; S_0 is what the scene stored when the run began: what it has
-    given up of that has paid.
-    """
-    s = state[0]
-    lost = min(s.kinetic + s.potential - s.start_energy, 0.0)
-    return float(s.given + (s.force_scale / s.scale) * lost)
+def bind_observer(observer: Part, guarding: GuardParameters) -> None:
+    """Fills in the controller and its limits."""
+    observer["controller"] = guarding.controller
+    observer["assumed_damping"] = guarding.credit
+    observer["assumed_rotational_damping"] = guarding.rotational_credit
+    observer["max_damping"] = guarding.most_damping
+    observer["max_rotational_damping"] = guarding.most_rotational_damping
+    observer["energy_credit_limit"] = guarding.surplus
 
 
-@compiled
-def observe_energy(state: NDArray[np.void], moved: Vector, turned: Vector, interval: float) -> None:
-    """Adds what the last tick gave to the device, burnt there and took up in the scene.
+def cap_dissipation(s: State) -> None:
+    """Limits, before a command, the dissipation that may pay for energy to the device.
 
-        A_k = max(A_{k-1} + w_{k-1}·δp_k − b δp_k²/t + r c (S_{k-1} − S_{k-2} − W), −surplus)
+        G ← max(G, −(A_max + r V + r max(S − S_0 − U, 0))),    r = force_scale / scale
 
-    S is what the scene stores, W the work of its own motors and of user forces, r = force_scale /
-    scale, and c the share of the wrench that the guard let through. What a certified device gets
-    keeps A <= 0 (BC97 (6)); what the environment creates enters through S, what the hold leaks
-    through w·δp − b δp²/t, so one account covers both ports. A surplus is capped: an hour of
-    dissipation does not pay for a minute of activity.
-
-    ``excess`` is what the environment's port owes alone, Σ E_k − Σ ½‖δx_k‖²_{K+B/T}, with its own
-    surplus capped in the same way.
-
-    ``kicked`` is what the device was given beyond what the hand put in (``unpaid``). Motors of the
-    scene pay for nothing there.
-
-    ``unfelt`` is what the scene took up of a handle that moved it while the force was off by
-    command, and still has: no hand has put that in (``kernel.tuning.forget_dissipation``).
+    G is ``energy_to_device``, A_max ``energy_credit_limit``, V the energy that the coupling's
+    springs can release, S − S_0 the energy that the scene has taken up; all in J. Both V and S −
+    S_0 may return to the hand. U is the energy that the scene took up while the force was off by
+    command; it may not return, and neither may V then, because the handle is re-anchored before
+    force is on again. Without the cap, a hand that has dissipated 1 J by rubbing could receive 1 J
+    by a slider that is moved, or a force that is switched, at the right moments.
 
     Args:
-        state: The bound state, as the tick before left it.
-        moved: δp in m, in the device's frame.
-        turned: Its rotation vector.
-        interval: t in s, since the device's last new sample.
+        s: The bound state, between two ticks.
     """
-    s = state[0]
-    stored = s.kinetic + s.potential - s.start_energy
-    over = s.environment_energy - s.slack
-    s.excess = max(s.excess + (over - s.excess_before), -s.surplus)
-    s.excess_before = over
-    own = stored - s.actuator_work - s.external_work
-    gained = (s.force_scale / s.scale) * s.passed * (own - s.own_before)
-    kept = max(s.kinetic + s.potential - s.start_energy, 0.0)
-    taken = own - s.own_before if s.commanded & FORCE_OFF else 0.0
-    s.unfelt = min(max(s.unfelt + taken, 0.0), kept)
-    s.own_before = own
-    # before the first tick and in a pause nobody knows how long the device took to move
-    rate = 1.0 / interval if s.tick > s.ramp_start else 0.0
-    given = 0.0
-    w, a = s.wrench_on_device, s.axis_account
-    for i in range(3):
-        linear = (w[i] - s.credit * rate * moved[i]) * moved[i]
-        angular = (w[3 + i] - s.rotational_credit * rate * turned[i]) * turned[i]
-        a[i] = max(a[i] + linear, -s.surplus)
-        a[3 + i] = max(a[3 + i] + angular, -s.surplus)
-        given += linear + angular
-    s.account = max(s.account + given + gained, -s.surplus)
-    s.given += given
-    s.kicked = unpaid(state)
-    for i in range(6):
-        u = rate * (moved[i] if i < 3 else turned[i - 3])
-        has_reversed = 1 if u * s.device_velocity[i] < 0.0 else 0
-        s.reversals[i] = ((s.reversals[i] << 1) | has_reversed) & (2**WINDOW - 1)
-        s.device_velocity[i] = u
+    observer, energy = s["observer"], s["energy"]
+    ratio = float(s["run"]["force_scale"] / s["run"]["scale"])
+    stored = float(
+        energy["kinetic"]
+        + energy["potential"]
+        - energy["start_energy"]
+        - observer["stored_while_force_off"]
+    )
+    released = 0.0 if s["guard"]["commanded"] & FORCE_OFF else releasable_energy(s)
+    limit = float(observer["energy_credit_limit"]) + released + ratio * max(stored, 0.0)
+    observer["energy_to_device"] = max(float(observer["energy_to_device"]), -limit)
+
+
+def observe_reset(s: State, stored_before: float) -> None:
+    """Accounts for a reset of the scene: storage that it replaced pays for no energy to the device.
+
+    Args:
+        s: The bound state with the energies after the reset.
+        stored_before: Storage before the reset in J.
+    """
+    energy, observer = s["energy"], s["observer"]
+    start, ratio = float(energy["start_energy"]), s["run"]["force_scale"] / s["run"]["scale"]
+    after = float(energy["kinetic"] + energy["potential"])
+    lost_before, lost_after = min(stored_before - start, 0.0), min(after - start, 0.0)
+    observer["energy_to_device"] += ratio * (lost_before - lost_after)
+    cap_dissipation(s)
 
 
 @compiled
-def _swings(state: NDArray[np.void], i: int) -> bool:
-    """Tells whether an axis moves to and fro from sample to sample."""
-    bits, count = state[0].reversals[i], 0
+def excess_energy_to_device(s: State) -> float:
+    """Returns the energy in J that the device received beyond the hand's, up to the last tick.
+
+        G + r min(S − S_0, 0),    r = force_scale / scale
+
+    G is the sum of w·δp − b ‖δp‖²/t in J; S_0 is the scene's storage at the start. Storage that the
+    scene has given up since then has paid for as much.
+    """
+    lost = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
+    return float(s.observer.energy_to_device + (s.run.force_scale / s.run.scale) * lost)
+
+
+@compiled
+def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
+    """Updates the passivity observer with the previous tick's energy flow.
+
+        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + r c (ΔS − W), −A_max)
+
+    A > 0 means that device and scene together have delivered more energy than they received.
+
+    Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the
+    previous tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new
+    sample (s); r = force_scale / scale; c share of the wrench that the guard let through; ΔS change
+    of the stored energy (J); W work of the scene's motors and of user forces (J). A_max (J) caps
+    the credit, so that long dissipation cannot hide a short active phase.
+
+    Also updated, each in J:
+        ``generated_energy``: Σ E_k − slack of the environment's port; A_max caps its credit.
+        ``excess_energy_to_device``: as the function computes it; motors of the scene pay for none.
+        ``stored_while_force_off``: energy that the scene took up while the force was off by
+        command and still stores. No hand supplied it (``cap_dissipation``).
+
+    Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
+
+    Args:
+        s: The bound state, as the previous tick left it.
+        moved: Translation δp in m, in the device's frame.
+        turned: Rotation vector δp in rad.
+        interval: t in s.
+
+    References:
+        Hannaford & Ryu 2002, eq. (4); Brown & Colgate 1997, eq. (6).
+    """
+    observer, energy = s.observer, s.energy
+    limit = observer.energy_credit_limit
+    stored = energy.kinetic + energy.potential - energy.start_energy
+    over = energy.environment_energy - energy.slack
+    generated = observer.generated_energy + (over - observer.previous_generated)
+    observer.generated_energy = max(generated, -limit)
+    observer.previous_generated = over
+    net = stored - energy.actuator_work - energy.external_work
+    change = net - observer.previous_net_storage
+    gained = (s.run.force_scale / s.run.scale) * s.guard.transmitted_share * change
+    taken = change if s.guard.commanded & FORCE_OFF else 0.0
+    unfelt = max(observer.stored_while_force_off + taken, 0.0)
+    observer.stored_while_force_off = min(unfelt, max(stored, 0.0))
+    observer.previous_net_storage = net
+    # before the first tick and in a pause, the time that the device took to move is unknown
+    rate = 1.0 / interval if s.loop.tick > s.guard.ramp_start else 0.0
+    delivered = 0.0
+    w, a = s.loop.wrench_on_device, observer.axis_energy
+    b, b_r = observer.assumed_damping, observer.assumed_rotational_damping
+    for i in range(3):
+        linear = (w[i] - b * rate * moved[i]) * moved[i]
+        angular = (w[3 + i] - b_r * rate * turned[i]) * turned[i]
+        a[i] = max(a[i] + linear, -limit)
+        a[3 + i] = max(a[3 + i] + angular, -limit)
+        delivered += linear + angular
+    observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
+    observer.energy_to_device += delivered
+    observer.excess_energy_to_device = excess_energy_to_device(s)
+    for i in range(6):
+        u = rate * (moved[i] if i < 3 else turned[i - 3])
+        has_reversed = 1 if u * observer.device_velocity[i] < 0.0 else 0
+        bits = (observer.reversals[i] << 1) | has_reversed
+        observer.reversals[i] = bits & (2**WINDOW - 1)
+        observer.device_velocity[i] = u
+
+
+@compiled
+def _swings(observer: Part, i: int) -> bool:
+    """Returns True if an axis moves to and fro from sample to sample."""
+    bits, count = observer.reversals[i], 0
     for _ in range(WINDOW):
         count += bits & 1
         bits >>= 1
@@ -114,91 +205,89 @@ def _swings(state: NDArray[np.void], i: int) -> bool:
 
 
 @compiled
-def _held_back(
-    state: NDArray[np.void], first: int, axis: int, f: float, most: float, debt: float
-) -> tuple[float, float]:
-    """Returns one component of the wrench with what is owed on its axis, and the damping added."""
-    s = state[0]
-    i = first + axis
-    u = s.device_velocity[i]
-    owed = min(debt, s.axis_account[i])
+def _damped(s: State, i: int, f: float, max_damping: float, debt: float) -> tuple[float, float]:
+    """Returns component i of the wrench, damped by the debt on its axis, and the damping."""
+    u = s.observer.device_velocity[i]
+    owed = min(debt, s.observer.axis_energy[i])
     if not owed > 0.0:
         return f, 0.0
-    damping = min(owed / (s.period * u * u), most) if u != 0.0 else 0.0
+    damping = min(owed / (s.run.period * u * u), max_damping) if u != 0.0 else 0.0
     f -= damping * u
-    if not _swings(state, i):
+    if not _swings(s.observer, i):
         return f, damping
-    # from tick to tick the force may follow the motion no faster than the device's damper bears
-    change = BOUND * most * abs(u)
-    return min(max(f, s.slewed[i] - change), s.slewed[i] + change), damping
+    # the force may follow the motion from tick to tick only as far as the device's damper bears
+    change, last = BOUND * max_damping * abs(u), s.guard.limited_wrench[i]
+    return min(max(f, last - change), last + change), damping
 
 
 @compiled
-def _from_tank(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vector, Vector]:
-    """Scales the wrench to what the tank can pay for over the next tick."""
-    s = state[0]
-    u = s.device_velocity
+def _tank_limited(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Scales the wrench so that its work in the next tick is at most the tank's level."""
+    u = s.observer.device_velocity
     work = force[0] * u[0] + force[1] * u[1] + force[2] * u[2]
     work += torque[0] * u[3] + torque[1] * u[4] + torque[2] * u[5]
-    work *= s.period
-    level = max(TANK_START - s.account, 0.0)
+    work *= s.run.period
+    level = max(TANK_START - s.observer.observed_energy, 0.0)
     if work > level:
         share = level / work
         force, torque = scaled(share, force), scaled(share, torque)
-        s.flags |= CONTROLLER_ACTIVE
+        s.observer.flags = CONTROLLER_ACTIVE
     return force, torque
 
 
 @compiled
-def control(state: NDArray[np.void], force: Vector, torque: Vector) -> tuple[Vector, Vector]:
-    """Returns the wrench with what the controller does to it.
+def control(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Returns the wrench on the device after the passivity controller.
 
-    Damper, on each axis that was itself given more than it returned while the account is in debt:
+    While energy is owed, the controller damps each axis that received more than it returned:
 
-        f ← f − α v,   α = min(debt/(T v²), b, m/T),   then   |f_k − f_{k−1}| <= 1.6 (b/T) |δp_k|
+        f ← f − α v,    α = min(debt/(T v²), b, m/T),    then    |f_k − f_{k−1}| <= 1.6 (b/T) |δp_k|
 
-    Unclipped, α grows beyond all bounds as v goes to zero and is active itself. It mends a device
-    with mass. Where the hand makes the loop swing from sample to sample, v is a sample late and
-    damping only adds to it: there the second bound, that of energy-bounding control, lowers the
-    stiffness that is felt until the damper bears it.
+    f in N, v in m/s, debt in J, T period in s, b the device's damping in N s/m, m its mass in kg.
+    Without the clip, α grows without bound as v goes to zero and is itself active. The second
+    bound, from energy-bounding control, applies if the hand makes the loop swing from sample to
+    sample. There v is one sample late and damping adds to the swing; the bound lowers the effective
+    stiffness until the device's damper bears it.
 
-    For the environment's port alone the debt is what it created beyond the slack that the coupling
-    leaves it, ``excess`` as the tick before left it: up to there a device that bears its coupling
-    stays passive whatever the environment does. Beyond, the damper acts as above, until each axis
-    has burnt or given back what it was given. A damper on the tool would sit nearer to the cause,
-    and makes contacts create more (as scaling the tool's velocity does).
+    Controller ``DAMPER`` takes ``observed_energy`` as the debt, ``ENVIRONMENT`` the previous tick's
+    ``generated_energy``. Up to the slack a device that bears its coupling stays passive; beyond it
+    each axis is damped until it has dissipated or returned its energy. A damper on the tool would
+    be nearer to the cause, but contacts then generate more.
 
-    Behind the damper a tank scales the wrench so that the work it does over the next tick, at the
-    speed of the last one, is no more than what the tank holds. It pays what α cannot because it is
-    clipped, and does not act in such a swing, where the speed of the last tick says nothing of the
-    next.
+    Behind the damper, a tank scales the wrench to the work that its level allows in the next tick,
+    at the velocity of the last one. It covers the debt that the clipped α cannot. It does not act
+    in a swing, because the last velocity does not predict the next one.
 
     References:
         Hannaford & Ryu 2002 (damper); Kim & Ryu 2010 (bound); Franken et al. 2011 (tank).
     """
-    s = state[0]
-    s.injected_damping = s.injected_rotational_damping = 0.0
-    if s.controller == DAMPER or (s.controller == ENVIRONMENT and s.has_law):
-        debt = s.account - THRESHOLD
-        if s.controller == ENVIRONMENT:
-            debt = s.excess - THRESHOLD
+    observer = s.observer
+    observer.flags = 0
+    observer.injected_damping = observer.injected_rotational_damping = 0.0
+    is_environment = observer.controller == ENVIRONMENT
+    if observer.controller == DAMPER or (is_environment and s.run.has_law):
+        debt = observer.observed_energy - THRESHOLD
+        if is_environment:
+            debt = observer.generated_energy - THRESHOLD
         if debt > 0.0:
-            b, b_r = s.most_damping, s.most_rotational_damping
-            x, on_x = _held_back(state, 0, 0, force[0], b, debt)
-            y, on_y = _held_back(state, 0, 1, force[1], b, debt)
-            z, on_z = _held_back(state, 0, 2, force[2], b, debt)
-            rx, on_rx = _held_back(state, 3, 0, torque[0], b_r, debt)
-            ry, on_ry = _held_back(state, 3, 1, torque[1], b_r, debt)
-            rz, on_rz = _held_back(state, 3, 2, torque[2], b_r, debt)
-            s.injected_damping = max(on_x, on_y, on_z)
-            s.injected_rotational_damping = max(on_rx, on_ry, on_rz)
-            is_damped = s.injected_damping > 0.0 or s.injected_rotational_damping > 0.0
+            b, b_r = observer.max_damping, observer.max_rotational_damping
+            x, on_x = _damped(s, 0, force[0], b, debt)
+            y, on_y = _damped(s, 1, force[1], b, debt)
+            z, on_z = _damped(s, 2, force[2], b, debt)
+            rx, on_rx = _damped(s, 3, torque[0], b_r, debt)
+            ry, on_ry = _damped(s, 4, torque[1], b_r, debt)
+            rz, on_rz = _damped(s, 5, torque[2], b_r, debt)
+            observer.injected_damping = max(on_x, on_y, on_z)
+            observer.injected_rotational_damping = max(on_rx, on_ry, on_rz)
+            is_damped = (
+                observer.injected_damping > 0.0 or observer.injected_rotational_damping > 0.0
+            )
             if is_damped or (x, y, z) != force or (rx, ry, rz) != torque:
-                s.flags |= CONTROLLER_ACTIVE
+                observer.flags = CONTROLLER_ACTIVE
             force, torque = (x, y, z), (rx, ry, rz)
-            is_swinging = s.controller == ENVIRONMENT  # the tank counts the other debt
+            is_swinging = is_environment  # the tank counts the other debt
             for i in range(6):
-                is_swinging = is_swinging or _swings(state, i)
+                is_swinging = is_swinging or _swings(observer, i)
             if not is_swinging:
-                force, torque = _from_tank(state, force, torque)
+                force, torque = _tank_limited(s, force, torque)
     return force, torque

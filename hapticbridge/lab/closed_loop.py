@@ -213,11 +213,11 @@ class ClosedLoop:
             environment=ledger.environment,
             created=float(most[0]),
             slack_share=ledger.slack_share,
-            first_active=int(state["first_active"][0]),
+            first_active=int(state["energy"]["first_active"][0]),
             fault=ledger.fault,
-            peak_force=float(state["peak_force"][0]),
+            peak_force=float(state["loop"]["peak_force"][0]),
             last_force=float(last.max(initial=0.0)),
-            device_energy=float(state["device_energy"][0]),
+            device_energy=ledger.device_energy,
             records=records[: min(done, records.size)],
         )
 
@@ -241,7 +241,7 @@ def _run(
         for _ in range(intervals[k] if k > 0 else 1):
             next_sample(devices, motion, sample)
         elapsed = devices[0].period * intervals[k]
-        for substep in range(s.substeps):
+        for substep in range(s.run.substeps):
             if before_step(state, sample, row, substep, elapsed) != OK:
                 return k
             advance(state)
@@ -254,7 +254,7 @@ def _run(
         force = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
         torque = w[3] * w[3] + w[4] * w[4] + w[5] * w[5]
         signal[k] = np.sqrt(force + torque / LEVER**2)
-        most[0] = max(most[0], s.environment_energy)
+        most[0] = max(most[0], s.energy.environment_energy)
         if records.size > 0:
             records[k] = row[0]
         if not signal[k] < HUGE:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hapticbridge.kernel.codes import COUPLED, DIRECT, HELD, WELD
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.rendering import METHODS, Method
 from hapticbridge.theory.compensation import IMPLICIT_LAG
 
@@ -22,7 +22,7 @@ _COMPARED = (
         name="implicitfast",
         about="the same actuators under implicitfast: implicit in velocity, not in position",
         hazard=f"the spring is not solved implicitly: it {_CREATES}",
-        scheme=COUPLED,
+        scheme=Scheme.IMPLICIT,
         integrator="implicitfast",
     ),
     Method(
@@ -30,7 +30,7 @@ _COMPARED = (
         about="the same actuators under implicitfast with K T more damping, which away from "
         "contact makes the step equal to that of 'implicit'",
         hazard="contacts are solved without the coupling's stiffness and may create energy",
-        scheme=COUPLED,
+        scheme=Scheme.IMPLICIT,
         integrator="implicitfast",
         compensated=True,
         adds=IMPLICIT_LAG,
@@ -40,7 +40,7 @@ _COMPARED = (
             name="explicit" if integrator == "Euler" else f"explicit:{integrator.lower()}",
             about=_HELD_ABOUT.format(integrator),
             hazard=_HELD_HAZARD,
-            scheme=HELD,
+            scheme=Scheme.ZERO_ORDER_HOLD,
             integrator=integrator,
         )
         for integrator in ("Euler", "implicitfast", "RK4")
@@ -52,7 +52,7 @@ _COMPARED = (
         "mass and on the constraint's impedance",
         hazard="the weld's stiffness is not the one asked for but mass times K/(1 - impedance) "
         "as measured, and no coupling law proves what the device needs",
-        scheme=WELD,
+        scheme=Scheme.WELD,
         integrator="implicitfast",
         discretization="none",
     ),
@@ -62,7 +62,7 @@ _COMPARED = (
         "contact; there is no coupling",
         hazard="geometry decides what the device needs: two contacts a distance L apart are "
         "stable only for L <= 2 sqrt(b_theta / (T K_c))",
-        scheme=DIRECT,
+        scheme=Scheme.MASSLESS,
         integrator="discrete",
         discretization="none",
     ),

@@ -27,9 +27,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
-from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.ring import TAIL, Ring
-from hapticbridge.recording.writer import RecordingWriter, check_contents
 
 # Second reader of a run.
 
@@ -73,6 +71,9 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     Returns:
         The outcome, as a clause.
     """
+    from hapticbridge.recording.reader import read_with_attachments  # noqa: PLC0415 - imports mcap
+    from hapticbridge.recording.writer import RecordingWriter  # noqa: PLC0415
+
     beside = path.with_name(path.name + ".salvaged")
     try:
         recording, attachments = read_with_attachments(path)
@@ -151,6 +152,8 @@ class Recorder:
     ) -> None:
         if ring.name is None:
             raise RecordingError("the recorder needs a shared ring, not a local one")
+        from hapticbridge.recording.writer import check_contents  # noqa: PLC0415 - imports mcap
+
         check_contents(metadata, attachments)
         configuration = {
             "ring": ring.name,
@@ -340,7 +343,7 @@ _FULL = "the disk is full; the recording ends here and is whole"
 class RecordStream:
     """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
-    ``kernel.publish.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
+    ``kernel.tick.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
     recorder's process reads them; otherwise the ring keeps the newest records. Close it after the
     loop in any case.
 
@@ -355,7 +358,7 @@ class RecordStream:
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
-        cursors: The ring's cursors, ``kernel.publish.HEAD`` and ``TAIL``.
+        cursors: The ring's cursors, ``kernel.tick.HEAD`` and ``TAIL``.
         recorder: The recorder's process once started; None without one.
         lost: Flag of the next record: ``DROPPED_BEFORE`` if the one before it was lost, else 0.
         dropped: Number of lost records.

@@ -196,7 +196,9 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
     worst, info = evidence.worst, evidence.info
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
     prompt = worst.scale * worst.force_scale
-    prompt *= required_damping(worst.coupling, felt_period(info, worst.period), worst.laws)
+    prompt *= required_damping(
+        worst.coupling, felt_period(info, worst.period), worst.law_evaluations
+    )
     if not late or not failing or own < prompt:
         return None
     return Cause(

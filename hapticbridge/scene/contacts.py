@@ -230,22 +230,19 @@ def contact_concerns(
     """Returns the risks of a contact setting, one clause each; empty for a recommended setting.
 
     Args:
-        solref: (timeconst in s, dampratio), or (−stiffness in 1/s², −damping in 1/s).
-        solimp: MuJoCo's d₀, d_w, width in m, midpoint, power; trailing values may be left out.
+        solref: As for ``contact_numbers``, which raises the errors.
+        solimp: As for ``contact_numbers``.
         timestep: h in s.
         cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
         diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
             shipped setting generate energy.
-        refsafe: True if MuJoCo raises a time constant that the step cannot resolve.
+        refsafe: As for ``contact_numbers``.
         condim: Dimension of the contact; 1 is without friction.
         friction: Coefficient of sliding.
         only_active: If true, only risks that are likely to exceed the slack are returned.
 
     Returns:
         Clauses that follow "the contact of …": the fault, the risk, and what to write instead.
-
-    Raises:
-        SceneError: A number is not finite, the time step is not > 0, or a sequence is too short.
     """
     numbers = contact_numbers(solref, solimp, timestep, refsafe=refsafe)
     # + 0.0 turns a negative zero into 0

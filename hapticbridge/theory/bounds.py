@@ -29,7 +29,7 @@ from hapticbridge.theory.transfer import (
 def coupled_stability_limit(
     device_damping: ArrayLike, period: float, *, damping: ArrayLike = 0.0, delay: float = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the stiffness below which device and coupling are stable against a wall.
+    """Returns the stiffness in N/m below which device and coupling are stable against a wall.
 
         K = (b + B) / (T/2 + t_d),    t_d = delay · T
 
@@ -38,17 +38,8 @@ def coupled_stability_limit(
     sign of B is opposite to that in ``minimum_damping``, because a damper helps stability and costs
     passivity.
 
-    Args:
-        device_damping: b in N s/m, finite and >= 0.
-        period: T in s, finite and > 0.
-        damping: B in N s/m, finite and >= 0.
-        delay: Delay from position to force in samples, >= 0; fractions are allowed.
-
-    Returns:
-        K in N/m, of the broadcast shape of the arguments.
-
-    Raises:
-        CouplingError: An argument is out of range.
+    b and B in N s/m must be finite and >= 0, T in s > 0, the delay in samples >= 0 (fractions are
+    allowed); otherwise CouplingError is raised. Arrays broadcast.
 
     References:
         Gil et al. 2009.
@@ -164,26 +155,13 @@ def worst_frequency(
 
     Without a delay it is Nyquist's, π/T, for every coupling; the spectrum of a spring alone is
     flat. With a delay, against a wall, a soft damper leaves it at low frequency. A strong damper
-    moves it towards π/((d + 1) T) and its odd multiples.
-
-    Args:
-        coupling: K and B; a ``CouplingGrid`` evaluates many at once.
-        period: T in s, finite and > 0.
-        discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force, 0 to 50.
-        filter_time: τ in s of a first-order low-pass behind the damper, >= 0.
-        axis: Kind of axis, which selects the pair of K and B.
+    moves it towards π/((d + 1) T) and its odd multiples. Arguments, errors and sources are those of
+    ``minimum_damping``.
 
     Returns:
         ω in rad/s, shaped like the coupling: 0.0 if the supremum is the limit for ω → 0, π/T if it
         is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
         is flat at its top. Of several equal maxima any one.
-
-    Raises:
-        CouplingError: An argument is out of range or unknown.
-
-    References:
-        Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
     law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
     k, b, period, samples, tau, is_ringing = law
@@ -316,19 +294,11 @@ def maximum_stiffness(
 def maximum_stiffness(
     device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the largest passive stiffness, K = 2 (b − B) / T.
+    """Returns the largest passive stiffness, K = 2 (b − B) / T, in N/m.
 
-    Args:
-        device_damping: b in N s/m, finite and > 0.
-        period: T in s, finite and > 0.
-        damping: B in N s/m, finite, 0 <= B < b.
-
-    Returns:
-        K in N/m, of the broadcast shape of the arguments. The stiffness of a coupling must stay
-        below it.
-
-    Raises:
-        CouplingError: An argument is out of range; for B >= b no stiffness is passive.
+    The stiffness of a coupling must stay below it. b in N s/m and T in s must be finite and > 0,
+    and 0 <= B < b; otherwise CouplingError is raised, because for B >= b no stiffness is passive.
+    Arrays broadcast.
 
     References:
         Brown & Colgate 1997, eq. (6) solved for K.
@@ -352,13 +322,8 @@ def stiffest_coupling(damping: float, rotational_damping: float, period: float) 
 
         B = b / 4,    K = 0.8 · 2 (b − B) / T        for translation and for rotation
 
-    Args:
-        damping: b in N s/m as seen in the scene (divided by scale · force scale), > 0.
-        rotational_damping: b_r in N m s/rad as seen in the scene, > 0.
-        period: T in s, finite and > 0.
-
-    Raises:
-        CouplingError: An argument is not finite or not positive.
+    The device's b in N s/m and N m s/rad, as seen in the scene (divided by scale · force scale),
+    and T in s must be finite and > 0; otherwise CouplingError is raised.
     """
     damping = scalar("device damping", damping, "N s/m", positive=True)
     rotational_damping = scalar("device damping", rotational_damping, "N m s/rad", positive=True)

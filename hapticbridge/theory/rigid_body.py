@@ -283,17 +283,8 @@ def exact_mass_response(
 
         X/H = (K + jωB) / (K + jωB − M ω²),    ω = 2π · frequency
 
-    Args:
-        coupling: K and B.
-        mass: M in kg, finite and > 0.
-        frequency: Frequency in Hz, finite and > 0; broadcast against the mass.
-
-    Returns:
-        X/H, complex, of the broadcast shape of mass and frequency; inf at the resonance of an
-        undamped mass.
-
-    Raises:
-        MechanicsError: An argument is not finite, not positive or mis-shaped.
+    Mass in kg and frequency in Hz must be finite and > 0, and broadcast; otherwise MechanicsError
+    is raised. At the resonance of an undamped mass X/H is inf.
     """
     mass, frequency = positive("mass", mass, "kg"), positive("frequency", frequency, "Hz")
     common_shape(mass=mass, frequency=frequency)

@@ -81,24 +81,14 @@ def damping_spectrum(
         delay = 0:   b(ω) = (T/2)(1 − cos ωT) / Re{(1 − e^{−jωT}) / C}        any environment
         delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
 
-    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments apply here. With a delay
-    the environment is a wall, because behind a delayed coupling no damping suffices for *every*
-    passive environment. Against a wall the coupling's damper can help, so values may be negative.
-
-    Args:
-        coupling: K and B, shape S.
-        period: T in s.
-        frequency: ω in rad/s, 0 < ω <= π/T, shape F.
-        discretization: Rule that takes the damper's velocity from sampled positions.
-        delay: d, whole samples from position to force.
-        filter_time: τ in s of a first-order low-pass behind the damper.
-        axis: Kind of axis, which selects the pair of K and B.
+    ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments and errors apply here. With
+    a delay the environment is a wall, because behind a delayed coupling no damping suffices for
+    *every* passive environment. Against a wall the coupling's damper can help, so values may be
+    negative.
 
     Returns:
-        b in N s/m (rotation: N m s/rad), shape S + F; inf where none suffices.
-
-    Raises:
-        CouplingError: An argument is out of range.
+        b in N s/m (rotation: N m s/rad), shape S + F for couplings of shape S and frequencies ω in
+        rad/s of shape F; inf where none suffices.
 
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
@@ -226,15 +216,8 @@ def wall_supremum(
     """Returns the supremum over 0 < θ <= π of (T/2) Re{(1 − e^{−jθ}) C e^{−jdθ}} / (1 − cos θ).
 
     The grid is even in θ and, with a low-pass, also in log θ down to its corner. The best cell of
-    every half ripple is refined by golden section, because ripples can be equally high.
-
-    Args:
-        stiffness: K in N/m.
-        damping: B in N s/m, of the shape of the stiffness.
-        period: T in s.
-        scheme: Discretization of the damper; must be finite at Nyquist.
-        delay: d in samples.
-        filter_time: τ in s.
+    every half ripple is refined by golden section, because ripples can be equally high. The
+    discretization (``scheme``) must be finite at Nyquist.
 
     Returns:
         The supremum in N s/m, and the θ in rad of its first occurrence, to about 1e-7.
@@ -269,12 +252,7 @@ def wall_supremum(
 
 
 def search_grid(delay: int, lag: float) -> _Array:
-    """Returns the grid of angles in rad, ascending, that brackets the maxima.
-
-    Args:
-        delay: d in samples.
-        lag: τ/T, without unit.
-    """
+    """Returns the grid of angles in rad, ascending, that brackets the maxima; ``lag`` is τ/T."""
     grid = np.linspace(LOWEST_ANGLE, np.pi, POINTS_PER_RIPPLE * (delay + 1) + 1)
     # Start at a hundredth of the corner, but stay a factor of two away from both ends of the
     # first cell: points crowded there could differ by rounding alone.

@@ -91,25 +91,14 @@ def transmission_line_stiffness(
     terminated_by: Termination = "device",
     round_trip: int = 2,
 ) -> float | NDArray[np.float64]:
-    """Returns the largest static stiffness of a passive line in front of a wall.
+    """Returns the largest static stiffness in N/m of a passive line in front of a wall.
 
         K = 2 Z/(n T)  with  Z = b  (software, n = 1: Z = b/2; n > 2: none, 0)
 
     With one sample each way K is b/T, **half** of the 2 b/T of a spring and damper. Only a line
     that returns within one sample, which is a plain spring, reaches 2 b/T. A line gains no
-    stiffness.
-
-    Args:
-        device_damping: b in N s/m, finite and > 0.
-        period: T in s, finite and > 0.
-        terminated_by: Element that terminates the line at the device.
-        round_trip: n, whole samples there and back, >= 1.
-
-    Returns:
-        K in N/m, shaped like the damping.
-
-    Raises:
-        CouplingError: An argument is out of range or unknown.
+    stiffness. Arguments and errors are those of ``transmission_line_spectrum``, with b in N s/m in
+    place of Z.
 
     References:
         Brown & Colgate 1997, section 6 (future work).

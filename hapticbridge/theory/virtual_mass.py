@@ -63,7 +63,7 @@ def _smallest_stable_mass(stiffness: _Array, damping: _Array, period: float, del
 def minimum_mass(
     coupling: Coupling | CouplingGrid, period: float, integrator: Integrator = "implicit"
 ) -> float | NDArray[np.float64]:
-    """Returns the mass above which a tool is stable behind a fixed handle.
+    """Returns the mass in kg above which a tool is stable behind a fixed handle.
 
         implicit        0
         semi_implicit   (T/2)(K T/2 + B)
@@ -71,14 +71,6 @@ def minimum_mass(
 
     A light tool on a stiff coupling requires the implicit step. With the explicit step the smallest
     mass for any damper is 4 K T², at B = 2 K T.
-
-    Args:
-        coupling: K and B.
-        period: T in s, finite and > 0.
-        integrator: Integration scheme of the mass.
-
-    Returns:
-        m in kg, shaped like the coupling.
 
     Raises:
         CouplingError: An argument is out of range.

@@ -235,7 +235,7 @@ def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> 
     """Returns the run's passivity controller; None if it is the bridge's default."""
     p = parameters
     scales = p.scale, p.force_scale
-    needed = required_axis_damping(info, p.coupling, p.period, *scales, p.laws, method)
+    needed = required_axis_damping(info, p.coupling, p.period, *scales, p.law_evaluations, method)
     limits = Limits(force=p.force_limit, torque=p.torque_limit)
     usual = guard_parameters_for(info, limits, p.period, needed=needed, scale=p.scale)
     if usual.controller == p.guarding.controller:

@@ -130,7 +130,7 @@ def what_if(
 
     Args:
         path: The recording, undamaged and unchanged; it carries its scene.
-        changes: New values by name: ``changes.UNITS``, or the scene's own parameters. Without
+        changes: New values by name: ``settings.UNITS``, or the scene's own parameters. Without
             changes the prescribed run equals the recorded one in every bit.
         strict: As for ``audit``.
         progress: Called with the number of runs done, their total, and the name of the next one.

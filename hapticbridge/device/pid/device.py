@@ -62,7 +62,7 @@ ms."""
 
 RESTART, LIFE = 0.02, 5
 """Time in s between restarts of an effect, and its duration in restarts. If the host dies, the
-force ends within 0.1 s; four restarts in a row may be lost without a gap in the force."""
+force ends within 0.1 s. Four restarts in a row may be lost without a gap in the force."""
 
 RESTART_REPORTS = 5
 """Smallest number of reports per effect between restarts on a slow bus, so that restarts take at

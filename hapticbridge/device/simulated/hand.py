@@ -69,7 +69,7 @@ grips hard, around the measured arm of the defaults. Every hand in them is passi
 
 
 def random_hand(seed: int) -> Hand:
-    """Returns a random passive hand that depends on the seed, a whole number >= 0, only.
+    """Returns a random passive hand that depends only on the seed, a whole number >= 0.
 
     Every value is drawn independently, evenly in its logarithm, from its ``HAND_RANGES``.
     """

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -81,10 +82,7 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
         goal += " (counted from the method's own limit at small steps, not from the truth)"
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
-        return (
-            f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
-            f"{_passed_over(best, points)}"
-        )
+        return f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
     fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
@@ -157,30 +155,6 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     return found
 
 
-def _passed_over(best: Measurement, points: Sequence[Measurement]) -> str:
-    """Says why the most accurate of the points that cost no more and err less was not taken.
-
-    As on the front, a weld and a tool that is where the handle is are left out: they render another
-    coupling, and a small distance from their own limit would be no merit.
-    """
-    better = [
-        each
-        for each in points
-        if _is_fast(each)
-        and each.setting.method.has_law
-        and each.cost.median <= best.cost.median
-        and (1 + ALIKE) * each.score.felt < best.score.felt
-        and _objections(each, points)
-    ]
-    if not better:
-        return ""
-    other = min(better, key=lambda each: each.score.felt)
-    return (
-        f" {other.setting.label} would cost no more and err less ({other.score.felt:.2g} JND), but "
-        f"{' and '.join(_objections(other, points))}."
-    )
-
-
 def _numbers(each: Measurement) -> str:
     tick = 1e6 * each.cost.median * each.setting.period
     return (
@@ -218,17 +192,11 @@ MARKS: dict[Verdict, tuple[str, bool, str]] = {
 }
 """Mark, whether it is filled, and what it means."""
 
-COLOURS = (
-    "#1a5fb4", "#2e8b57", "#b3261e", "#e08a00", "#7b4fa6", "#008b8b", "#8c564b", "#d1578f",
-    "#6b6b00", "#404040", "#4aa3ff", "#9bbb59", "#ff7f50", "#c71585",
-    "#00c5a0", "#a0522d", "#5f6b8a", "#d4b000",
-)  # fmt: skip
 
-
-def colours_of(chart: Chart) -> dict[str, str]:
+def colours_of(chart: Chart) -> dict[str, Any]:
     """Returns a colour for every method and engine."""
     names = list(dict.fromkeys(who(each.setting) for each in chart.measurements))
-    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+    return {name: colormaps["tab20"](i % 20) for i, name in enumerate(names)}
 
 
 def drawn_error(each: Measurement) -> float:
@@ -263,7 +231,7 @@ def draw_chart(chart: Chart) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str]) -> None:
+def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any]) -> None:
     points, orders = chart.of(panel), chart.orders(panel)
     for name, colour in colours.items():
         mine = [each for each in points if who(each.setting) == name]
@@ -293,13 +261,14 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, str])
         "one just noticeable difference", (0.995, JND), xycoords=("axes fraction", "data"),
         ha="right", va="bottom", fontsize="x-small",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.yaxis.set_major_formatter("{x:g}")
     low, high = axes.get_ylim()
     axes.yaxis.set_minor_formatter("{x:g}" if high < NARROW * low else NullFormatter())
-    axes.set_xlabel("cost: processor seconds per simulated second (1 = real time on one core)")
-    axes.set_ylabel("error (just noticeable differences)")
+    axes.set(
+        xlabel="cost: processor seconds per simulated second (1 = real time on one core)",
+        ylabel="error (just noticeable differences)",
+    )
     kind = "error against" if panel.is_truth else "NOT the truth: difference from"
     title = "\n".join([panel.title, *textwrap.wrap(f"{kind} {panel.reference}", 92)])
     axes.set_title(title, fontsize="small", parse_math=False)
@@ -342,7 +311,7 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
     return said
 
 
-def _draw_point(axes: Axes, each: Measurement, place: float, colour: str) -> None:
+def _draw_point(axes: Axes, each: Measurement, place: float, colour: Any) -> None:
     mark, is_filled, _ = MARKS[each.score.verdict]
     cost = each.cost
     axes.errorbar(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.codes import DIRECT, LOSSLESS
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.rendering import (
     Method,
@@ -256,7 +256,7 @@ def settings_for(
     points += [
         Setting(method, usual, substeps=count)
         for method in methods
-        if method.scheme not in (LOSSLESS, DIRECT)
+        if method.scheme not in (Scheme.MIDPOINT, Scheme.MASSLESS)
         for count in SUBSTEPS
     ]
     if has_contact:

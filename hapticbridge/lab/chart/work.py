@@ -476,8 +476,6 @@ ROOM = 15.0
 """How far the axis of time goes beyond half of a tick, a ratio without unit: the legend stands
 above the curves."""
 
-COLOURS = ("#1a5fb4", "#e08a00", "#2e8b57", "#b3261e")
-
 
 def draw_work(chart: WorkChart) -> Figure:
     """Draws the tick's time over the count, a panel for each way to grow."""
@@ -499,7 +497,8 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
     if not chart.variants(family):
         axes.set_title("not measured", fontsize="small")
         return
-    for variant, colour in zip(chart.variants(family), COLOURS, strict=False):
+    for place, variant in enumerate(chart.variants(family)):
+        colour = f"C{place}"
         points = chart.of(family, variant)
         sizes = [each.size for each in points]
         growth = chart.growth(family, variant)
@@ -514,8 +513,7 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
         "half of a tick at 1 kHz", (0.02, 1e6 * TICK_SHARE / RATE), va="bottom",
         xycoords=("axes fraction", "data"), fontsize="x-small",
     )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     axes.set_ylabel("processor time of a tick (µs)", fontsize="small")
     axes.grid(visible=True, alpha=0.3)
     low, high = axes.get_ylim()
@@ -524,50 +522,23 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
 
 
 def paragraph(chart: WorkChart) -> str:
-    """Says how the cost grows, and how much fits into a tick at 1 kHz."""
+    """States the growth of a tick's time, and how much fits into a tick at 1 kHz."""
     said = []
     for family in FAMILIES:
-        points = chart.of(family, USUAL)
-        if not points:
-            continue
-        fit = [each.size for each in points if each.rate >= RATE]
-        last = points[-1]
-        most = f"up to {max(fit)} hold 1 kHz" if fit else "none holds 1 kHz"
-        said.append(
-            f"{family.unit}: {1e6 * points[0].time.median:.3g} µs a tick for {points[0].size}, "
-            f"{1e6 * last.time.median:.3g} µs for {last.size}"
-            f"{_grows(chart.growth(family, USUAL))}; {most}"
-        )
-        said += [_against(chart, family, last)] if len(chart.variants(family)) > 1 else []
-    told = [each[0].upper() + each[1:] for each in said if each]
-    return ". ".join([*told, HOLDS]) + "."
-
-
-def _grows(growth: Growth | None) -> str:
-    return "" if growth is None else f" (growing as {_power(growth)} from {growth.start:g} on)"
+        for variant in chart.variants(family):
+            points = chart.of(family, variant)
+            first, last = points[0], points[-1]
+            most = max((each.size for each in points if each.rate >= RATE), default=0)
+            said.append(
+                f"{family.unit.capitalize()}, {variant.name}: {1e6 * first.time.median:.3g} µs a "
+                f"tick for {first.size}, {1e6 * last.time.median:.3g} µs for {last.size}; up to "
+                f"{most} hold 1 kHz"
+            )
+    return ". ".join([*said, HOLDS]) + "."
 
 
 def _power(growth: Growth) -> str:
     return f"n^{growth.exponent:.2f} ({growth.low:.2f} to {growth.high:.2f})"
-
-
-def _against(chart: WorkChart, family: Family, last: Work) -> str:
-    """Says what islands and sleep are worth at the largest size."""
-    found = [chart.of(family, variant)[-1] for variant in chart.variants(family)]
-    if len(found) < len(VARIANTS):
-        return ""
-    usual, undivided, bare, asleep = found
-    return (
-        f"without islands a tick with {last.size} {family.unit} takes {_ratio(undivided, usual)} "
-        "times as long, and sleep, which a bridge refuses, would make MuJoCo's step "
-        f"{_ratio(bare, asleep)} times as fast"
-    )
-
-
-def _ratio(slow: Work, fast: Work) -> str:
-    """Returns a ratio of medians with the least and the largest that the rounds leave possible."""
-    least, most = slow.low / fast.high, slow.high / fast.low
-    return f"{slow.time.median / fast.time.median:.3g} ({least:.3g} to {most:.3g})"
 
 
 def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:

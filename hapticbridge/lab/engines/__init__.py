@@ -19,20 +19,3 @@ marked experimental.
 | ``drake_point`` | SAP, compliant points | held force |
 | ``drake_hydroelastic`` | SAP, compliant tool against rigid shapes | held force |
 """
-
-from hapticbridge.lab.engines.base import Body as Body
-from hapticbridge.lab.engines.base import Contacts as Contacts
-from hapticbridge.lab.engines.base import Engine as Engine
-from hapticbridge.lab.engines.base import Engines as Engines
-from hapticbridge.lab.engines.base import Pose as Pose
-from hapticbridge.lab.engines.base import Setting as Setting
-from hapticbridge.lab.engines.base import Shape as Shape
-from hapticbridge.lab.engines.base import Simulation as Simulation
-from hapticbridge.lab.engines.base import Task as Task
-from hapticbridge.lab.engines.base import Velocity as Velocity
-from hapticbridge.lab.engines.base import Wrench as Wrench
-from hapticbridge.lab.engines.base import available_engines as available_engines
-from hapticbridge.lab.engines.base import composed as composed
-from hapticbridge.lab.engines.base import engine_names as engine_names
-from hapticbridge.lab.engines.base import open_engine as open_engine
-from hapticbridge.lab.engines.from_scene import task_from_scene as task_from_scene

@@ -14,7 +14,7 @@ from typing import Any
 import pybullet
 
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.engines.base import Contacts, Engine, Pose, Setting, Shape, Task, Velocity
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Quaternion, Vector
 
@@ -43,13 +43,13 @@ _GUIDE = "PyBullet Quickstart Guide"
 _PARAMETERS = f"{_GUIDE}: setPhysicsEngineParameter"
 _DYNAMICS = f"{_GUIDE}: changeDynamics"
 _SHARED = {
-    "coupling": Setting("held force", f"{_GUIDE}: applyExternalForce/Torque"),
-    "body": Setting("multibody of one link", f"{_GUIDE}: createMultiBody"),
-    "linearDamping, angularDamping": Setting("0 (default 0.04)", _DYNAMICS),
-    "collisionMargin": Setting("0 for meshes", _DYNAMICS),
-    "activationState": Setting("disable sleeping", _DYNAMICS),
-    "deterministicOverlappingPairs": Setting("1", _PARAMETERS),
-    "numSubSteps": Setting("0 (default)", _PARAMETERS),
+    "coupling": base.Setting("held force", f"{_GUIDE}: applyExternalForce/Torque"),
+    "body": base.Setting("multibody of one link", f"{_GUIDE}: createMultiBody"),
+    "linearDamping, angularDamping": base.Setting("0 (default 0.04)", _DYNAMICS),
+    "collisionMargin": base.Setting("0 for meshes", _DYNAMICS),
+    "activationState": base.Setting("disable sleeping", _DYNAMICS),
+    "deterministicOverlappingPairs": base.Setting("1", _PARAMETERS),
+    "numSubSteps": base.Setting("0 (default)", _PARAMETERS),
 }
 
 _TYPES = {
@@ -68,14 +68,14 @@ class PybulletEngine:
         """Takes its name, what ``setPhysicsEngineParameter`` is given, and the solver's name."""
         self.name = name
         self._parameters = dict(parameters)
-        given = {key: Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
-        self.settings: Mapping[str, Setting] = {
+        given = {key: base.Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
+        self.settings: Mapping[str, base.Setting] = {
             **_SHARED,
             **given,
-            "constraintSolverType": Setting(solver, _PARAMETERS),
+            "constraintSolverType": base.Setting(solver, _PARAMETERS),
         }
 
-    def open(self, task: Task, timestep: float) -> PybulletSimulation:
+    def open(self, task: base.Task, timestep: float) -> PybulletSimulation:
         """Sets a task up; see ``Engine.open``."""
         return PybulletSimulation(task, timestep, self._parameters)
 
@@ -83,7 +83,7 @@ class PybulletEngine:
 class PybulletSimulation(HeldSimulation):
     """A task in a Bullet world of its own."""
 
-    def __init__(self, task: Task, timestep: float, parameters: Mapping[str, float]) -> None:
+    def __init__(self, task: base.Task, timestep: float, parameters: Mapping[str, float]) -> None:
         super().__init__(task, timestep)
         kinds = [shape.kind for shape in task.body.shapes]
         if "mesh" in kinds and len(kinds) > 1:
@@ -124,7 +124,7 @@ class PybulletSimulation(HeldSimulation):
         )
         self._begin(task)
 
-    def _set_dynamics(self, body: int, task: Task, **more: Any) -> None:
+    def _set_dynamics(self, body: int, task: base.Task, **more: Any) -> None:
         """Takes out what Bullet adds to a body, and sets its friction."""
         has_mesh = any(shape.kind == "mesh" for shape in (*task.body.shapes, *task.fixed))
         if has_mesh:
@@ -144,7 +144,7 @@ class PybulletSimulation(HeldSimulation):
             physicsClientId=self._client,
         )
 
-    def _collision(self, placed: Sequence[tuple[Shape, Pose]]) -> int:
+    def _collision(self, placed: Sequence[tuple[base.Shape, base.Pose]]) -> int:
         """Makes one shape of several, and returns its number; −1 of nothing."""
         if not placed:
             return -1
@@ -180,19 +180,19 @@ class PybulletSimulation(HeldSimulation):
         pybullet.applyExternalTorque(body, -1, torque, world, client)
         pybullet.stepSimulation(client)
 
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
         position, (x, y, z, w) = pybullet.getBasePositionAndOrientation(self._body, self._client)
-        return Pose(position, (w, x, y, z))
+        return base.Pose(position, (w, x, y, z))
 
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
-        return Velocity(*pybullet.getBaseVelocity(self._body, self._client))
+        return base.Velocity(*pybullet.getBaseVelocity(self._body, self._client))
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start."""
         points = pybullet.getContactPoints(self._body, physicsClientId=self._client)
-        return Contacts.of(-point[8] for point in points)  # its distance, negative where deep
+        return base.Contacts.of(-point[8] for point in points)  # its distance, negative where deep
 
     def close(self) -> None:
         """Ends the Bullet world."""
@@ -206,7 +206,7 @@ def _xyzw(quaternion: Quaternion) -> Quaternion:
     return x, y, z, w
 
 
-def engines() -> tuple[Engine, ...]:
+def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
     impulses = {
         "numSolverIterations": ITERATIONS,

@@ -29,7 +29,7 @@ from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from hapticbridge.lab.engines.base import Contacts, Engine, Pose, Setting, Shape, Task, Velocity
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Vector
 
@@ -48,10 +48,12 @@ _PLANT = "Drake, MultibodyPlant"
 _PROPERTIES = "Drake, geometry::DefaultProximityProperties"
 _USER_GUIDE = "Drake, Hydroelastic Contact User Guide"
 _SHARED = {
-    "coupling": Setting("held force, applied_generalized_force", f"{_PLANT}: input ports"),
-    "discrete_contact_approximation": Setting("sap", f"{_PLANT}: DiscreteContactApproximation"),
-    "sap_near_rigid_threshold": Setting("0", f"{_PLANT}: set_sap_near_rigid_threshold"),
-    "use_sampled_output_ports": Setting("False", f"{_PLANT}: SetUseSampledOutputPorts"),
+    "coupling": base.Setting("held force, applied_generalized_force", f"{_PLANT}: input ports"),
+    "discrete_contact_approximation": base.Setting(
+        "sap", f"{_PLANT}: DiscreteContactApproximation"
+    ),
+    "sap_near_rigid_threshold": base.Setting("0", f"{_PLANT}: set_sap_near_rigid_threshold"),
+    "use_sampled_output_ports": base.Setting("False", f"{_PLANT}: SetUseSampledOutputPorts"),
 }
 
 
@@ -60,13 +62,13 @@ class DrakeEngine:
 
     version = version("drake")
 
-    def __init__(self, name: str, contact_model: str, settings: Mapping[str, Setting]) -> None:
+    def __init__(self, name: str, contact_model: str, settings: Mapping[str, base.Setting]) -> None:
         """Takes its name, Drake's name of the contact model, and the settings of that model."""
         self.name = name
         self._contact_model = contact_model
-        self.settings: Mapping[str, Setting] = {**_SHARED, **settings}
+        self.settings: Mapping[str, base.Setting] = {**_SHARED, **settings}
 
-    def open(self, task: Task, timestep: float) -> DrakeSimulation:
+    def open(self, task: base.Task, timestep: float) -> DrakeSimulation:
         """Sets a task up; see ``Engine.open``."""
         return DrakeSimulation(task, timestep, self._contact_model)
 
@@ -77,7 +79,7 @@ class DrakeSimulation(HeldSimulation):
     Drake refuses to go on from a state that is not finite: from then on the pose is nan.
     """
 
-    def __init__(self, task: Task, timestep: float, contact_model: str) -> None:
+    def __init__(self, task: base.Task, timestep: float, contact_model: str) -> None:
         super().__init__(task, timestep)
         config = MultibodyPlantConfig(
             time_step=self._timestep,
@@ -134,34 +136,36 @@ class DrakeSimulation(HeldSimulation):
             self._is_finite = False
         self._steps += 1
 
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
         if not self._is_finite:
-            return Pose((np.nan,) * 3, (np.nan,) * 4)
+            return base.Pose((np.nan,) * 3, (np.nan,) * 4)
         w, i, j, k, x, y, z = self._plant.GetPositions(self._context).tolist()
-        return Pose((x, y, z), (w, i, j, k))
+        return base.Pose((x, y, z), (w, i, j, k))
 
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
         if not self._is_finite:
-            return Velocity((np.nan,) * 3, (np.nan,) * 3)
+            return base.Velocity((np.nan,) * 3, (np.nan,) * 3)
         a, b, c, x, y, z = self._plant.GetVelocities(self._context).tolist()
-        return Velocity((x, y, z), (a, b, c))
+        return base.Velocity((x, y, z), (a, b, c))
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the pose now; a hydroelastic patch has no depth."""
         if not self._is_finite:
-            return Contacts(0, 0.0)
+            return base.Contacts(0, 0.0)
         found = self._plant.get_contact_results_output_port().Eval(self._context)
         pairs = range(found.num_point_pair_contacts())
-        points = Contacts.of(found.point_pair_contact_info(i).point_pair().depth for i in pairs)
+        points = base.Contacts.of(
+            found.point_pair_contact_info(i).point_pair().depth for i in pairs
+        )
         return points._replace(points=points.points + found.num_hydroelastic_contacts())
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-def _material(task: Task, relaxation_time: float) -> Any:
+def _material(task: base.Task, relaxation_time: float) -> Any:
     material = ProximityProperties()
     friction = CoulombFriction(task.body.friction, task.body.friction)
     AddContactMaterial(material, point_stiffness=POINT_STIFFNESS, friction=friction)
@@ -169,12 +173,12 @@ def _material(task: Task, relaxation_time: float) -> Any:
     return material
 
 
-def _hint(shape: Shape) -> float:
+def _hint(shape: base.Shape) -> float:
     """Returns Drake's ``resolution_hint`` in m; it is not used for boxes and meshes."""
     return RESOLUTION * (shape.size[0] if shape.size else 1.0)
 
 
-def _geometry(shape: Shape) -> Any:
+def _geometry(shape: base.Shape) -> Any:
     if shape.kind == "box":
         return Box(*(2 * half for half in shape.size))
     if shape.kind == "sphere":
@@ -184,27 +188,29 @@ def _geometry(shape: Shape) -> Any:
     return Convex(np.asarray(shape.vertices).T, "mesh")
 
 
-def _transform(pose: Pose) -> Any:
+def _transform(pose: base.Pose) -> Any:
     quaternion = np.array(pose.quaternion)
     # Drake takes no norm that is wrong in its last digits
     turn = Turn(quaternion / np.linalg.norm(quaternion))
     return RigidTransform(turn, np.array(pose.position))
 
 
-def engines() -> tuple[Engine, ...]:
+def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
-    stiffness = Setting(f"{POINT_STIFFNESS:g} N/m", f"{_PROPERTIES}: point_stiffness")
+    stiffness = base.Setting(f"{POINT_STIFFNESS:g} N/m", f"{_PROPERTIES}: point_stiffness")
     point = {
         "point_contact_stiffness": stiffness,
-        "relaxation_time": Setting("0", f"{_PROPERTIES}: relaxation_time"),
+        "relaxation_time": base.Setting("0", f"{_PROPERTIES}: relaxation_time"),
     }
     hydroelastic = {
-        "compliance": Setting("tool compliant, fixed shapes rigid", _USER_GUIDE),
-        "hydroelastic_modulus": Setting(f"{MODULUS:g} Pa", f"{_PROPERTIES}: hydroelastic_modulus"),
-        "resolution_hint": Setting(
+        "compliance": base.Setting("tool compliant, fixed shapes rigid", _USER_GUIDE),
+        "hydroelastic_modulus": base.Setting(
+            f"{MODULUS:g} Pa", f"{_PROPERTIES}: hydroelastic_modulus"
+        ),
+        "resolution_hint": base.Setting(
             f"{RESOLUTION:g} of the radius", f"{_PROPERTIES}: resolution_hint"
         ),
-        "relaxation_time": Setting("1 timestep", f"{_PROPERTIES}: relaxation_time"),
+        "relaxation_time": base.Setting("1 timestep", f"{_PROPERTIES}: relaxation_time"),
     }
     return (
         DrakeEngine("drake_point", "point", point),

@@ -13,20 +13,7 @@ from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS
-from hapticbridge.lab.engines.base import (
-    SIZES,
-    Body,
-    Contacts,
-    Kind,
-    Pose,
-    Shape,
-    Task,
-    Velocity,
-    Wrench,
-    check_timestep,
-    composed,
-    inverted,
-)
+from hapticbridge.lab.engines import base
 from hapticbridge.pose import (
     ZERO_VECTOR,
     Quaternion,
@@ -42,7 +29,7 @@ from hapticbridge.pose import (
 )
 from hapticbridge.scene import Scene
 
-_KINDS: dict[int, Kind] = {
+_KINDS: dict[int, base.Kind] = {
     mujoco.mjtGeom.mjGEOM_BOX: "box",
     mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
     mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
@@ -58,7 +45,7 @@ _WITHOUT = (
 
 def task_from_scene(
     scene: Scene, motion: Motion | None = None, coupling: Coupling | None = None
-) -> Task:
+) -> base.Task:
     """Returns the task that a scene of one free tool among fixed shapes sets.
 
     MuJoCo's contact settings are left out: each engine has its own. Friction is that of the pairs
@@ -85,9 +72,9 @@ def task_from_scene(
     tool_ids, fixed_ids = _touching(scene, body_id)
     start = _pose(data.xpos[body_id], data.xquat[body_id])
     grip_in_world = _pose(scene.grip_pose()[:3], scene.grip_pose()[3:])
-    world_to_body = inverted(start)
+    world_to_body = base.inverted(start)
     inertia_frame = _pose(model.body_ipos[body_id], model.body_iquat[body_id])
-    body = Body(
+    body = base.Body(
         mass=float(model.body_mass[body_id]),
         inertia=_vector(model.body_inertia[body_id]),
         inertia_frame=inertia_frame,
@@ -97,8 +84,8 @@ def task_from_scene(
         friction=_friction(scene, tool_ids, fixed_ids),
     )
     spin = rotated(start.quaternion, _vector(data.qvel[3:6]))
-    lever = subtract(composed(start, inertia_frame).position, start.position)
-    return Task(
+    lever = subtract(base.composed(start, inertia_frame).position, start.position)
+    return base.Task(
         name=scene.name,
         body=body,
         fixed=tuple(
@@ -107,9 +94,9 @@ def task_from_scene(
         ),
         gravity=_vector(model.opt.gravity),
         coupling=coupling,
-        grip=composed(world_to_body, grip_in_world),
+        grip=base.composed(world_to_body, grip_in_world),
         start=start,
-        start_velocity=Velocity(add(_vector(data.qvel[:3]), cross(spin, lever)), spin),
+        start_velocity=base.Velocity(add(_vector(data.qvel[:3]), cross(spin, lever)), spin),
         handle=None if motion is None else _from(grip_in_world, motion),
     )
 
@@ -156,7 +143,7 @@ def _touching(scene: Scene, body_id: int) -> tuple[list[int], list[int]]:
         kind = int(model.geom_type[i])
         if kind not in _KINDS:
             name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-            fault = f"geom '{model.geom(i).name}' is a {name}; they share {', '.join(SIZES)}"
+            fault = f"geom '{model.geom(i).name}' is a {name}; they share {', '.join(base.SIZES)}"
         elif model.geom_margin[i] != 0 or model.geom_gap[i] != 0:
             fault = f"geom '{model.geom(i).name}' has a margin or gap"
     if fault:
@@ -187,26 +174,26 @@ def _friction(scene: Scene, tool_ids: list[int], fixed_ids: list[int]) -> float:
     return found.pop() if found else 0.0
 
 
-def _shape(model: mujoco.MjModel, geom_id: int, pose: Pose) -> Shape:
+def _shape(model: mujoco.MjModel, geom_id: int, pose: base.Pose) -> base.Shape:
     kind = _KINDS[int(model.geom_type[geom_id])]
     vertices = None
     if kind == "mesh":
         mesh = int(model.geom_dataid[geom_id])
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         vertices = np.array(model.mesh_vert[first : first + count], dtype=np.float64)
-    size = tuple(float(value) for value in model.geom_size[geom_id][: SIZES[kind]])
-    return Shape(kind, size, pose.position, pose.quaternion, vertices)
+    size = tuple(float(value) for value in model.geom_size[geom_id][: base.SIZES[kind]])
+    return base.Shape(kind, size, pose.position, pose.quaternion, vertices)
 
 
-def _from(grip: Pose, motion: Motion) -> Motion:
+def _from(grip: base.Pose, motion: Motion) -> Motion:
     """Returns a motion that is counted from its first pose, begun at the grip."""
     table = motion.table
     turned = [product(_four(row[4:]), grip.quaternion) for row in table]
     return Motion(table[:, 0], table[:, 1:4] + np.asarray(grip.position), turned)
 
 
-def _pose(position: object, quaternion: object) -> Pose:
-    return Pose(_vector(position), canonical(_four(quaternion)))
+def _pose(position: object, quaternion: object) -> base.Pose:
+    return base.Pose(_vector(position), canonical(_four(quaternion)))
 
 
 def _vector(values: object) -> tuple[float, float, float]:
@@ -238,7 +225,7 @@ class HeldSimulation(ABC):
         τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
 
     with the handle h and the grip x at the end of step k; step k + 1 is done under (f_k, τ_k),
-    moved to the centre of mass. This is ``mechanics.drive_mass``'s scheme ``held``. The handle has
+    moved to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has
     not moved before step 0.
 
     Engines know a body by its centre of mass: here a child's body is the frame of the principal
@@ -246,13 +233,13 @@ class HeldSimulation(ABC):
     up in ``__init__`` after that of this class, and calls ``_begin`` last.
     """
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         """Takes the task.
 
         Raises:
             StudyError: The timestep is not finite and positive.
         """
-        self._timestep = check_timestep(timestep)
+        self._timestep = base.check_timestep(timestep)
         coupling = task.coupling
         self._gains = (
             None
@@ -266,27 +253,27 @@ class HeldSimulation(ABC):
         )
         self._grip = (task.grip.position, task.grip.quaternion)
         self._principal_in_body = task.body.inertia_frame
-        self._body_in_principal = inverted(task.body.inertia_frame)
+        self._body_in_principal = base.inverted(task.body.inertia_frame)
         self._centre = task.body.inertia_frame.position
         self._handle: Frame = _AT_ORIGIN
         self._tool: Frame = _AT_ORIGIN
         self._wrench = self._at_centre = (ZERO_VECTOR, ZERO_VECTOR)
 
-    def _begin(self, task: Task) -> None:
+    def _begin(self, task: base.Task) -> None:
         """Computes the wrench of step 0."""
         handle = task.handle_poses(self._timestep, 1)[0]
         self._handle = (handle.position, handle.quaternion)
-        grip = composed(self.pose(), task.grip)
+        grip = base.composed(self.pose(), task.grip)
         self._tool = (grip.position, grip.quaternion)
         self._measure(self._handle)
 
-    def _principal(self, body: Pose) -> Pose:
+    def _principal(self, body: base.Pose) -> base.Pose:
         """Returns the pose of the principal frame for a pose of the body's frame."""
-        return composed(body, self._principal_in_body)
+        return base.composed(body, self._principal_in_body)
 
-    def _shape_pose(self, shape: Shape) -> Pose:
+    def _shape_pose(self, shape: base.Shape) -> base.Pose:
         """Returns the pose of one of the tool's shapes in the principal frame."""
-        return composed(self._body_in_principal, shape.pose)
+        return base.composed(self._body_in_principal, shape.pose)
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
         """Goes one step under the wrench of the last, and computes the next."""
@@ -297,9 +284,9 @@ class HeldSimulation(ABC):
         """Does the step; a child whose engine has a spring of its own aims it at the handle."""
         self.advance(*self._at_centre)
 
-    def wrench(self) -> Wrench:
+    def wrench(self) -> base.Wrench:
         """Returns the wrench on the tool about the grip."""
-        return Wrench(*self._wrench)
+        return base.Wrench(*self._wrench)
 
     def _measure(self, handle: Frame) -> None:
         if self._gains is None:
@@ -321,19 +308,19 @@ class HeldSimulation(ABC):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
 
     @abstractmethod
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
 
-    def pose(self) -> Pose:
+    def pose(self) -> base.Pose:
         """Returns the pose of the body's frame."""
-        return composed(self.principal_pose(), self._body_in_principal)
+        return base.composed(self.principal_pose(), self._body_in_principal)
 
     @abstractmethod
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
 
     @abstractmethod
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step."""
 
     @abstractmethod

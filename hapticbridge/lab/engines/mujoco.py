@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import mujoco
 
-from hapticbridge.lab.engines.base import Contacts, Engine, Pose, Setting, Shape, Task, Velocity
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Vector, add, conjugate, cross, rotated, subtract
 
@@ -40,17 +40,19 @@ class MujocoEngine:
 
     name = "mujoco"
     version = mujoco.__version__
-    settings: Mapping[str, Setting] = {
-        "coupling": Setting("held force, xfrc_applied", "MuJoCo documentation, Computation: State"),
-        "integrator": Setting("implicitfast", _OVERVIEW),
-        "cone": Setting("elliptic", _REFERENCE),
-        "solver": Setting("Newton, tolerance 1e-10", _REFERENCE),
-        "diagexact": Setting("enable", _REFERENCE),
-        "solref": Setting("2 timesteps, damping ratio 1", _MODELING),
-        "solimp": Setting("0.95 0.99 0.001 0.5 2", _MODELING),
+    settings: Mapping[str, base.Setting] = {
+        "coupling": base.Setting(
+            "held force, xfrc_applied", "MuJoCo documentation, Computation: State"
+        ),
+        "integrator": base.Setting("implicitfast", _OVERVIEW),
+        "cone": base.Setting("elliptic", _REFERENCE),
+        "solver": base.Setting("Newton, tolerance 1e-10", _REFERENCE),
+        "diagexact": base.Setting("enable", _REFERENCE),
+        "solref": base.Setting("2 timesteps, damping ratio 1", _MODELING),
+        "solimp": base.Setting("0.95 0.99 0.001 0.5 2", _MODELING),
     }
 
-    def open(self, task: Task, timestep: float) -> MujocoSimulation:
+    def open(self, task: base.Task, timestep: float) -> MujocoSimulation:
         """Sets a task up; see ``Engine.open``."""
         return MujocoSimulation(task, timestep)
 
@@ -58,7 +60,7 @@ class MujocoEngine:
 class MujocoSimulation(HeldSimulation):
     """A task in MuJoCo."""
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         self._spec = spec = mujoco.MjSpec()
         option = spec.option
@@ -95,7 +97,7 @@ class MujocoSimulation(HeldSimulation):
         self._begin(task)
 
     def _add(
-        self, body: mujoco.MjsBody, shape: Shape, friction: float, own: int, other: int
+        self, body: mujoco.MjsBody, shape: base.Shape, friction: float, own: int, other: int
     ) -> None:
         """Adds a geom that touches only the other side's."""
         geom = body.add_geom(
@@ -117,31 +119,33 @@ class MujocoSimulation(HeldSimulation):
         self._applied[:] = (*force, *torque)
         mujoco.mj_step(self._model, self._data)
 
-    def pose(self) -> Pose:
+    def pose(self) -> base.Pose:
         """Returns the pose of the body's frame."""
         x, y, z, w, i, j, k = self._position.tolist()
-        return Pose((x, y, z), (w, i, j, k))
+        return base.Pose((x, y, z), (w, i, j, k))
 
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
         return self._principal(self.pose())
 
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
         quaternion = self.pose().quaternion
         vx, vy, vz, wx, wy, wz = self._velocity.tolist()
         spin = rotated(quaternion, (wx, wy, wz))
-        return Velocity(add((vx, vy, vz), cross(spin, rotated(quaternion, self._centre))), spin)
+        return base.Velocity(
+            add((vx, vy, vz), cross(spin, rotated(quaternion, self._centre))), spin
+        )
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step."""
         distances = self._data.contact.dist
-        return Contacts.of(-float(distance) for distance in distances)
+        return base.Contacts.of(-float(distance) for distance in distances)
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-def engines() -> tuple[Engine, ...]:
+def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
     return (MujocoEngine(),)

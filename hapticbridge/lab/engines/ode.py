@@ -21,7 +21,7 @@ from hapticbridge.arguments import Array
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled, direct
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.lab.engines.base import Contacts, Engine, Pose, Setting, Shape, Task, Velocity
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 from hapticbridge.pose import (
     ZERO_VECTOR,
@@ -244,15 +244,17 @@ class OdeEngine:
     """ODE with its direct solver."""
 
     name = "ode"
-    settings: Mapping[str, Setting] = {
-        "coupling": Setting("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
-        "step": Setting("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
-        "ERP": Setting("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "CFM": Setting(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
-        "contact surface layer": Setting(f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"),
-        "friction": Setting("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
-        "rotation": Setting("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
-        "gyroscopic mode": Setting("on (default)", f"{_MANUAL}: Rigid Body Functions"),
+    settings: Mapping[str, base.Setting] = {
+        "coupling": base.Setting("held force", f"{_MANUAL}: Rigid Body Functions, Mass and force"),
+        "step": base.Setting("dWorldStep (direct solver)", f"{_MANUAL}: World, Stepping Functions"),
+        "ERP": base.Setting("0.2 (default)", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "CFM": base.Setting(f"{CFM:g}", f"{_MANUAL}: Concepts, How To Use ERP and CFM"),
+        "contact surface layer": base.Setting(
+            f"{LAYER:g} m", f"{_MANUAL}: World, Contact Parameters"
+        ),
+        "friction": base.Setting("dContactApprox1", f"{_MANUAL}: Joint Types, Contact"),
+        "rotation": base.Setting("finite", f"{_MANUAL}: Rigid Body Functions, Miscellaneous"),
+        "gyroscopic mode": base.Setting("on (default)", f"{_MANUAL}: Rigid Body Functions"),
     }
 
     @property
@@ -260,7 +262,7 @@ class OdeEngine:
         """ODE does not tell its own version, only how it was built."""
         return str(library().dGetConfiguration().decode())
 
-    def open(self, task: Task, timestep: float) -> OdeSimulation:
+    def open(self, task: base.Task, timestep: float) -> OdeSimulation:
         """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
         return OdeSimulation(task, timestep)
 
@@ -268,7 +270,7 @@ class OdeEngine:
 class OdeSimulation(HeldSimulation):
     """A task in ODE."""
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         self._ode = ode = library()
         for shape in (*task.body.shapes, *task.fixed):
@@ -306,7 +308,7 @@ class OdeSimulation(HeldSimulation):
         self._step = direct(step, *self._fixed_arguments, nothing, nothing, self._depths)
         self._begin(task)
 
-    def _tool_in(self, world: int, task: Task) -> int:
+    def _tool_in(self, world: int, task: base.Task) -> int:
         """Adds the tool's body and returns its address."""
         ode, mass = self._ode, Mass()
         body: int = ode.dBodyCreate(world)
@@ -322,7 +324,7 @@ class OdeSimulation(HeldSimulation):
         ode.dBodySetAutoDisableFlag(body, 0)
         return body
 
-    def _geom(self, shape: Shape, pose: Pose, *, is_fixed: bool = False) -> int:
+    def _geom(self, shape: base.Shape, pose: base.Pose, *, is_fixed: bool = False) -> int:
         ode = self._ode
         geom: int
         if shape.kind == "box":
@@ -344,19 +346,19 @@ class OdeSimulation(HeldSimulation):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
         self._touching = self._step(*self._fixed_arguments, force, torque, self._depths)
 
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
         p, q = self._ode.dBodyGetPosition(self._body), self._ode.dBodyGetQuaternion(self._body)
-        return Pose((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]))
+        return base.Pose((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]))
 
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
         v, w = self._ode.dBodyGetLinearVel(self._body), self._ode.dBodyGetAngularVel(self._body)
-        return Velocity((v[0], v[1], v[2]), (w[0], w[1], w[2]))
+        return base.Velocity((v[0], v[1], v[2]), (w[0], w[1], w[2]))
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start."""
-        return Contacts.of(self._depths[: self._touching].tolist())
+        return base.Contacts.of(self._depths[: self._touching].tolist())
 
     def close(self) -> None:
         """Gives back what ODE holds."""
@@ -382,15 +384,15 @@ class OdeSpringEngine(OdeEngine):
     """ODE with an implicit coupling: a soft ball joint and a soft angular motor."""
 
     name = "ode_spring"
-    settings: Mapping[str, Setting] = {
+    settings: Mapping[str, base.Setting] = {
         **OdeEngine.settings,
-        "coupling": Setting(
+        "coupling": base.Setting(
             "implicit spring: ball joint and angular motor, CFM 1/(T K + B)",
             "ODE Manual: Concepts, How To Use ERP and CFM",
         ),
     }
 
-    def open(self, task: Task, timestep: float) -> OdeSimulation:
+    def open(self, task: base.Task, timestep: float) -> OdeSimulation:
         """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
         return OdeSpringSimulation(task, timestep)
 
@@ -406,7 +408,7 @@ class OdeSpringSimulation(OdeSimulation):
     whose damper acts against the moving handle.
     """
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         self._ball = self._motor = 0
         coupling = task.coupling
@@ -458,7 +460,7 @@ def _offset(stiffness: float, damping: float, stretch: Vector, moved: Vector) ->
     return scaled(1.0 / (stiffness + damping), pull)
 
 
-def engines() -> tuple[Engine, ...]:
+def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module.
 
     Raises:

@@ -15,16 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticbridge.lab.engines.base import (
-    Contacts,
-    Engine,
-    Pose,
-    Setting,
-    Shape,
-    Task,
-    Velocity,
-    composed,
-)
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.from_scene import Frame, HeldSimulation
 from hapticbridge.pose import (
     ZERO_VECTOR,
@@ -73,28 +64,30 @@ class SapienEngine:
 
     name = "physx"
     version = f"PhysX 5 in SAPIEN {version('sapien')}"
-    settings: Mapping[str, Setting] = {
-        "coupling": Setting("held force", f"{_DYNAMICS}, Applying Forces"),
-        "solver": Setting("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
-        "position iterations": Setting(f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"),
-        "velocity iterations": Setting("1", f"{_DYNAMICS}, Solver Iterations"),
-        "contact offset": Setting(
+    settings: Mapping[str, base.Setting] = {
+        "coupling": base.Setting("held force", f"{_DYNAMICS}, Applying Forces"),
+        "solver": base.Setting("TGS", f"{_DYNAMICS}, Temporal Gauss-Seidel"),
+        "position iterations": base.Setting(
+            f"{POSITION_ITERATIONS}", f"{_DYNAMICS}, Solver Iterations"
+        ),
+        "velocity iterations": base.Setting("1", f"{_DYNAMICS}, Solver Iterations"),
+        "contact offset": base.Setting(
             f"{CONTACT_OFFSET:g} m",
             f"{_COLLISION}, Tuning Shape Collision",
         ),
-        "rest offset": Setting("0", f"{_COLLISION}, Tuning Shape Collision"),
-        "contact generation": Setting("PCM", f"{_COLLISION}, PCM"),
-        "tolerances": Setting(
+        "rest offset": base.Setting("0", f"{_COLLISION}, Tuning Shape Collision"),
+        "contact generation": base.Setting("PCM", f"{_COLLISION}, PCM"),
+        "tolerances": base.Setting(
             f"length {LENGTH:g} m (default 1), speed {SPEED:g} m/s",
             "PhysX 5 API: PxTolerancesScale, which advises the size of the objects; "
             "chosen shorter, or PCM keeps normals of a pose that was left",
         ),
-        "friction": Setting("every iteration", f"{_DYNAMICS}, Friction"),
-        "sleep threshold": Setting("0", f"{_DYNAMICS}, Sleeping"),
-        "damping": Setting("0", f"{_DYNAMICS}, Damping"),
+        "friction": base.Setting("every iteration", f"{_DYNAMICS}, Friction"),
+        "sleep threshold": base.Setting("0", f"{_DYNAMICS}, Sleeping"),
+        "damping": base.Setting("0", f"{_DYNAMICS}, Damping"),
     }
 
-    def open(self, task: Task, timestep: float) -> SapienSimulation:
+    def open(self, task: base.Task, timestep: float) -> SapienSimulation:
         """Sets a task up; see ``Engine.open``."""
         return SapienSimulation(task, timestep)
 
@@ -102,7 +95,7 @@ class SapienEngine:
 class SapienSimulation(HeldSimulation):
     """A task in a PhysX scene of its own."""
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         _physx()
         # SAPIEN has these for the whole process, and reads them when something is made
@@ -125,7 +118,7 @@ class SapienSimulation(HeldSimulation):
             fixed = physx.PhysxRigidStaticComponent()
             for shape in task.fixed:
                 fixed.attach(_collision(shape, shape.pose, material))
-            self._add(fixed, Pose())
+            self._add(fixed, base.Pose())
         self._body = body = physx.PhysxRigidDynamicComponent()
         for shape in task.body.shapes:
             body.attach(_collision(shape, self._shape_pose(shape), material))
@@ -137,7 +130,7 @@ class SapienSimulation(HeldSimulation):
         body.angular_velocity = np.array(task.start_velocity.angular)
         self._begin(task)
 
-    def _add(self, component: Any, pose: Pose) -> None:
+    def _add(self, component: Any, pose: base.Pose) -> None:
         entity = sapien.Entity()
         entity.add_component(component)
         entity.set_pose(sapien.Pose(pose.position, pose.quaternion))
@@ -148,25 +141,25 @@ class SapienSimulation(HeldSimulation):
         self._body.add_force_torque(force, torque)
         self._system.step()
 
-    def principal_pose(self) -> Pose:
+    def principal_pose(self) -> base.Pose:
         """Returns the pose of the principal axes of inertia at the centre of mass."""
         pose = self._body.entity_pose
         (x, y, z), (w, i, j, k) = pose.p.tolist(), pose.q.tolist()
-        return Pose((x, y, z), (w, i, j, k))
+        return base.Pose((x, y, z), (w, i, j, k))
 
-    def velocity(self) -> Velocity:
+    def velocity(self) -> base.Velocity:
         """Returns the velocity of the centre of mass and the angular velocity."""
         linear, angular = self._body.linear_velocity, self._body.angular_velocity
-        return Velocity(tuple(linear.tolist()), tuple(angular.tolist()))
+        return base.Velocity(tuple(linear.tolist()), tuple(angular.tolist()))
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start.
 
         PhysX stops what would touch within the step, and leaves gaps of less than a nanometre: what
         pushes touches, too.
         """
         points = [point for contact in self._system.get_contacts() for point in contact.points]
-        return Contacts.of(
+        return base.Contacts.of(
             max(-point.separation, 0.0) if np.any(point.impulse) else -point.separation
             for point in points
         )
@@ -180,14 +173,14 @@ class SapienSpringEngine(SapienEngine):
     """PhysX 5 with an implicit coupling: the drives of a D6 joint."""
 
     name = "physx_spring"
-    settings: Mapping[str, Setting] = {
+    settings: Mapping[str, base.Setting] = {
         **SapienEngine.settings,
-        "coupling": Setting(
+        "coupling": base.Setting(
             "implicit spring: D6 joint, linear and slerp drives", f"{_GUIDE}: Joints, D6 Joint"
         ),
     }
 
-    def open(self, task: Task, timestep: float) -> SapienSimulation:
+    def open(self, task: base.Task, timestep: float) -> SapienSimulation:
         """Sets a task up; see ``Engine.open``."""
         return SapienSpringSimulation(task, timestep)
 
@@ -199,13 +192,13 @@ class SapienSpringSimulation(SapienSimulation):
     parts of the step here, so that it is less damped than the implicit scheme of one step.
     """
 
-    def __init__(self, task: Task, timestep: float) -> None:
+    def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         coupling = task.coupling
         if coupling is None:
             return
         self._drive = drive = physx.PhysxDriveComponent(self._body)
-        grip = composed(self._body_in_principal, task.grip)
+        grip = base.composed(self._body_in_principal, task.grip)
         drive.set_pose_in_child(sapien.Pose(*grip))
         for set_gains in (
             drive.set_drive_property_x,
@@ -235,7 +228,7 @@ def _physx() -> Any:
     return physx.PhysxEngine(LENGTH, SPEED)
 
 
-def _collision(shape: Shape, pose: Pose, material: Any) -> Any:
+def _collision(shape: base.Shape, pose: base.Pose, material: Any) -> Any:
     quaternion = pose.quaternion
     if shape.kind == "box":
         made = physx.PhysxCollisionShapeBox(np.array(shape.size), material)
@@ -250,6 +243,6 @@ def _collision(shape: Shape, pose: Pose, material: Any) -> Any:
     return made
 
 
-def engines() -> tuple[Engine, ...]:
+def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
     return (SapienEngine(), SapienSpringEngine())

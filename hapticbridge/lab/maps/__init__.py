@@ -1,4 +1,4 @@
-"""Where methods fail: stability maps, theory drawn over measurement.
+"""Stability maps of the rendering methods, theory drawn over measurement.
 
 Read ``base`` first, then one map, such as ``coupling``: its rig, its points, the evaluation of one
 point, the reading of its table and its picture stand in one file.

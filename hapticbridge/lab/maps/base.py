@@ -1,13 +1,14 @@
-"""What a stability map is: points, what happens at each, and what it all says."""
+"""Common base of the stability maps: points, evaluation, numbers, picture and sentences."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,26 +57,63 @@ class Finding:
     boundary: Mapping[str, Any]
 
 
+Sentences = Iterable[tuple[str, Mapping[str, Any]]]
+"""Sentences with fields in braces, and the numbers that fill them."""
+
+
 @dataclass(frozen=True, slots=True)
 class StabilityMap:
-    """A map: which points, what is run at each, how it is read.
+    """A map: its points, their evaluation, and the reading of the table.
 
     Attributes:
-        name: What the command line calls it.
-        about: One sentence.
-        default_points: How many points there are about if nobody chooses.
+        name: Name at the command line.
+        doc: Docstring of the map's module; ``about`` is its first line behind the colon.
+        default_points: About how many points there are by default.
         points: Returns about that many points, in a fixed order.
-        evaluate: What happens at a point; at the top level of a module, so that other processes
-            find it.
-        read: What the table says.
+        evaluate: Computes one point; at the top level of a module, so that other processes find it.
+        summarize: Returns the numbers of a table: where methods fail, measured beside predicted.
+        draw: Draws a table and its numbers.
+        sentences: States the numbers; see ``paragraph``.
     """
 
     name: str
-    about: str
+    doc: str | None
     default_points: int
     points: Callable[[int], Sequence[Point]]
     evaluate: Callable[[Point], Mapping[str, float | int | str | bool]]
-    read: Callable[[Table], Finding]
+    summarize: Callable[[Table], Mapping[str, Any]]
+    draw: Callable[[Table, Mapping[str, Any]], Figure]
+    sentences: Callable[[Mapping[str, Any]], Sentences]
+
+    @property
+    def about(self) -> str:
+        """What the map shows, in one sentence."""
+        return (self.doc or "").partition("\n")[0].partition(": ")[2].rstrip(".")
+
+    def read(self, table: Table) -> Finding:
+        """Reads the rows at which something was computed.
+
+        Raises:
+            StudyError: There is no such row.
+        """
+        if not len(table):
+            raise StudyError(f"map '{self.name}': the table has no rows; there is nothing to read")
+        if table.failed.all():
+            raise StudyError(
+                f"map '{self.name}': no point could be computed; first: {table['error'][0]}"
+            )
+        table = table.select(~table.failed)
+        boundary = self.summarize(table)
+        return Finding(self.draw(table, boundary), paragraph(self.sentences(boundary)), boundary)
+
+
+def paragraph(sentences: Sentences) -> str:
+    """Fills numbers into sentences; one that lacks a number, for its points failed, is left out."""
+    said = []
+    for text, numbers in sentences:
+        with contextlib.suppress(KeyError, TypeError):
+            said.append(text.format_map(numbers))
+    return ". ".join(said) + "."
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,23 +133,6 @@ class MapFiles:
     boundary: Path
     finding: Finding
     failed: int
-
-
-def computed(table: Table, name: str) -> Table:
-    """Returns the rows of a map's table at which something was computed.
-
-    Args:
-        table: All rows; where a point failed, ``error`` says why.
-        name: The map's.
-
-    Raises:
-        StudyError: There is no such row.
-    """
-    if not len(table):
-        raise StudyError(f"map '{name}': the table has no rows, so there is nothing to read")
-    if table.failed.all():
-        raise StudyError(f"map '{name}': no point could be computed; first: {table['error'][0]}")
-    return table.select(~table.failed)
 
 
 def run_map(
@@ -159,7 +180,7 @@ def run_map(
     )
     table.write(files[form])  # first: it is what cost the time
     failed = int(table.failed.sum())
-    finding = stability_map.read(computed(table, name))
+    finding = stability_map.read(table)
     write_picture(finding.figure, files["png"])
     said = {
         "map": name,
@@ -252,11 +273,6 @@ def agreement(measured: ArrayLike, predicted: ArrayLike, width: float = WIDTH) -
     return max(float(known.max()), width / 2) if known.size else None
 
 
-def per_cent(share: float | None) -> str:
-    """Returns an agreement in words, to three digits at most."""
-    return "nowhere comparable" if share is None else f"within {100 * share:.2g} %"
-
-
 def used_damping(
     name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
 ) -> NDArray[np.float64]:
@@ -306,20 +322,8 @@ def limit_by_6(
     return np.asarray(maximum_stiffness(device_damping, period, spent))
 
 
-METHOD_COLOURS: Mapping[str, str] = {
-    "implicit": "#000000",
-    "compensated": "#9aa3d6",
-    "lossless": "#3a1fd1",
-    "implicitfast": "#7b3294",
-    "implicitfast:compensated": "#d684bd",
-    "explicit": "#00868b",
-    "explicit:implicitfast": "#5cc8d8",
-    "explicit:rk4": "#7f7f7f",
-    "weld": "#6b3f14",
-    "direct": "#d6219c",
-}
-"""Colour of each rendering method's lines. None is near a verdict's (``verdicts.COLOURS``: green,
-yellow, orange, red): red would say that a method is unstable."""
+METHOD_COLOURS = {name: f"C{place}" for place, name in enumerate(METHODS)}
+"""Colour of each rendering method's lines."""
 
 THEORY_COLOUR = "#1a5fb4"
 """Colour of what was computed and not measured, unless it is black."""
@@ -448,6 +452,11 @@ def verdict_numbers(is_stable: ArrayLike, environment: NDArray[np.object_]) -> N
     """Returns the place of each run's verdict in ``VERDICTS``."""
     numbers = np.array([VERDICTS.index(name) for name in environment], dtype=np.int64)
     return np.where(np.asarray(is_stable, dtype=bool), numbers, VERDICTS.index("unstable"))
+
+
+def of_method(table: Table, what: str, name: str) -> Table:
+    """Returns the rows of one kind of point and one method."""
+    return table.select((table["what"] == what) & (table["method"] == name))
 
 
 def draw_verdicts(

@@ -1,4 +1,4 @@
-"""Map ``contact``: which settings of MuJoCo's contact, and which methods, create energy."""
+"""Map ``contact``: energy that settings of MuJoCo's contact create, by rendering method."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, TypeAlias
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,39 +18,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.lab.maps.base import (
-    COLOURS,
-    MISSING,
-    VERDICTS,
-    Finding,
-    Point,
-    StabilityMap,
-    computed,
-    draw_verdicts,
-    loop_in,
-    say_missing,
-)
-from hapticbridge.lab.maps.contact_rigs import (
-    PEG_ROTATION,
-    PERIOD,
-    SHIPPED,
-    SHIPPED_SOLIMP,
-    TREATMENTS,
-    ContactRun,
-    Treatment,
-    deepest,
-    firm_device,
-    peg_runs,
-    random_push,
-    random_taps,
-    recorded,
-    run_once,
-    set_mass,
-    summary,
-    ticks_of,
-    until_active,
-    wall_runs,
-)
+from hapticbridge.lab.maps import base, contact_rigs
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.contact_rigs import PERIOD, TREATMENTS, ContactRun, Treatment, peg_runs
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene.contacts import (
@@ -91,7 +61,7 @@ def agreement(table: Table) -> dict[str, Any]:
     """Counts, on the peg's grid, what the rule says against what was measured."""
     mine = table.select(table["rig"] == "peg")
     numbers = [
-        contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD)
+        contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD)
         for s, d in zip(mine["steps"], mine["dampratio"], strict=True)
     ]
     measured = verdicts(mine)
@@ -104,7 +74,7 @@ def agreement(table: Table) -> dict[str, Any]:
             "cells": int(cells.sum()),
             **{
                 verdict.replace(" ", "_"): int((measured[cells] == place).sum())
-                for place, verdict in enumerate(VERDICTS[:3])
+                for place, verdict in enumerate(base.VERDICTS[:3])
             },
         }
         for name, cells in regions.items()
@@ -119,47 +89,23 @@ def exceptions(table: Table) -> list[dict[str, Any]]:
         for mass, verdict in zip(mine["mass"].tolist(), verdicts(mine).tolist(), strict=True):
             numbers = treatment.numbers
             grade = numbers.grade if mass >= HEAVY else numbers.light_grade
-            if treatment.is_ruled and verdict > VERDICTS.index(grade):
+            if treatment.is_ruled and verdict > base.VERDICTS.index(grade):
                 worse = {"treatment": name, "mass": mass, "rule": grade}
-                found.append({**worse, "measured": VERDICTS[verdict]})
+                found.append({**worse, "measured": base.VERDICTS[verdict]})
     return found
 
 
-Columns: TypeAlias = Sequence[tuple[str, float, str, float, str]]
-"""Of figures beside the bars: heading, right edge as a share of the bars' width, what stands there,
-its factor and format."""
-
-
-def draw_bars(
-    axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Columns
-) -> None:
-    """Draws a bar an entry, runs by verdict, with what they came to in columns beside it.
-
-    Args:
-        axes: Where; the columns stand to their right.
-        found: An entry a bar; without one the axes say that no point could be computed.
-        names: Of the bars.
-        columns: What to write beside them.
-    """
+def draw_bars(axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[str]) -> None:
+    """Draws one bar for each entry: its runs by verdict."""
     if not found:
-        say_missing(axes)
+        base.say_missing(axes)
         return
-    places = np.arange(len(found))[::-1]
     left = np.zeros(len(found))
-    for verdict, colour in zip(VERDICTS[:3], COLOURS[:3], strict=True):
+    for verdict, colour in zip(base.VERDICTS[:3], base.COLOURS[:3], strict=True):
         width = np.array([one[verdict.replace(" ", "_")] for one in found])
-        axes.barh(places, width, left=left, color=colour, height=0.8)
+        axes.barh(names, width, left=left, color=colour, height=0.8)
         left = left + width
-    beside = axes.get_yaxis_transform()
-    for heading, share, name, factor, form in columns:
-        edge = 1 + share
-        axes.text(edge, len(found) - 0.3, heading, transform=beside, size=7, ha="right")
-        for place, one in zip(places, found, strict=True):
-            text = format(factor * one[name], form)
-            axes.text(edge, place, text, transform=beside, size=8, ha="right", va="center")
-    axes.set_yticks(places, names, size=8)
-    axes.set_xlim(0, max(left.max(), 1.0))
-    axes.set_ylim(-0.6, len(found) - 0.4)
+    axes.invert_yaxis()
     axes.set_xlabel("runs by verdict")
 
 
@@ -179,41 +125,31 @@ def search(name: str, mass: float) -> dict[str, float | int]:
     """Runs a peg of a mass in kg in one treatment, by K, friction and hand."""
     cases = list(itertools.product([mass], FRICTION, SEARCH_HANDS))
     treatment = TREATMENTS[name]
-    return summary([run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)])
+    return contact_rigs.summary(
+        [run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)]
+    )
+
+
+def totals(mine: Table) -> dict[str, Any]:
+    """Adds up runs by verdict; takes the largest of what else was measured, and median depth."""
+    counts = ("runs", "strict", "within_slack", "active")
+    worst = ("created", "slack_share", "peak_force", "largest_depth")
+    return {
+        **{name: int(mine[name].sum()) for name in counts},
+        **{name: float(mine[name].max()) for name in worst},
+        "median_depth": float(np.median(mine["median_depth"])),
+    }
 
 
 def searched(table: Table, name: str) -> dict[str, Any]:
-    """Returns what one treatment came to in a table of the map, over all tools."""
-    mine = table.select(table["treatment"] == name)
+    """Returns the totals of one treatment over all tools."""
     treatment = TREATMENTS[name]
     return {
         "treatment": name,
         "relaxation": treatment.relaxation,
         "static_depth": treatment.static_depth,
-        "runs": int(mine["runs"].sum()),
-        "strict": int(mine["strict"].sum()),
-        "within_slack": int(mine["within_slack"].sum()),
-        "active": int(mine["active"].sum()),
-        "created": float(mine["created"].max()),
-        "slack_share": float(mine["slack_share"].max()),
-        "median_depth": float(np.median(mine["median_depth"])),
-        "largest_depth": float(mine["largest_depth"].max()),
+        **totals(table.select(table["treatment"] == name)),
     }
-
-
-SEARCH_COLUMNS: Columns = (
-    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
-    ("depth, mm:\nmedian", 0.66, "median_depth", 1e3, ".2f"),
-    ("\nlargest", 0.9, "largest_depth", 1e3, ".2f"),
-    ("steady depth,\n× shipped", 1.28, "static_depth", 1.0, ".3g"),
-    ("\nτ, ms", 1.5, "relaxation", 1e3, ".3g"),
-)
-"""Beside the bars. The steady depth is computed, the others are measured."""
-
-
-def draw_search(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    """Draws a bar a treatment, runs by verdict, with what they came to in columns beside it."""
-    draw_bars(axes, found, [one["treatment"] for one in found], SEARCH_COLUMNS)
 
 
 COMPARED = ("implicit", "compensated", "lossless")
@@ -249,7 +185,7 @@ def cases_of(rig: str, mass: float) -> list[Case]:
 
 def compared(rig: str, method: str, mass: float) -> dict[str, float | int]:
     """Runs a tool of a mass in kg on a rig by a method, by K, friction and hand."""
-    return summary(list(method_runs(rig, method, cases_of(rig, mass))))
+    return contact_rigs.summary(list(method_runs(rig, method, cases_of(rig, mass))))
 
 
 def method_runs(
@@ -266,23 +202,30 @@ def method_runs(
     """
     treatment = Treatment(method=method)
     for stiffness, mass, friction, hand in cases:
-        damping, turning = FELT_DAMPING * stiffness * PERIOD, PEG_ROTATION[0] * stiffness
+        damping, turning = (
+            FELT_DAMPING * stiffness * PERIOD,
+            contact_rigs.PEG_ROTATION[0] * stiffness,
+        )
         felt = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
         coupling = felt
         if same_law:
             law = METHODS["lossless"].used(felt, PERIOD)
             coupling = METHODS[method].rendered(law, PERIOD)
         if rig == "taps":
-            loop = loop_in("virtual_wall", "contact")
-            path, holder = random_taps(hand)
+            loop = base.loop_in("virtual_wall", "contact")
+            path, holder = contact_rigs.random_taps(hand)
         else:
-            loop = loop_in("peg_in_hole", "mouth", _start_at_mouth)
-            path, holder = recorded() if hand == 0 else random_push(hand)
+            loop = base.loop_in("peg_in_hole", "mouth", _start_at_mouth)
+            path, holder = contact_rigs.recorded() if hand == 0 else contact_rigs.random_push(hand)
         treatment.apply(loop.scene.model, friction)
-        set_mass(loop, "tool" if rig == "taps" else "peg", mass)
-        device = firm_device(felt, path, holder)
-        records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
-        yield replace(run, depth=deepest(loop, records) if rig == "mouth" else _behind(records))
+        contact_rigs.set_mass(loop, "tool" if rig == "taps" else "peg", mass)
+        device = contact_rigs.firm_device(felt, path, holder)
+        records, run = contact_rigs.run_once(
+            loop, device, coupling, treatment, contact_rigs.ticks_of(device)
+        )
+        yield replace(
+            run, depth=contact_rigs.deepest(loop, records) if rig == "mouth" else _behind(records)
+        )
 
 
 def _start_at_mouth(model: mujoco.MjModel) -> None:
@@ -295,55 +238,13 @@ def _behind(records: NDArray[np.void]) -> float:
 
 
 def methods_found(table: Table) -> list[dict[str, Any]]:
-    """Returns what each method came to on each rig in a table of the map, over all tools."""
+    """Returns the totals of each method on each rig over all tools."""
     found = []
     for rig, method in itertools.product(RIGS, COMPARED):
         mine = table.select((table["rig"] == rig) & (table["method"] == method))
         if len(mine):
-            counts = ("runs", "strict", "within_slack", "active")
-            worst = ("created", "slack_share", "peak_force", "largest_depth")
-            found.append(
-                {
-                    "rig": rig,
-                    "method": method,
-                    **{name: int(mine[name].sum()) for name in counts},
-                    **{name: float(mine[name].max()) for name in worst},
-                    "median_depth": float(np.median(mine["median_depth"])),
-                }
-            )
+            found.append({"rig": rig, "method": method, **totals(mine)})
     return found
-
-
-def of_methods(found: Sequence[Mapping[str, Any]]) -> str:
-    """Says what the methods came to, in a sentence a rig; nothing where none was computed."""
-    said = []
-    words = {"taps": "tapping on a wall", "mouth": "in and out of the hole"}
-    for rig, doing in words.items():
-        mine = [one for one in found if one["rig"] == rig]
-        if mine:
-            parts = [
-                f"'{one['method']}' is strict in {one['strict']} of {one['runs']} runs, active in "
-                f"{one['active']}, makes {1e3 * one['created']:.2g} mJ at most"
-                for one in mine
-            ]
-            said.append(f"{HANDS} hands {doing}, as shipped: {'; '.join(parts)}.")
-    return " ".join(said)
-
-
-METHOD_COLUMNS: Columns = (
-    ("most energy\nmade, J", 0.34, "created", 1.0, ".1e"),
-    ("slack\nused", 0.56, "slack_share", 1.0, ".2f"),
-    ("peak\nforce, N", 0.84, "peak_force", 1.0, ".1f"),
-    ("depth, mm:\nmedian", 1.2, "median_depth", 1e3, ".2f"),
-    ("\nlargest", 1.5, "largest_depth", 1e3, ".2f"),
-)
-"""Beside the bars: the largest of all runs, but for the median."""
-
-
-def draw_methods(axes: Axes, found: Sequence[Mapping[str, Any]]) -> None:
-    """Draws a bar a rig and method, runs by verdict, with what they came to beside it."""
-    names = [f"{one['method']}, {one['rig']}" for one in found]
-    draw_bars(axes, found, names, METHOD_COLUMNS)
 
 
 STEPS = (0.25, 20.0)
@@ -359,25 +260,14 @@ PANELS = (
 )
 """Rig, method, K in N/m and title."""
 
-BESIDE = (1.0, 1.22)
-"""Width of bars and of the columns beside them, as a ratio."""
-
 CONTOUR = 160
 """Points along each axis from which the rule's lines are drawn; more make them smoother."""
 
 Array = NDArray[np.float64]
 
 
-def draw(
-    table: Table, found: Sequence[Mapping[str, Any]], methods: Sequence[Mapping[str, Any]]
-) -> Figure:
-    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
-
-    Args:
-        table: Of the map.
-        found: What each treatment of the search came to.
-        methods: What each method came to on each rig.
-    """
+def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
+    """Draws verdicts over timeconst and dampratio with the rule, and methods and search below."""
     figure = new_figure(8, 16)
     parts = figure.subfigures(3, 1, squeeze=False, height_ratios=(1, 0.4, 1.05))
     above, between, below = parts[:, 0]
@@ -391,13 +281,14 @@ def draw(
                 axes.set_xlabel("timeconst / T")
             if column == 0:
                 axes.set_ylabel("dampratio")
-    draw_methods(between.add_subplot(between.add_gridspec(1, 2, width_ratios=BESIDE)[0]), methods)
+    methods, search = boundary["methods"], boundary["search"]
+    draw_bars(between.subplots(), methods, [f"{one['method']}, {one['rig']}" for one in methods])
     between.suptitle(
         f"The methods on the contact as shipped, {HANDS} hands each: taps on a wall, and in and "
         "out of the hole's mouth;\ntools and K as below, B = 1.25 K T felt",
         fontsize="small",
     )
-    draw_search(below.add_subplot(below.add_gridspec(1, 2, width_ratios=BESIDE)[0]), found)
+    draw_bars(below.subplots(), search, [one["treatment"] for one in search])
     below.suptitle(
         "The search on the peg: 30, 100 and 300 g, K = 1000 and 6000 N/m, friction 0 and 0.42,\n"
         "one recorded and two random hands",
@@ -414,7 +305,9 @@ def draw(
 
 
 def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
-    handles: list[Artist] = [Patch(facecolor=COLOURS[v], label=VERDICTS[v]) for v in verdicts]
+    handles: list[Artist] = [
+        Patch(facecolor=base.COLOURS[v], label=base.VERDICTS[v]) for v in verdicts
+    ]
     handles += [Line2D([], [], color="black", ls=style, label=words) for _, style, words in LINES]
     figure.legend(
         handles=handles, loc="outside lower center", ncols=3, fontsize="small", frameon=False
@@ -424,7 +317,9 @@ def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
 def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: float) -> None:
     is_mine = (table["rig"] == rig) & (table["method"] == method)
     mine = table.select(is_mine & (table["stiffness"] == stiffness))
-    draw_verdicts(axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True)
+    base.draw_verdicts(
+        axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True
+    )
     steps, ratio, regions = _rule()
     for (_, style, _), is_above in zip(LINES, regions, strict=True):
         axes.contour(
@@ -440,8 +335,7 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
         ha="center",
         arrowprops={"arrowstyle": "-", "lw": 0.6},
     )
-    axes.set_xlim(*STEPS)
-    axes.set_ylim(*DAMPING_RATIO)
+    axes.set(xlim=STEPS, ylim=DAMPING_RATIO)
 
 
 @cache
@@ -452,7 +346,8 @@ def _rule() -> tuple[Array, Array, list[Array]]:
     """
     steps, ratio = (np.geomspace(*ends, CONTOUR) for ends in (STEPS, DAMPING_RATIO))
     numbers = [
-        [contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD) for s in steps] for d in ratio
+        [contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD) for s in steps]
+        for d in ratio
     ]
     regions = [
         np.array([[is_in(name, one) for one in row] for row in numbers], dtype=np.float64)
@@ -496,93 +391,61 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
         return compared(str(point["rig"]), str(point["method"]), float(point["mass"]))
     solref = float(point["steps"]) * PERIOD, float(point["dampratio"])
     treatment = Treatment(solref, method=str(point["method"]))
-    runs = wall_runs if point["rig"] == "wall" else peg_runs
-    return summary(until_active(runs(treatment, float(point["stiffness"]))))
-
-
-def read(table: Table) -> Finding:
-    """Draws verdicts over timeconst and dampratio with the rule on top, methods and search below.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "contact")
-    found = [searched(table, name) for name in TREATMENTS if np.any(table["treatment"] == name)]
-    methods = methods_found(table)
-    rule, worse = agreement(table), exceptions(table)
-    said = [_of_rule(rule, len(worse)), _of_fast(table), _of_search(found), _of_shipped(found)]
-    said.append(of_methods(methods) or f"Of the methods {MISSING}.")
-    return Finding(
-        draw(table, found, methods),
-        " ".join(filter(None, said)),
-        {"period": PERIOD, "rule": rule, "search": found, "methods": methods, "exceptions": worse},
+    runs = contact_rigs.wall_runs if point["rig"] == "wall" else peg_runs
+    return contact_rigs.summary(
+        contact_rigs.until_active(runs(treatment, float(point["stiffness"])))
     )
 
 
-def _of_rule(rule: Mapping[str, Mapping[str, int]], worse: int) -> str:
-    inside, sure, below = (rule[name] for name in ("relaxed", "strict", "abrupt"))
-    if not inside["cells"] + below["cells"]:
-        return f"On the peg's grid {MISSING}."
-    holds = sure["strict"] == sure["cells"] and not inside["active"] and not worse
-    return (
-        f"The rule {'held' if holds else 'did not hold everywhere'}: on the peg's grid "
-        f"{sure['strict']} of {sure['cells']} settings that it calls strict were "
-        f"so in every run, {inside['cells'] - inside['active']} of {inside['cells']} that it has "
-        f"within the slack for 30 g stayed there, and {below['active']} of {below['cells']} for "
-        f"which it promises nothing did not; in the search {worse} rows were worse than it says."
-    )
-
-
-def _of_fast(table: Table) -> str:
+def summarize(table: Table) -> dict[str, Any]:
+    """Compares the rule with the grid and the search, and adds up treatments and methods."""
     fast = table.select((table["rig"] == "wall") & (table["method"] == "implicitfast"))
-    if not len(fast):
-        return f"On a wall under 'implicitfast' {MISSING}."
-    share = 100 * float(np.mean(verdicts(fast) > 0))
-    return f"Under 'implicitfast' a mass on a wall creates energy at {share:.0f} % of the settings."
+    return {
+        "period": PERIOD,
+        "rule": agreement(table),
+        "active_share_of_implicitfast": float(np.mean(verdicts(fast) > 0)) if len(fast) else None,
+        "search": [searched(table, name) for name in TREATMENTS if name in table["treatment"]],
+        "methods": methods_found(table),
+        "exceptions": exceptions(table),
+    }
 
 
-def _of_search(found: Sequence[Mapping[str, Any]]) -> str:
-    if not found:
-        return f"In the search {MISSING}."
-    strict = [one for one in found if one["strict"] == one["runs"]]
-    at_rate = [one for one in strict if TREATMENTS[one["treatment"]].substeps == 1]
-    if at_rate:
-        best = min(at_rate, key=lambda one: one["median_depth"])
-        text = (
-            f"{len(at_rate)} of {len(found)} treatments are strict on the peg in every run with "
-            f"one step a tick; least deep is '{best['treatment']}', median "
-            f"{1e3 * best['median_depth']:.2f} mm and at most {1e3 * best['largest_depth']:.2f} "
-            f"mm, {best['static_depth']:.2g} times as deep as shipped under a steady force; it "
-            f"takes {1e3 * best['relaxation']:.3g} ms to come back after a push"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States how far the rule held, and the verdicts of treatments and methods."""
+    if boundary["rule"]["relaxed"]["cells"] + boundary["rule"]["abrupt"]["cells"]:
+        yield (
+            "On the peg's grid {strict[strict]} of {strict[cells]} settings that the rule calls "
+            "strict were so in every run, {relaxed[active]} of {relaxed[cells]} that it has within "
+            "the slack for 30 g were active, and so were {abrupt[active]} of {abrupt[cells]} for "
+            "which it promises nothing; in the search {worse} rows were worse than it says",
+            boundary["rule"] | {"worse": len(boundary["exceptions"])},
         )
-    else:
-        text = f"none of {len(found)} treatments is strict on the peg in every run"
-    finer = [one for one in strict if TREATMENTS[one["treatment"]].substeps > 1]
-    if finer:
-        best = min(finer, key=lambda one: one["median_depth"])
-        text += (
-            f"; with substeps '{best['treatment']}' is too, at {1e3 * best['median_depth']:.2f} mm"
+    yield (
+        "Under 'implicitfast' a mass on a wall creates energy at "
+        "{active_share_of_implicitfast:.0%} of the settings",
+        boundary,
+    )
+    search = boundary["search"]
+    strict = [one for one in search if one["strict"] == one["runs"]]
+    strict = [one for one in strict if TREATMENTS[one["treatment"]].substeps == 1]
+    best: Mapping[str, Any] = min(strict, key=lambda one: float(one["median_depth"]), default={})
+    yield (
+        "{count} treatments of the search are strict on the peg in every run with one step a tick; "
+        "least deep is '{treatment}', median {median_depth:.2g} m, {static_depth:.2g} times as "
+        "deep as shipped under a steady force",
+        {**best, "count": len(strict)},
+    )
+    yield (
+        "The setting as shipped is strict in {strict} of {runs} runs and uses up to "
+        "{slack_share:.2f} of the slack",
+        next((one for one in search if one["treatment"] == contact_rigs.SHIPPED), {}),
+    )
+    for one in boundary["methods"]:
+        yield (
+            "'{method}', {rig}: strict in {strict} of {runs} runs, active in {active}, creates "
+            "{created:.2g} J at most",
+            one,
         )
-    return f"The search: {text}."
 
 
-def _of_shipped(found: Sequence[Mapping[str, Any]]) -> str:
-    for one in found:
-        if one["treatment"] == SHIPPED:
-            return (
-                f"The setting as shipped is strict in {one['strict']} of {one['runs']} runs and "
-                f"uses up to {one['slack_share']:.2f} of the slack, at "
-                f"{1e3 * one['median_depth']:.2f} and at most {1e3 * one['largest_depth']:.2f} mm."
-            )
-    return ""
-
-
-CONTACT = StabilityMap(
-    name="contact",
-    about="settings of MuJoCo's contact: energy that they create on a wall and in a hole, and the "
-    "search for one that creates none",
-    default_points=333,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+CONTACT = StabilityMap("contact", __doc__, 333, points, evaluate, summarize, draw, sentences)

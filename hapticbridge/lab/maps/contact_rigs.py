@@ -17,7 +17,7 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.trajectory import read_motion
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import ClosedLoop
-from hapticbridge.lab.maps.base import loop_in, set_tool_mass, swinging
+from hapticbridge.lab.maps import base
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import scene_path
 from hapticbridge.scene.contacts import ContactNumbers, contact_numbers
@@ -32,7 +32,7 @@ def tapping(frequency: float) -> Motion:
 
     It wants to go 6 mm behind the wall's face.
     """
-    return swinging(0.008, frequency, duration=1.0, count=301)
+    return base.swinging(0.008, frequency, duration=1.0, count=301)
 
 
 @cache
@@ -41,7 +41,7 @@ def random_taps(seed: int) -> tuple[Motion, Hand]:
     random = np.random.default_rng(seed)
     size, frequency = random.uniform(5e-3, 8e-3), random.uniform(1.0, 6.0)
     hand = Hand(stiffness=random.uniform(800, 3000), damping=random.uniform(5, 30))
-    return swinging(size, frequency, duration=1.0, count=301), hand
+    return base.swinging(size, frequency, duration=1.0, count=301), hand
 
 
 @cache
@@ -308,7 +308,7 @@ def wall_runs(
 
     Every run is made when it is asked for.
     """
-    loop = loop_in("virtual_wall", "contact")
+    loop = base.loop_in("virtual_wall", "contact")
     coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
     for mass, hand in cases:
         treatment.apply(loop.scene.model, 0.0)
@@ -328,7 +328,7 @@ def peg_runs(
     cases: Iterable[tuple[float, float, int]] = PEG_RUNS,
 ) -> Iterator[ContactRun]:
     """Runs pegs by mass (kg), friction and hand in the hole at K in N/m, as ``wall_runs`` does."""
-    loop = loop_in("peg_in_hole", "contact", start_in_hole)
+    loop = base.loop_in("peg_in_hole", "contact", start_in_hole)
     for mass, friction, hand in cases:
         treatment.apply(loop.scene.model, friction)
         set_mass(loop, "peg", mass)
@@ -394,7 +394,7 @@ def firm_device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice
 
 def set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
     """Gives a tool a mass in kg."""
-    set_tool_mass(loop.scene.model, body, mass)
+    base.set_tool_mass(loop.scene.model, body, mass)
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
 
 

@@ -14,29 +14,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.lab.maps.base import (
-    MISSING,
-    THEORY_COLOUR,
-    VERDICTS,
-    Finding,
-    Point,
-    StabilityMap,
-    agreement,
-    computed,
-    draw_verdicts,
-    free_tool_and_wall,
-    largest_stable,
-    law_in_words,
-    limit_by_6,
-    loop_in,
-    needed_by_6,
-    per_cent,
-    swinging,
-    used_damping,
-    verdict_legend,
-    verdict_numbers,
-    wall_loop,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.maps.tool_mass import felt, worst_angle
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
@@ -89,7 +68,7 @@ SEARCHED = (1.0, 200_000.0)
 and the same for every B."""
 
 
-PATH = swinging(0.0075, 1.5, duration=2.0, count=201)
+PATH = base.swinging(0.0075, 1.5, duration=2.0, count=201)
 """Of a hand that goes 5 mm deep into the wall three times in 2 s."""
 
 
@@ -179,11 +158,11 @@ def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcom
 
 
 def _tool() -> ClosedLoop:
-    return loop_in(free_tool_and_wall)
+    return base.loop_in(base.free_tool_and_wall)
 
 
 def _wall() -> ClosedLoop:
-    return wall_loop(WALL_MASS, free_tool_and_wall)
+    return base.wall_loop(WALL_MASS, base.free_tool_and_wall)
 
 
 def _limit_on_wall(name: str, damping: float) -> float:
@@ -192,12 +171,7 @@ def _limit_on_wall(name: str, damping: float) -> float:
     def is_stable(stiffness: float) -> bool:
         return _worst_hand(name, _coupling(stiffness, damping), None).is_stable
 
-    return largest_stable(is_stable, *SEARCHED).middle
-
-
-def of_method(table: Table, what: str, name: str) -> Table:
-    """Returns the rows of one method that are ``cell`` or ``limit``."""
-    return table.select((table["what"] == what) & (table["method"] == name))
+    return base.largest_stable(is_stable, *SEARCHED).middle
 
 
 def verdicts_of(cells: Table) -> NDArray[np.int64]:
@@ -209,7 +183,7 @@ def verdicts_of(cells: Table) -> NDArray[np.int64]:
     for column in STABLE:
         value = cells.numbers(column)
         is_stable &= np.isnan(value) | (value == 1)
-    return verdict_numbers(is_stable, cells.texts("environment"))
+    return base.verdict_numbers(is_stable, cells.texts("environment"))
 
 
 CONTOUR = 41
@@ -219,20 +193,19 @@ FINE = 201
 """Points along each axis from which (6) is drawn; more make its corner sharper."""
 
 
-def draw(table: Table) -> Figure:
+def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     """Draws K against B by method, with the bounds and the measured limits on top."""
     figure = new_figure(8, 8.4)
     *panels, last = figure.subplots(3, 3, sharex=True, sharey=True).ravel()
     last.remove()
     for axes, name in zip(panels, THEORIES, strict=True):
         has_wall = METHODS[name].has_law
-        _draw_cells(axes, of_method(table, "cell", name))
+        _draw_cells(axes, base.of_method(table, "cell", name))
         _draw_theory(axes, name, has_wall=has_wall)
-        limits = of_method(table, "limit", name)
+        limits = base.of_method(table, "limit", name)
         axes.plot(limits["damping"], limits.numbers("limit"), "o", color="black", ms=4, mfc="white")
         axes.set_title(f"{name}{_note(name)}", fontsize="medium")
-        axes.set_xlim(*DAMPING)
-        axes.set_ylim(*STIFFNESS)
+        axes.set(xlim=DAMPING, ylim=STIFFNESS)
     for axes in panels[5:]:
         axes.set_xlabel("coupling damping B (N s/m)")
         axes.tick_params(labelbottom=True)
@@ -244,12 +217,12 @@ def draw(table: Table) -> Figure:
         "B is asked for; the law uses B′ = B, or less where a title says so (0 at least)",
         fontsize="medium",
     )
-    verdict_legend(
+    base.verdict_legend(
         figure,
         [
             ("(6): b = K T/2 + B′", "black", "-"),
             ("(7), Tustin's rule, at low frequency", "black", ":"),
-            (f"free tool of {1e3 * TOOL_MASS:g} g by this method", THEORY_COLOUR, "--"),
+            (f"free tool of {1e3 * TOOL_MASS:g} g by this method", base.THEORY_COLOUR, "--"),
             ("measured limit on a wall", "black", "o"),
         ],
     )
@@ -257,7 +230,7 @@ def draw(table: Table) -> Figure:
 
 
 def _draw_cells(axes: Axes, cells: Table) -> None:
-    draw_verdicts(axes, cells["damping"], cells["stiffness"], verdicts_of(cells), log_y=True)
+    base.draw_verdicts(axes, cells["damping"], cells["stiffness"], verdicts_of(cells), log_y=True)
 
 
 def _note(name: str) -> str:
@@ -265,7 +238,7 @@ def _note(name: str) -> str:
     method = METHODS[name]
     if not method.has_law:
         return ": free, and tapping"
-    return f", {law_in_words(name)}" if method.lag else ""
+    return f", {base.law_in_words(name)}" if method.lag else ""
 
 
 def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
@@ -273,7 +246,7 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
     b = DEVICE_DAMPING
     if has_wall:
         fine = np.linspace(*DAMPING, FINE), np.geomspace(*STIFFNESS, FINE)
-        by_6 = needed_by_6(name, fine[1][:, None], fine[0], PERIOD)
+        by_6 = base.needed_by_6(name, fine[1][:, None], fine[0], PERIOD)
         axes.contour(*fine, by_6, levels=[b], colors="black", linewidths=1.8)
     if has_wall and METHODS[name].lag == 0.0:
         # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
@@ -285,7 +258,7 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
         np.geomspace(*STIFFNESS, CONTOUR),
         np.minimum(_needed(_first_alike(name)), 10 * b),
         levels=[b],
-        colors=THEORY_COLOUR,
+        colors=base.THEORY_COLOUR,
         linestyles="--",
         linewidths=1.5,
     )
@@ -301,7 +274,7 @@ def _first_alike(name: str) -> str:
 def _needed(name: str) -> NDArray[np.float64]:
     """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B."""
     stiffness, damping = np.geomspace(*STIFFNESS, CONTOUR), np.linspace(*DAMPING, CONTOUR)
-    used = used_damping(name, stiffness[:, None], damping, PERIOD)
+    used = base.used_damping(name, stiffness[:, None], damping, PERIOD)
     return np.array(
         [
             [worst_angle(THEORIES[name], k, float(b), TOOL_MASS, PERIOD)[1] for b in row]
@@ -310,31 +283,22 @@ def _needed(name: str) -> NDArray[np.float64]:
     )
 
 
-def read(table: Table) -> Finding:
-    """Draws K against B by method, with the bounds on top, and compares the limits with (6).
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "coupling")
-    boundary = {
-        name: _cells_below(name, of_method(table, "cell", name))
-        | _limits(name, of_method(table, "limit", name))
+def summarize(table: Table) -> dict[str, Any]:
+    """Counts outcomes below (6) by method, and compares the limits on a wall with (6)."""
+    methods = {
+        name: _cells_below(name, base.of_method(table, "cell", name))
+        | _limits(name, base.of_method(table, "limit", name))
         for name in THEORIES
     }
-    return Finding(
-        draw(table),
-        _paragraph(boundary),
-        {"period": PERIOD, "device_damping": DEVICE_DAMPING, "methods": boundary},
-    )
+    return {"period": PERIOD, "device_damping": DEVICE_DAMPING, "methods": methods}
 
 
 def _cells_below(name: str, cells: Table) -> dict[str, Any]:
     """Counts what happened at a method's points below (6), where a device bears the coupling."""
-    needed = needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
+    needed = base.needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
     below = needed < DEVICE_DAMPING
     mine = cells.select(below)
-    is_passive = verdicts_of(mine) <= VERDICTS.index("within slack")
+    is_passive = verdicts_of(mine) <= base.VERDICTS.index("within slack")
     ports = mine.texts("fault_port")
     return {
         "passive_share_below_6": float(np.mean(is_passive)) if len(mine) else None,
@@ -350,62 +314,37 @@ def _limits(name: str, limits: Table) -> dict[str, Any]:
     """Compares the limits that were found on a wall with (6); empty where none was searched."""
     if not len(limits):
         return {}
-    predicted = limit_by_6(name, DEVICE_DAMPING, PERIOD, limits["damping"])
+    predicted = base.limit_by_6(name, DEVICE_DAMPING, PERIOD, limits["damping"])
     measured = limits.numbers("limit")
     return {
         "damping": limits["damping"].tolist(),
         "measured_on_wall": measured.tolist(),
         "predicted_6": predicted.tolist(),
-        "largest_deviation": agreement(measured, predicted),
+        "largest_deviation": base.agreement(measured, predicted),
     }
 
 
-def _paragraph(boundary: Mapping[str, Mapping[str, Any]]) -> str:
-    if "largest_deviation" in boundary["implicit"]:
-        worst = boundary["implicit"]["largest_deviation"]
-        on_wall = (
-            f"On a wall the worst hand turns 'implicit' unstable {per_cent(worst)} of "
-            "K = 2 (b − B)/T, eq. (6)"
-        )
-    else:
-        on_wall = f"On a wall, behind 'implicit', {MISSING}"
-    said = [on_wall, *(_of_method(name, mine) for name, mine in boundary.items())]
-    said.append(
-        "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 "
-        "at least, and (6) holds for what is used"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States the agreement with (6), and what happened below it by method."""
+    methods = boundary["methods"]
+    yield (
+        "On a wall the worst hand turns 'implicit' unstable within {largest_deviation:.2%} of "
+        "K = 2 (b − B)/T, eq. (6)",
+        methods["implicit"],
     )
-    return ". ".join(said) + ". The table holds tick and port of every first fault."
-
-
-def _of_method(name: str, mine: Mapping[str, Any]) -> str:
-    if not mine["runs_below_6"]:
-        return f"'{name}': {MISSING} below (6)"
-    text = (
-        f"'{name}' is stable and passive at {100 * mine['passive_share_below_6']:.0f} % of the "
-        "points below (6)"
-    )
-    faults = [
-        f"the {port} port at {mine[f'{port}_faults_below_6']}"
-        for port in ("environment", "device")
-        if mine[f"{port}_faults_below_6"]
-    ]
-    if faults:
-        return (
-            f"{text}; the hand that taps finds at fault {' and '.join(faults)} of "
-            f"{mine['runs_below_6']}"
+    for name, mine in methods.items():
+        yield (
+            "'{name}' is stable and passive at {passive_share_below_6:.0%} of the {runs_below_6} "
+            "points below (6); the hand that taps finds the environment at fault at "
+            "{environment_faults_below_6}, the device at {device_faults_below_6}, and at most "
+            "{most_slack_used_below_6:.0%} of the slack used",
+            mine | {"name": name},
         )
-    text += "; the hand that taps finds no port at fault"
-    if mine["most_slack_used_below_6"] > 0:
-        text += f" and {100 * mine['most_slack_used_below_6']:.0f} % of the slack used"
-    return text
+    yield (
+        "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "
+        "least, and (6) holds for what is used",
+        {},
+    )
 
 
-COUPLING = StabilityMap(
-    name="coupling",
-    about="stiffness against damping of the coupling at one device, for every method: stable and "
-    "passive, or not",
-    default_points=6000,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+COUPLING = StabilityMap("coupling", __doc__, 6000, points, evaluate, summarize, draw, sentences)

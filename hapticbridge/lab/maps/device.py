@@ -1,4 +1,4 @@
-"""Map ``device``: what encoder steps and dry friction of a device make of a wall.
+"""Map ``device``: effect of encoder steps and dry friction of a device on a wall.
 
 Diolaiti's regions are those of a spring alone, B = 0, of which no method takes anything off: the
 law is one for ``implicit``, ``compensated`` and ``lossless``, and one of them is run. With a damper
@@ -21,20 +21,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
-from hapticbridge.lab.maps.base import COLOURS as VERDICT_COLOURS
-from hapticbridge.lab.maps.base import (
-    METHOD_COLOURS,
-    MISSING,
-    Finding,
-    Point,
-    StabilityMap,
-    computed,
-    largest_stable,
-    law_in_words,
-    say_missing,
-    used_damping,
-    wall_loop,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -191,7 +179,7 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
 def _wall(
     name: str, device: SimulatedDevice, damping: float, ticks: int, knock: NDArray[np.float64]
 ) -> LoopOutcome:
-    return wall_loop(WALL_MASS).run(
+    return base.wall_loop(WALL_MASS).run(
         device,
         Coupling(STIFFNESS, damping, 0.0, 0.0),
         METHODS[name],
@@ -212,7 +200,7 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
     References:
         Abbott & Okamura 2005.
     """
-    return 0.5 + used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
+    return 0.5 + base.used_damping(name, STIFFNESS, damping, PERIOD) / (PERIOD * STIFFNESS)
 
 
 def friction_to_rest(name: str, damping: float) -> float:
@@ -226,7 +214,7 @@ def friction_to_rest(name: str, damping: float) -> float:
         damping: B in N s/m asked for, >= 0.
     """
     beta = DAMPED / (STIFFNESS * PERIOD)
-    return largest_stable(
+    return base.largest_stable(
         lambda sigma: settle(beta, sigma, 0.0, damping, name)[0] != "rest", *FRICTION
     ).middle
 
@@ -262,7 +250,7 @@ def shaken(name: str, damping: float) -> float:
     return float((force * moved).sum() / np.abs(moved).sum() / QUANTUM)
 
 
-COLOURS = (VERDICT_COLOURS[0], "#8fb8de", VERDICT_COLOURS[1], VERDICT_COLOURS[3])
+COLOURS = (base.COLOURS[0], "#8fb8de", base.COLOURS[1], base.COLOURS[3])
 """Of the regions: those of the verdicts from strict to unstable, and one that no verdict has for
 what depends on the knock."""
 
@@ -276,12 +264,12 @@ SIZES = (7.0, 5.5, 3.5)
 ``lossless`` use no damper they lie on each other, and all must be seen."""
 
 
-def draw(cells: Table, friction: Mapping[str, Any]) -> Figure:
+def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     """Draws the regions, and beside them the friction that was found at each damper."""
     figure = new_figure(8, 5.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
-    _draw_regions(left, cells)
-    _draw_friction(right, friction)
+    _draw_regions(left, table.select(table["what"] == "cell"))
+    _draw_friction(right, boundary["friction"])
     figure.suptitle(
         f"Encoder steps of Δ = {1e6 * RESOLUTION:g} µm against dry friction f_c: a device of\n"
         f"{1e3 * DEVICE_MASS:g} g pressed on a wall, K = {STIFFNESS:g} N/m, {1 / PERIOD:g} Hz",
@@ -304,8 +292,7 @@ def draw(cells: Table, friction: Mapping[str, Any]) -> Figure:
 
 
 def _draw_regions(axes: Axes, cells: Table) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     if len(cells):
         number = np.array([REGIONS.index(name) for name in cells["region"]])
         beta, sigma = np.unique(cells["beta"]), np.unique(cells["sigma"])
@@ -322,37 +309,36 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
         }.items():
             axes.text(*place, f"theory:\n{name}", ha="center", va="center", fontsize="small")
     else:
-        say_missing(axes)
+        base.say_missing(axes)
     axes.axvline(0.5, color="black", lw=1.8)
     axes.axhline(0.5, color="black", lw=1.8)
-    axes.set_xlim(*RANGE)
-    axes.set_ylim(*RANGE)
+    axes.set(xlim=RANGE, ylim=RANGE)
     ticks = (0.1, 0.2, 0.5, 1.0, 2.0)
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
-    axes.set_xlabel("damping of the device, β = b/(K T)")
-    axes.set_ylabel("friction of the device, σ = f_c/(K Δ)")
+    axes.set(
+        xlabel="damping of the device, β = b/(K T)", ylabel="friction of the device, σ = f_c/(K Δ)"
+    )
     axes.set_title("B = 0: pressed, and knocked; one law", fontsize="medium")
 
 
 def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
-    axes.set_xlabel("coupling damping B asked for (N s/m)")
-    axes.set_ylabel("friction needed, f_c/(K Δ)")
+    axes.set(xlabel="coupling damping B asked for (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
     if not found:
-        say_missing(axes)
+        base.say_missing(axes)
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
         if name in found:
-            mine, colour = found[name], METHOD_COLOURS[name]
+            mine, colour = found[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
                 mine["damping"],
                 mine["predicted"],
                 color=colour,
                 lw=size / 3,
-                label=f"{name}: {law_in_words(name)}",
+                label=f"{name}: {base.law_in_words(name)}",
             )
             for what, marker in MARKERS.items():
                 axes.plot(mine["damping"], mine[what], marker, **style)
@@ -413,31 +399,17 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     }
 
 
-def read(table: Table) -> Finding:
-    """Compares regions over β and σ, and the friction that a damper needs, with theory.
-
-    Where no point of one of the two, or of a method, was computed it is left out, and the
-    paragraph says so.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "device")
+def summarize(table: Table) -> dict[str, Any]:
+    """Compares regions over β and σ, and the friction that a damper needs, with theory."""
     cells = table.select(table["what"] == "cell")
-    dampers = table.select(table["what"] == "friction")
-    boundary: dict[str, Any] = {
+    dampers = {name: base.of_method(table, "friction", name) for name in METHODS_SHOWN}
+    return {
         "period": PERIOD,
         "stiffness": STIFFNESS,
         "resolution": RESOLUTION,
         "regions": _regions(cells) if len(cells) else {},
-        "friction": {
-            name: _friction(name, mine)
-            for name in METHODS_SHOWN
-            if len(mine := dampers.select(dampers["method"] == name))
-        },
+        "friction": {name: _friction(name, mine) for name, mine in dampers.items() if len(mine)},
     }
-    said = [_of_regions(boundary["regions"]), _of_friction(boundary["friction"])]
-    return Finding(draw(cells, boundary["friction"]), " ".join(said), boundary)
 
 
 def _regions(cells: Table) -> dict[str, Any]:
@@ -465,48 +437,27 @@ def _friction(name: str, dampers: Table) -> dict[str, Any]:
     }
 
 
-def _of_regions(found: Mapping[str, Any]) -> str:
-    if not found:
-        return f"Regions over β and σ: {MISSING}."
-    counts = ", ".join(f"{name} {count}" for name, count in found["points"].items())
-    edges, largest = found["measured_edges"], found["largest_cycle_steps"]
-    size = (
-        "no bounded limit cycle was seen"
-        if largest is None
-        else f"in encoder steps, peak to peak, the largest bounded limit cycle is {largest:.0f}, "
-        f"the median one {found['median_cycle_steps']:.0f}"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States the agreement with Diolaiti's regions, and the friction that each damper needs."""
+    regions = boundary["regions"]
+    yield "The runs agree with Diolaiti's regions at {agreement:.0%} of the points", regions
+    edges = regions.get("measured_edges", {})
+    yield "Divergence ends at β = {last:.2f} to {first:.2f} (theory: ½)", edges.get("beta")
+    yield (
+        "A press comes to rest from σ = {last:.2f} to {first:.2f} on (theory: ½)",
+        edges.get("sigma"),
     )
-    return (
-        f"What the runs did agrees with Diolaiti's regions at {100 * found['agreement']:.0f} % of "
-        f"the points: {counts}. Divergence ends at β = {_said(edges['beta'])}, and the pressed "
-        f"device comes to rest from σ = {_said(edges['sigma'])} on (theory: both ½); {size}."
+    yield (
+        "The largest bounded limit cycle spans {largest_cycle_steps:.0f} encoder steps, the median "
+        "one {median_cycle_steps:.0f}",
+        regions,
     )
-
-
-def _of_friction(found: Mapping[str, Any]) -> str:
-    if not found:
-        return f"Friction against the damper: {MISSING}."
-    error = max(SMALLEST, *(100 * mine["worst_ratio_error"] for mine in found.values()))
-    needs = "; ".join(_needs_of(name, found.get(name)) for name in METHODS_SHOWN)
-    return (
-        "With a damper, a hand that shakes the device across one encoder step needs f_c = K Δ/2 + "
-        f"B′ Δ/T within {error:.2g} %. That, and where one that only presses begins to let it "
-        f"rest, at the values of B that were tried: {needs}."
-    )
-
-
-def _needs_of(name: str, mine: Mapping[str, Any] | None) -> str:
-    if mine is None:
-        return f"'{name}': {MISSING}"
-    shaken_needs, pressed = mine["shaken"], mine["pressed"]
-    return (
-        f"'{name}' shaken {min(shaken_needs):.3g} to {max(shaken_needs):.3g} K Δ, pressed "
-        f"{min(pressed):.3g} to {max(pressed):.3g} K Δ"
-    )
-
-
-def _said(edge: Mapping[str, float] | None) -> str:
-    return "no value here" if edge is None else f"{edge['last']:.2f} to {edge['first']:.2f}"
+    for name, mine in boundary["friction"].items():
+        yield (
+            "Shaken across one encoder step, '{name}' needs f_c = K Δ/2 + B′ Δ/T within "
+            "{worst_ratio_error:.2%}",
+            mine | {"name": name},
+        )
 
 
 def _edges(cells: Table) -> dict[str, Any]:
@@ -548,11 +499,4 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
     )
 
 
-DEVICE = StabilityMap(
-    name="device",
-    about="encoder steps against Coulomb friction of the device: Diolaiti's four regions, measured",
-    default_points=400,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+DEVICE = StabilityMap("device", __doc__, 400, points, evaluate, summarize, draw, sentences)

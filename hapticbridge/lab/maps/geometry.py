@@ -1,4 +1,4 @@
-"""Map ``geometry``: how long a peg may be, rendered directly and through the coupling.
+"""Map ``geometry``: longest stable peg, rendered directly and through the coupling.
 
 The peg touches both walls of its hole throughout, where ``lossless`` is in its implicit form: what
 tells the methods behind the coupling apart is the B' that their law uses, with (6) in B'.
@@ -19,23 +19,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import LoopOutcome
-from hapticbridge.lab.maps.base import (
-    MISSING,
-    THEORY_COLOUR,
-    Finding,
-    Point,
-    StabilityMap,
-    agreement,
-    computed,
-    draw_verdicts,
-    largest_stable,
-    law_in_words,
-    limit_by_6,
-    loop_in,
-    per_cent,
-    verdict_legend,
-    verdict_numbers,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -114,7 +99,7 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
     Returns:
         The outcome, with its records.
     """
-    loop = loop_in("planar_peg", "geometry")
+    loop = base.loop_in("planar_peg", "geometry")
     set_length(loop.scene.model, length)
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
     device, coupling = device_and_coupling(name, stiffness)
@@ -203,7 +188,8 @@ BEHIND = ("implicit", "compensated", "lossless")
 METHODS_SHOWN = ("direct", *BEHIND)
 
 BOUNDS = {
-    name: float(limit_by_6(name, DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING)) for name in BEHIND
+    name: float(base.limit_by_6(name, DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
+    for name in BEHIND
 }
 """The largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T for ``implicit``; 2 b_θ/T for the others, of
 whose B' nothing is left there."""
@@ -247,12 +233,12 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
     )
     if point["what"] == "limit":
         if name == "direct":
-            found = largest_stable(
+            found = base.largest_stable(
                 lambda value: is_stable(name, value, stiffness), LENGTH[0] / 4, 4 * LENGTH[1]
             )
         else:
             lower, upper = ROTATIONAL_STIFFNESS
-            found = largest_stable(
+            found = base.largest_stable(
                 lambda value: is_stable(name, length, value), lower / 4, 4 * upper
             )
         return {"limit": found.middle}
@@ -266,31 +252,24 @@ def evaluate(point: Point) -> Mapping[str, float | int | str | bool]:
     }
 
 
-def draw(table: Table, limits: Mapping[str, Table]) -> Figure:
-    """Draws contact stiffness over length, and that of the coupling, with the limits on top.
-
-    Args:
-        table: All rows that were computed.
-        limits: The searches of each method.
-    """
+def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
+    """Draws contact stiffness over length, and that of the coupling, with the limits on top."""
     figure = new_figure(8, 7.6)
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, METHODS_SHOWN, strict=True):
         _draw_cells(axes, table, name)
-        mine = limits[name]
+        mine = base.of_method(table, "limit", name)
         if name == "direct":
             lengths = np.geomspace(*LENGTH, 100)
             axes.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
             x, y = mine.numbers("limit"), mine["stiffness"]
             axes.set_title("direct: no coupling", fontsize="medium")
-            axes.set_ylabel("contact stiffness K_c (N/m)")
-            axes.set_ylim(*CONTACT_STIFFNESS)
+            axes.set(ylabel="contact stiffness K_c (N/m)", ylim=CONTACT_STIFFNESS)
         else:
-            axes.axhline(BOUNDS[name], color=THEORY_COLOUR, lw=1.8, ls="--")
+            axes.axhline(BOUNDS[name], color=base.THEORY_COLOUR, lw=1.8, ls="--")
             x, y = mine["length"], mine.numbers("limit")
-            axes.set_title(f"{name}, {law_in_words(name, '_r')}", fontsize="medium")
-            axes.set_ylabel("coupling stiffness K_r (N m/rad)")
-            axes.set_ylim(*ROTATIONAL_STIFFNESS)
+            axes.set_title(f"{name}, {base.law_in_words(name, '_r')}", fontsize="medium")
+            axes.set(ylabel="coupling stiffness K_r (N m/rad)", ylim=ROTATIONAL_STIFFNESS)
         axes.plot(1e3 * x, y, "o", color="black", ms=4, mfc="white")
         axes.set_xlim(1e3 * LENGTH[0], 1e3 * LENGTH[1])
     for axes in panels[2:]:
@@ -301,11 +280,11 @@ def draw(table: Table, limits: Mapping[str, Table]) -> Figure:
         f"{1e3 * ROTATIONAL_DAMPING:g} mN m s/rad is asked for, and the law uses B_r′ (0 at least)",
         fontsize="medium",
     )
-    verdict_legend(
+    base.verdict_legend(
         figure,
         [
             ("L = 2 √(b_θ/(T K_c))", "black", "-"),
-            ("(6): b_θ = K_r T/2 + B_r′", THEORY_COLOUR, "--"),
+            ("(6): b_θ = K_r T/2 + B_r′", base.THEORY_COLOUR, "--"),
             ("measured limit", "black", "o"),
         ],
     )
@@ -313,28 +292,20 @@ def draw(table: Table, limits: Mapping[str, Table]) -> Figure:
 
 
 def _draw_cells(axes: Axes, table: Table, name: str) -> None:
-    cells = table.select((table["what"] == "cell") & (table["method"] == name))
-    verdict = verdict_numbers(cells.numbers("stable") == 1, cells.texts("environment"))
+    cells = base.of_method(table, "cell", name)
+    verdict = base.verdict_numbers(cells.numbers("stable") == 1, cells.texts("environment"))
     length = 1e3 * cells["length"]
-    draw_verdicts(axes, length, cells["stiffness"], verdict, log_x=True, log_y=True)
+    base.draw_verdicts(axes, length, cells["stiffness"], verdict, log_x=True, log_y=True)
 
 
-def read(table: Table) -> Finding:
-    """Draws contact or coupling stiffness over the length, with the limits on top.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "geometry")
-    limits = table.select(table["what"] == "limit")
-    of_method = {name: limits.select(limits["method"] == name) for name in METHODS_SHOWN}
-    boundary = {
+def summarize(table: Table) -> dict[str, Any]:
+    """Compares the limits in length and in stiffness with theory."""
+    return {
         "period": PERIOD,
         "device_rotational_damping": DEVICE_DAMPING,
-        "direct": _of_direct(of_method["direct"]),
-        **{name: _behind(name, of_method[name]) for name in BEHIND},
+        "direct": _of_direct(base.of_method(table, "limit", "direct")),
+        **{name: _behind(name, base.of_method(table, "limit", name)) for name in BEHIND},
     }
-    return Finding(draw(table, of_method), _paragraph(boundary), boundary)
 
 
 def _of_direct(limits: Table) -> dict[str, Any]:
@@ -344,7 +315,7 @@ def _of_direct(limits: Table) -> dict[str, Any]:
         "contact_stiffness": limits["stiffness"].tolist(),
         "measured_length": measured.tolist(),
         "predicted_length": predicted.tolist(),
-        "largest_deviation": agreement(measured, predicted),
+        "largest_deviation": base.agreement(measured, predicted),
     }
 
 
@@ -358,46 +329,26 @@ def _behind(name: str, limits: Table) -> dict[str, Any]:
         "length": limits["length"].tolist(),
         "measured_rotational_stiffness": measured.tolist(),
         "predicted_6": BOUNDS[name],
-        "largest_deviation": agreement(measured, BOUNDS[name]),
+        "largest_deviation": base.agreement(measured, BOUNDS[name]),
         "smallest": float(known.min()) if known.size else None,
         "largest": float(known.max()) if known.size else None,
         "largest_over_smallest": float(known.max() / known.min()) if known.size else None,
     }
 
 
-def _paragraph(boundary: Mapping[str, Any]) -> str:
-    direct = boundary["direct"]
-    contact, length = direct["contact_stiffness"], direct["measured_length"]
-    if contact:
-        soft, stiff = int(np.argmin(contact)), int(np.argmax(contact))
-        said = (
-            f"Rendered directly, a peg is stable up to {1e3 * length[soft]:.3g} mm with contacts "
-            f"of {contact[soft]:.3g} N/m and up to {1e3 * length[stiff]:.3g} mm with "
-            f"{contact[stiff]:.3g} N/m: {per_cent(direct['largest_deviation'])} of "
-            "L = 2 √(b_θ/(T K_c)). "
-        )
-    else:
-        said = f"Rendered directly, {MISSING}. "
-    behind = "; ".join(_said_of(name, boundary[name]) for name in BEHIND)
-    return f"{said}Behind the coupling the largest K_r: {behind}. Eq. (6) does not know L."
-
-
-def _said_of(name: str, mine: Mapping[str, Any]) -> str:
-    if mine["largest"] is None:
-        return f"'{name}', {'no limit was found' if mine['length'] else MISSING}"
-    return (
-        f"'{name}', between {mine['smallest']:.4g} and {mine['largest']:.4g} N m/rad over all "
-        f"lengths, {per_cent(mine['largest_deviation'])} of the {mine['predicted_6']:.3g} N m/rad "
-        "of eq. (6)"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States the agreement with theory, rendered directly and behind each coupling."""
+    yield (
+        "Rendered directly, the longest stable peg is within {largest_deviation:.2%} of "
+        "L = 2 √(b_θ/(T K_c))",
+        boundary["direct"],
     )
+    for name in BEHIND:
+        yield (
+            "Behind '{name}' the largest K_r lies between {smallest:.4g} and {largest:.4g} N m/rad "
+            "over all lengths; eq. (6), which has no length in it, says {predicted_6:.4g}",
+            boundary[name] | {"name": name},
+        )
 
 
-GEOMETRY = StabilityMap(
-    name="geometry",
-    about="length of a peg against the stiffness of its contacts, rendered directly, and against "
-    "that of the coupling in front of it, by method",
-    default_points=3600,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+GEOMETRY = StabilityMap("geometry", __doc__, 3600, points, evaluate, summarize, draw, sentences)

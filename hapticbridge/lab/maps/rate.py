@@ -1,4 +1,4 @@
-"""Map ``rate``: how stiff a wall may be at each period, delay, jitter and share of lost ticks.
+"""Map ``rate``: largest stiffness of a wall against period, delay, jitter and lost ticks.
 
 At even ticks for ``implicit``, ``compensated`` and ``lossless`` at the same B asked for, each
 against the bound for the B' that its law uses.
@@ -19,29 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.lab.closed_loop import PARTS, LoopOutcome, Timing
-from hapticbridge.lab.maps.base import (
-    MISSING,
-    STILL,
-    THEORY_COLOUR,
-    WIDTH,
-    Finding,
-    Point,
-    StabilityMap,
-    agreement,
-    computed,
-    largest_stable,
-    law_in_words,
-    per_cent,
-    say_missing,
-    wall_loop,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
-THEORY_WIDTH = WIDTH / 100
+THEORY_WIDTH = base.WIDTH / 100
 """Relative width of the search for what theory says: far below that of a measurement."""
 
 DEVICE_DAMPING = 2.0
@@ -142,7 +128,7 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
         def is_stable(stiffness: float) -> bool:
             return worst_hand(name, stiffness, period, delay).is_stable
 
-        limit = largest_stable(is_stable, *SEARCHED).middle
+        limit = base.largest_stable(is_stable, *SEARCHED).middle
         return {"limit": limit} | unevenness([period])
 
     timings = [_timing(str(point["what"]), share, seed) for seed in range(SEEDS)]
@@ -151,7 +137,7 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     def is_stable_in_all(stiffness: float) -> bool:
         return all(finite_hand(name, hand, stiffness, timing).is_stable for timing in timings)
 
-    limit = largest_stable(is_stable_in_all, *SEARCHED).middle
+    limit = base.largest_stable(is_stable_in_all, *SEARCHED).middle
     intervals = np.concatenate([timing.intervals(TICKS) for timing in timings]) / PARTS
     return {"limit": limit} | unevenness(period * intervals)
 
@@ -194,7 +180,7 @@ def worst_hand(name: str, stiffness: float, period: float, delay: int) -> LoopOu
 def finite_hand(name: str, hand: str, stiffness: float, timing: Timing) -> LoopOutcome:
     """Runs a spring as wall for a device that is free or in an ordinary hand, at uneven ticks."""
     device = SimulatedDevice(
-        damping=DEVICE_DAMPING, hand=HANDS[hand], path=STILL if HANDS[hand] else None
+        damping=DEVICE_DAMPING, hand=HANDS[hand], path=base.STILL if HANDS[hand] else None
     )
     spring = Coupling(stiffness, 0.0, 0.0, 0.0)
     return _run(name, device, spring, UNEVEN_PERIOD, timing=timing)
@@ -209,7 +195,7 @@ def _run(
     ticks: int = TICKS,
     timing: Timing | None = None,
 ) -> LoopOutcome:
-    return wall_loop(WALL_MASS).run(
+    return base.wall_loop(WALL_MASS).run(
         device,
         coupling,
         METHODS[name],
@@ -237,7 +223,7 @@ def wall_limit(name: str, period: float, delay: int) -> float:
         used = METHODS[name].used(coupling, period)
         return minimum_damping(used, period, delay=delay) < DEVICE_DAMPING
 
-    return largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle
+    return base.largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle
 
 
 def uneven_bound(period: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -263,7 +249,7 @@ SHOWN = (15.0, 7e4)
 """Range of K in N/m at even ticks: all bounds at b, and room for the names below them."""
 
 
-def draw(boundary: Mapping[str, Any]) -> Figure:
+def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
     """Draws what ``rate.read`` found."""
     figure = new_figure(8, 8.4)
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
@@ -285,7 +271,7 @@ def draw(boundary: Mapping[str, Any]) -> Figure:
         for name, marker in MARKERS.items()
     ]
     handles += [
-        first.plot([], [], style, color=THEORY_COLOUR, label=label)[0]
+        first.plot([], [], style, color=base.THEORY_COLOUR, label=label)[0]
         for label, style in STYLES.values()
     ]
     figure.suptitle(
@@ -311,8 +297,7 @@ def draw(boundary: Mapping[str, Any]) -> Figure:
 def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
     # one hue, lighter the later: a delay is a quantity, and verdicts own the other colours
     shade = matplotlib.colormaps["Blues_r"]
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     for delay, mine in by_delay.items():
         colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
         axes.plot(period, mine["predicted"], color=colour, label=delay)
@@ -328,9 +313,9 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
             columnspacing=1.0,
         )
     else:
-        say_missing(axes)
+        base.say_missing(axes)
     axes.set_ylim(*SHOWN)
-    axes.set_title(f"{name}, {law_in_words(name)}", fontsize="medium")
+    axes.set_title(f"{name}, {base.law_in_words(name)}", fontsize="medium")
     axes.set_xlabel("period T (ms)")
     ticks = (0.1, 0.3, 1, 3)
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -352,9 +337,9 @@ def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
     if found:
         lines = next(iter(found.values()))  # the ticks were the same for every hand
         for key, (_, style) in STYLES.items():
-            axes.plot(lines["share"], lines[key], style, color=THEORY_COLOUR)
+            axes.plot(lines["share"], lines[key], style, color=base.THEORY_COLOUR)
     else:
-        say_missing(axes)
+        base.say_missing(axes)
     axes.set_xlabel(words)
     axes.grid(visible=True, which="both", alpha=0.25)
 
@@ -365,33 +350,22 @@ def _drawable(values: list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
 
 
-WORDS = {"jitter": "Ticks late by up to a share of T", "drops": "A share of all ticks lost"}
-"""How the paragraph begins on uneven ticks."""
-
 LINES = ("mean", "balanced", "longest")
 """Periods of ``unevenness`` with which the measurement at uneven ticks is compared."""
 
 
-def read(table: Table) -> Finding:
-    """Compares the largest K with theory: by method, period and delay; by jitter; by lost ticks.
-
-    A method, a delay or a hand without a computed point is left out, and the paragraph says so.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "rate")
-    boundary = {
+def summarize(table: Table) -> dict[str, Any]:
+    """Compares the largest K with theory: by method, period and delay; at uneven ticks."""
+    return {
         "device_damping": DEVICE_DAMPING,
         "damping": DAMPING,
         "methods": {name: _by_delay(name, table) for name in METHODS_SHOWN},
         "uneven": {what: _uneven(table.select(table["what"] == what)) for what in UNEVEN},
     }
-    return Finding(draw(boundary), _paragraph(boundary), boundary)
 
 
 def _by_delay(name: str, table: Table) -> dict[str, Any]:
-    rows = table.select((table["what"] == "delay") & (table["method"] == name))
+    rows = base.of_method(table, "delay", name)
     found: dict[str, Any] = {}
     for delay in np.unique(rows["delay"]):
         mine = rows.select(rows["delay"] == delay)
@@ -401,7 +375,7 @@ def _by_delay(name: str, table: Table) -> dict[str, Any]:
             "period": period.tolist(),
             "measured": limit.tolist(),
             "predicted": predicted.tolist(),
-            "worst_ratio_error": agreement(limit, predicted),
+            "worst_ratio_error": base.agreement(limit, predicted),
             "slope": _slope(period, limit),
         }
     return found
@@ -428,82 +402,28 @@ def _uneven(rows: Table) -> dict[str, Any]:
     return found
 
 
-def _paragraph(boundary: Mapping[str, Any]) -> str:
-    said = [_of_even(boundary["methods"])]
-    said += [_of_method(name, mine) for name, mine in boundary["methods"].items()]
-    said += [_of_uneven(what, mine) for what, mine in boundary["uneven"].items()]
-    return ". ".join(said) + "."
-
-
-def _of_even(methods: Mapping[str, Mapping[str, Any]]) -> str:
-    delays = [mine for by_delay in methods.values() for mine in by_delay.values()]
-    if not delays:
-        return f"Even ticks: {MISSING}"
-    known = [mine["worst_ratio_error"] for mine in delays if mine["worst_ratio_error"] is not None]
-    periods = [1e3 * period for mine in delays for period in mine["period"]]
-    return (
-        f"At even ticks, T = {min(periods):.3g} to {max(periods):.3g} ms and {DAMPING:g} N s/m "
-        "asked for, the worst hand turns the wall unstable "
-        f"{per_cent(max(known, default=None))} of the bound for its method and delay. Wall, b, B "
-        "and worst hand have no time but T: with K T kept, the runs at all periods are one loop "
-        "to another scale. With a delay a damper helps on a wall, so that B′ taken off costs "
-        "stiffness there"
-    )
-
-
-def _of_method(name: str, by_delay: Mapping[str, Any]) -> str:
-    left_out = [str(delay) for delay in range(DELAYS) if str(delay) not in by_delay]
-    if len(left_out) == DELAYS:
-        return f"'{name}' at even ticks: {MISSING}"
-    at_each = [
-        f"{100 * share:.0f} %" + (f" at {delay}" if delay != "0" else " without a delay")
-        for delay, mine in by_delay.items()
-        if (share := _share(mine)) is not None
-    ]
-    text = f"'{name}' bears, of K = 2b/T, {', '.join(at_each) or 'nothing that was found'}"
-    slope = by_delay.get("0", {}).get("slope")
-    if slope is not None:
-        text += f"; without a delay K was found to go with T to the power {slope:.3f}"
-    if left_out:
-        text += f"; delay of {', '.join(left_out)} samples: {MISSING}"
-    return text
-
-
-def _share(mine: Mapping[str, Any]) -> float | None:
-    """Returns the mean over the periods of K T/(2b); None where no K was found."""
-    share = np.array(mine["measured"]) * np.array(mine["period"]) / (2 * DEVICE_DAMPING)
-    known = share[np.isfinite(share) & (share > 0)]
-    return float(known.mean()) if known.size else None
-
-
-def _of_uneven(what: str, mine: Mapping[str, Any]) -> str:
-    free, held = mine.get("no hand"), mine.get("ordinary hand")
-    said = []
-    if free is None:
-        said.append(f"no hand: {MISSING}")
-    else:
-        first, last = free["measured"][0], free["measured"][-1]
-        is_known = 0 < first < np.inf and last < np.inf
-        kept = f"keeps {100 * last / first:.0f} % of its stiffness" if is_known else "bears"
-        said.append(
-            f"at {free['share'][-1]:g} a free device {kept} ({last:.0f} N/m), against "
-            f"2b ΣT/ΣT² = {free['at_balanced'][-1]:.0f} by the balance of energy, "
-            f"{free['at_mean'][-1]:.0f} at the mean interval and {free['at_longest'][-1]:.0f} at "
-            "the longest, which is enough for any hand"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States the agreement with the bounds at even ticks, and the limits at uneven ones."""
+    for name, by_delay in boundary["methods"].items():
+        errors = [mine["worst_ratio_error"] for mine in by_delay.values()]
+        yield (
+            "'{name}': the worst hand turns the wall unstable within {error:.2%} of the bound for "
+            "its delay",
+            {"name": name, "error": max(filter(None, errors), default=None)},
         )
-    if held is None:
-        said.append(f"ordinary hand: {MISSING}")
-    else:
-        said.append(f"an ordinary hand is stable up to {held['measured'][-1]:.0f} N/m")
-    return f"{WORDS[what]}: {'; '.join(said)}"
+        yield (
+            "'{name}': without a delay K goes with T to the power {slope:.3f}",
+            by_delay.get("0", {}) | {"name": name},
+        )
+    for what, by_hand in boundary["uneven"].items():
+        for hand, mine in by_hand.items():
+            yield (
+                "{axis}, {share:g}: with {hand} the wall is stable up to {measured:.0f} N/m; "
+                "2b ΣT/ΣT² by the balance of energy is {at_balanced:.0f} N/m, 2b/T at the mean "
+                "interval {at_mean:.0f} and at the longest {at_longest:.0f}, enough for any hand",
+                {key: values[-1] for key, values in mine.items()}
+                | {"axis": AXES[what].capitalize(), "hand": hand},
+            )
 
 
-RATE = StabilityMap(
-    name="rate",
-    about="largest stiffness of a wall against period and delay by method, and against jitter and "
-    "lost ticks",
-    default_points=110,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+RATE = StabilityMap("rate", __doc__, 110, points, evaluate, summarize, draw, sentences)

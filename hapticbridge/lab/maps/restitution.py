@@ -6,7 +6,7 @@ is MuJoCo's alone, by integrator and contact setting.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -18,15 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from hapticbridge.errors import StudyError, choices
-from hapticbridge.lab.maps.base import (
-    MISSING,
-    THEORY_COLOUR,
-    Finding,
-    Point,
-    StabilityMap,
-    computed,
-    say_missing,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
@@ -186,7 +179,7 @@ DRAWN = ("scenes", "bouncy, implicitfast")
 
 COLOURS = {
     "inelastic": "#b0b0b0",
-    "newton": THEORY_COLOUR,
+    "newton": base.THEORY_COLOUR,
     "poisson": "#7fb2ee",
     "stronge": "#0d2c54",
 }
@@ -206,20 +199,23 @@ Summary = dict[str, Any]
 """What one contact setting came to."""
 
 
-def draw(table: Table, by_setting: Mapping[str, Summary]) -> Figure:
-    """Draws the energy over the angle, and how far each law is from MuJoCo.
-
-    Args:
-        table: Of the map.
-        by_setting: What each contact setting came to.
-    """
+def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
+    """Draws the energy over the angle, and how far each law is from MuJoCo."""
+    by_setting = boundary["settings"]
     figure = new_figure(8, 7.2)
     panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
     for axes, name in zip(panels[0], DRAWN, strict=True):
         _draw_curves(axes, table, name)
     panels[0, 0].set_ylabel("change of kinetic energy (J)")
-    _draw_bars(panels[1, 0], by_setting)
-    _draw_gains(panels[1, 1], by_setting)
+    found = by_setting.values()
+    distances = {law: [row["rms_distance_to_law"][law] for row in found] for law in COLOURS}
+    _draw_bars(panels[1, 0], by_setting, distances, "distance from MuJoCo, RMS (J)")
+    largest = {
+        "MuJoCo": [row["largest_energy_change"] for row in found],
+        "newton": [row["largest_by_newton"] for row in found],
+    }
+    label = "largest change of energy (J)\nblack: MuJoCo, blue: Newton"
+    _draw_bars(panels[1, 1], by_setting, largest, label)
     figure.suptitle(
         f"A rod of {MASS:g} kg and {LENGTH:g} m falls at {APPROACH:g} m/s on MuJoCo's floor;\n"
         f"above: it slides at {SLIDE:g} m/s, friction {SHOWN:g}",
@@ -233,7 +229,7 @@ def _draw_curves(axes: Axes, table: Table, name: str) -> None:
     rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
     mine = table.select(rows)
     if not len(mine):
-        say_missing(axes)
+        base.say_missing(axes)
         return
     angle = np.degrees(mine["angle"])
     for law, colour in COLOURS.items():
@@ -260,34 +256,19 @@ def _named(law: str) -> str:
     return "any law, e = 0" if law == "inelastic" else law.capitalize()
 
 
-def _draw_bars(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    for shift, (law, colour) in enumerate(COLOURS.items()):
-        distances = [row["rms_distance_to_law"][law] for row in by_setting.values()]
-        axes.barh(place + 0.2 * (shift - 1.5), distances, 0.2, color=colour)
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
-    axes.invert_yaxis()
-    axes.set_xlabel("distance from MuJoCo, RMS (J)")
-
-
-def _draw_gains(axes: Axes, by_setting: Mapping[str, Summary]) -> None:
-    place = np.arange(len(by_setting))
-    axes.barh(
-        place - 0.18,
-        [row["largest_energy_change"] for row in by_setting.values()],
-        0.36,
-        fc="black",
-    )
-    axes.barh(
-        place + 0.18,
-        [row["largest_by_newton"] for row in by_setting.values()],
-        0.36,
-        color=COLOURS["newton"],
-    )
-    axes.set_yticks(place, [name.replace(", ", ",\n", 1) for name in by_setting], fontsize="small")
+def _draw_bars(
+    axes: Axes, names: Iterable[str], rows: Mapping[str, Sequence[float]], label: str
+) -> None:
+    """Draws a bar per setting for each law, or for MuJoCo in black."""
+    names = [name.replace(", ", ",\n", 1) for name in names]
+    place, height = np.arange(len(names)), 0.8 / len(rows)
+    for shift, (law, values) in enumerate(rows.items()):
+        centre = place + height * (shift - (len(rows) - 1) / 2)
+        axes.barh(centre, values, height, color=COLOURS.get(law, "black"))
+    axes.set_yticks(place, names, fontsize="small")
     axes.invert_yaxis()
     axes.axvline(0.0, color="black", lw=0.6)
-    axes.set_xlabel("largest change of energy (J)\nblack: MuJoCo, blue: Newton")
+    axes.set_xlabel(label)
 
 
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
@@ -342,16 +323,10 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
     return float(resolve_impact(rod, velocity, friction, restitution, law).energy_change)
 
 
-def read(table: Table) -> Finding:
-    """Draws the energy over the angle, and how far each law is from MuJoCo.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "restitution")
+def summarize(table: Table) -> dict[str, Any]:
+    """Compares each contact setting with the laws of impact."""
     groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
-    by_setting = {name: _summary(mine) for name, mine in groups.items() if len(mine)}
-    return Finding(draw(table, by_setting), _paragraph(by_setting), {"settings": by_setting})
+    return {"settings": {name: _summary(mine) for name, mine in groups.items() if len(mine)}}
 
 
 def _summary(mine: Table) -> Summary:
@@ -377,55 +352,17 @@ def _nearest(distances: Mapping[str, float]) -> str | None:
     return first if distances[first] < (1 - LEAD) * distances[second] else None
 
 
-def _paragraph(by_setting: Mapping[str, Summary]) -> str:
-    missing = [f"'{name}'" for name in SETTINGS if name not in by_setting]
-    said = f"With {', '.join(missing)} {MISSING}. " if missing else ""
-    nearest = [row["nearest_law"] for row in by_setting.values()]
-    counts = {law: nearest.count(law) for law in dict.fromkeys(nearest)}
-    names = {None: "none", "inelastic": "the inelastic one"}
-    likeness = ", ".join(
-        f"{names.get(law) or str(law).capitalize()} in {count}"
-        for law, count in sorted(counts.items(), key=lambda pair: -pair[1])
-    )
-    gains = [
-        f"'{name}' up to {row['largest_energy_change']:+.2g} J"
-        for name, row in by_setting.items()
-        if row["largest_energy_change"] > 0
-    ]
-    if "scenes" in by_setting:
-        said += _of_the_scenes(by_setting["scenes"])
-    own = max(by_setting, key=lambda name: by_setting[name]["largest_own_restitution"])
-    by_newton = max(by_setting, key=lambda name: by_setting[name]["largest_by_newton"])
-    said += (
-        f"Of the {len(by_setting)} settings the law that is nearest by more than {100 * LEAD:.0f} "
-        f"% is {likeness}. The largest e of a slanted rod is "
-        f"{by_setting[own]['largest_own_restitution']:.2g}, with '{own}', whose upright rod has "
-        f"{by_setting[own]['restitution']:.2g}; Newton's law changes the energy by "
-        f"{by_setting[by_newton]['largest_by_newton']:+.2g} J at most, with '{by_newton}'. "
-    )
-    if gains:
-        return f"{said}Kinetic energy is created with {', '.join(gains)}."
-    return f"{said}No setting created kinetic energy."
-
-
-def _of_the_scenes(usual: Summary) -> str:
-    distances = usual["rms_distance_to_law"]
-    return (
-        f"With the contact of the scenes a rod that falls upright comes back with e = "
-        f"{usual['restitution']:.2g}, and at any angle and friction its energy changes by "
-        f"{usual['largest_energy_change']:+.2g} J at most. Laws of impact with that e are "
-        f"{1e3 * min(distances[law] for law in RESTITUTION_LAWS):.2g} to "
-        f"{1e3 * max(distances[law] for law in RESTITUTION_LAWS):.2g} mJ away (RMS), e = 0 "
-        f"{1e3 * distances['inelastic']:.2g} mJ. "
-    )
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States e, the energy and the nearest law of each contact setting."""
+    for name, mine in boundary["settings"].items():
+        yield (
+            "With '{name}' a rod that falls upright comes back with e = {restitution:.2g}; at any "
+            "angle and friction its energy changes by {largest_energy_change:+.2g} J at most, by "
+            "Newton's law {largest_by_newton:+.2g} J; the nearest law is {nearest}",
+            mine | {"name": name, "nearest": mine["nearest_law"] or "none"},
+        )
 
 
 RESTITUTION = StabilityMap(
-    name="restitution",
-    about="energy of a rod after one contact of MuJoCo's, against the laws of Newton, Poisson and "
-    "Stronge",
-    default_points=4200,
-    points=points,
-    evaluate=evaluate,
-    read=read,
+    "restitution", __doc__, 4200, points, evaluate, summarize, draw, sentences
 )

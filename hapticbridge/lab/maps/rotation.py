@@ -1,4 +1,4 @@
-"""Map ``rotation``: how fast a tool may spin, and what happens where the angle passes π."""
+"""Map ``rotation``: speed and angle of a spinning tool, up to the cut at an angle of π."""
 
 from __future__ import annotations
 
@@ -16,22 +16,8 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.lab.maps.base import (
-    METHOD_COLOURS,
-    MISSING,
-    THEORY_COLOUR,
-    Finding,
-    Point,
-    StabilityMap,
-    computed,
-    draw_verdicts,
-    free_body,
-    largest_stable,
-    loop_in,
-    scene_of,
-    verdict_legend,
-    verdict_numbers,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import RunSetup
 from hapticbridge.plotting import new_figure
@@ -171,7 +157,7 @@ def spin(
     Raises:
         HapticBridgeError: A value is out of range, or the method cannot render a free tool.
     """
-    scene = loop_in(spinning_scene).scene
+    scene = base.loop_in(spinning_scene).scene
     chosen = METHODS[method]
     effective = prepare(scene, coupling, PERIOD, 1, chosen)
     quaternions = turning(speed, angle=angle, axis=axis)
@@ -221,14 +207,14 @@ def sudden(method: str, stiffness: float, speed: float) -> Spin:
 
 def speed_of_cut(method: str, stiffness: float) -> float:
     """Returns the speed in rad/s, 1 to 1000, at which a sudden turn winds the angle past π."""
-    return largest_stable(
+    return base.largest_stable(
         lambda speed: sudden(method, stiffness, speed).crossed < 0, 1.0, 1000.0
     ).middle
 
 
 def spinning_scene() -> Scene:
     """Loads the tool, floating free of gravity."""
-    return scene_of(free_body(MASS, INERTIA))
+    return base.scene_of(base.free_body(MASS, INERTIA))
 
 
 def _set_spin(scene: Scene, omega: NDArray[np.float64]) -> None:
@@ -240,7 +226,7 @@ def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.vo
     for first in range(0, TICKS, CHUNK):
         part = slice(first, first + CHUNK)
         done = simulate(binding.state, samples[part], binding.row, records[part])
-        if done < CHUNK or not binding.state["kinetic"][0] < DIVERGED:
+        if done < CHUNK or not binding.state["energy"]["kinetic"][0] < DIVERGED:
             return first + done
     return TICKS
 
@@ -362,7 +348,7 @@ HIGHEST = 5 * np.pi * SOFT
 """Upper end of the axis of torque in N m: the jump at the cut, and room for the names above it."""
 
 
-def draw(table: Table) -> Figure:
+def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     """Draws verdicts over speed and angle, creation over speed, and the jump at the cut."""
     figure = new_figure(8, 8.4)
     grid = figure.add_gridspec(3, 6, height_ratios=[1, 1, 1.4])
@@ -382,11 +368,11 @@ def draw(table: Table) -> Figure:
         f"{1 / PERIOD:g} Hz;\nabove and right: K_r = {SOFT:g} N m/rad",
         fontsize="medium",
     )
-    verdict_legend(
+    base.verdict_legend(
         figure,
         [
             ("angle passed π", "black", "o"),
-            ("gyroscopic torque = π K_r", THEORY_COLOUR, "--"),
+            ("gyroscopic torque = π K_r", base.THEORY_COLOUR, "--"),
         ],
     )
     return figure
@@ -394,12 +380,12 @@ def draw(table: Table) -> Figure:
 
 def _draw_cells(axes: Axes, table: Table, method: str) -> None:
     axes.set_title(method, fontsize="medium")
-    cells = table.select((table["what"] == "cell") & (table["method"] == method))
-    verdict = verdict_numbers(cells.numbers("ticks") == TICKS, cells.texts("environment"))
-    draw_verdicts(axes, cells["speed"], cells["angle"], verdict)
+    cells = base.of_method(table, "cell", method)
+    verdict = base.verdict_numbers(cells.numbers("ticks") == TICKS, cells.texts("environment"))
+    base.draw_verdicts(axes, cells["speed"], cells["angle"], verdict)
     passed = cells.select(cells.numbers("crossed") >= 0)
     axes.plot(passed["speed"], passed["angle"], "o", color="black", ms=2, mfc="white", mew=0.5)
-    axes.axvline(gyroscopic_speed(SOFT), color=THEORY_COLOUR, ls="--", lw=1.5)
+    axes.axvline(gyroscopic_speed(SOFT), color=base.THEORY_COLOUR, ls="--", lw=1.5)
 
 
 def _draw_creation(axes: Axes, table: Table) -> None:
@@ -413,7 +399,7 @@ def _draw_creation(axes: Axes, table: Table) -> None:
             axes.plot(
                 mine["speed"],
                 predicted,
-                color=THEORY_COLOUR,
+                color=base.THEORY_COLOUR,
                 lw=4,
                 alpha=0.5,
                 label=r"½T²|ω×Iω|²/I",
@@ -422,7 +408,7 @@ def _draw_creation(axes: Axes, table: Table) -> None:
             mine["speed"],
             np.maximum(mine.numbers("created"), LEAST),
             STYLES[stiffness],
-            color=METHOD_COLOURS[method],
+            color=base.METHOD_COLOURS[method],
             ms=3,
             lw=1,
             label=f"{method}, K_r = {stiffness:g}" if stiffness else "translation only",
@@ -440,50 +426,27 @@ def _draw_cut(axes: Axes, table: Table) -> None:
     widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last lie on each other
     for method, width in zip(METHODS_SHOWN, widths, strict=True):
         mine = cuts.select(cuts["method"] == method)
-        jump = mine.numbers("torque_jump")
-        is_beyond = jump > HIGHEST
-        colour = METHOD_COLOURS[method]
-        label = method
-        if is_beyond.any():
-            # a line to there would seem to end at the edge: marks say that it does not
-            axes.plot(
-                mine["speed"][is_beyond],
-                np.full(is_beyond.sum(), 0.97 * HIGHEST),
-                "^",
-                color=colour,
-                ms=5,
-            )
-            label = f"{method} (▲ beyond: to {jump[is_beyond].max():.1g})"
-        shown = np.where(is_beyond, np.nan, jump)
-        axes.plot(mine["speed"], shown, "o-", color=colour, ms=3, lw=width, label=label)
-    axes.axvline(cut_speed(SOFT), color=THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
-    axes.axhline(2 * np.pi * SOFT, color=THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
-    axes.set_ylim(0, HIGHEST)
-    axes.set_xlabel("speed of a sudden turn (rad/s)")
-    axes.set_ylabel("largest jump of torque\nin a tick (N m)")
+        # the weld's jumps lie far beyond the others': they are drawn at the upper edge
+        jump = np.minimum(mine.numbers("torque_jump"), 0.97 * HIGHEST)
+        colour = base.METHOD_COLOURS[method]
+        axes.plot(mine["speed"], jump, "o-", color=colour, ms=3, lw=width, label=method)
+    axes.axvline(cut_speed(SOFT), color=base.THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
+    axes.axhline(2 * np.pi * SOFT, color=base.THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
+    axes.set(
+        xlabel="speed of a sudden turn (rad/s)",
+        ylabel="largest jump of torque\nin a tick (N m)",
+        ylim=(0, HIGHEST),
+    )
     axes.legend(fontsize="x-small", loc="upper right", bbox_to_anchor=(1.0, 0.95))
 
-
-TOLD_AT = 50.0
-"""Speed in rad/s at which the paragraph says what is created: eight turns a second."""
 
 TELLING = (1e-4, 0.05)
 """Share of the kinetic energy within which creation is compared with theory: above rounding, and
 below what changes the motion."""
 
 
-def read(table: Table) -> Finding:
-    """Draws verdicts over speed and angle, creation over speed, and the jump at the cut.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "rotation")
-    boundary = _boundary(table)
-    return Finding(draw(table), _paragraph(boundary), boundary)
-
-
-def _boundary(table: Table) -> dict[str, Any]:
+def summarize(table: Table) -> dict[str, Any]:
+    """Finds where each method is passive, what translation alone creates, and the cut at π."""
     cells = table.select(table["what"] == "cell")
     free = table.select((table["what"] == "line") & (table["rotational_stiffness"] == 0))
     predicted = np.array([free_creation(float(speed)) for speed in free["speed"]])
@@ -558,78 +521,41 @@ def _strict_share(cells: Table, method: str) -> float | None:
     return float(np.mean(cells.texts("environment")[rows] == "strict")) if rows.any() else None
 
 
-def _paragraph(boundary: Mapping[str, Any]) -> str:
-    said = [_of_method(name, boundary) for name in METHODS_SHOWN]
-    said += [_of_translation(boundary["translation_only"]), *_of_cut(boundary["cut"])]
-    return f"With K_r = {SOFT:g} N m/rad: " + ". ".join(said) + "."
-
-
-def _of_translation(free: Mapping[str, Any]) -> str:
-    if not free["speed"]:
-        return f"In translation alone {MISSING}"
-    usual = int(np.argmin(np.abs(np.asarray(free["speed"]) - TOLD_AT)))
-    text = (
-        f"Coupled in translation alone, the tool creates {free['created'][usual]:.2g} J in 1 s "
-        f"at {free['speed'][usual]:.3g} rad/s, and more the faster up to "
-        f"{free['grows_up_to']:.3g} rad/s"
-    )
-    if free["largest_deviation"] is None:
-        return text
-    return (
-        f"{text}; up to {free['compared_up_to']:.3g} rad/s, where that is little next to its "
-        f"own energy, it is ½T²|ω × Iω|²/I a step within {100 * free['largest_deviation']:.2g} %"
-    )
-
-
-def _of_cut(cut: Mapping[str, Any]) -> list[str]:
-    said = []
-    if cut["speed_measured"] is not None:
-        said.append(
-            f"A sudden turn passes the cut at π at {cut['speed_measured']:.4g} rad/s, predicted "
-            f"{cut['speed_predicted']:.4g} rad/s"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States where each method is passive, what translation alone creates, and the cut at π."""
+    for name in METHODS_SHOWN:
+        mine = {"name": name, "gyroscopic_speed": boundary["gyroscopic_speed"]}
+        mine |= {key: boundary[key][name] for key in ("fastest_passive", "first_passed")}
+        mine |= {"strict": boundary["share_strict_below"][name]}
+        yield "'{name}' is passive at every angle up to {fastest_passive:.3g} rad/s", mine
+        yield (
+            "'{name}' is strict in {strict:.0%} of its runs below {gyroscopic_speed:.3g} rad/s, "
+            "where the gyroscopic torque reaches what the spring gives at π",
+            mine,
         )
-    if cut["torque_jump"] is not None:
-        said.append(
-            f"Behind the cut the torque of 'implicit' flips by {cut['torque_jump']:.3g} N m within "
-            f"a tick, and it creates {cut['created']:.2g} J at most"
-        )
-    jumps = cut["largest_torque_jump"]
-    if all(jump is None for jump in jumps.values()):
-        said.append(f"Of sudden turns {MISSING}")
-    if (jumps["weld"] or 0.0) > cut["torque_jump_predicted"]:
-        said.append(
-            "The gains of a 'weld' are those of the translation; where its angle passes π its "
-            f"torque jumps by up to {jumps['weld']:.1g} N m"
-        )
-    return said
-
-
-def _of_method(name: str, boundary: Mapping[str, Any]) -> str:
-    fastest, strict = boundary["fastest_passive"][name], boundary["share_strict_below"][name]
-    passed = boundary["first_passed"][name]
-    if strict is None:
-        return f"'{name}': {MISSING}"
-    if fastest is None:
-        text = f"'{name}' is passive at every angle at no speed shown"
-    else:
-        text = f"'{name}' is passive, strictly or within its slack, at every angle up to "
-        text += f"{fastest:.3g} rad/s"
-    text += (
-        f", strict in {100 * strict:.0f} % of its runs below {boundary['gyroscopic_speed']:.3g} "
-        "rad/s, where the gyroscopic torque reaches what the spring gives at π"
-        if name == METHODS_SHOWN[0]
-        else f", strict in {100 * strict:.0f} %"
+        yield "The angle of '{name}' first passes π at {first_passed:.3g} rad/s", mine
+    yield (
+        "Coupled in translation alone, the tool creates ½T²|ω × Iω|²/I a step within "
+        "{largest_deviation:.2%} up to {compared_up_to:.3g} rad/s, and more the faster up to "
+        "{grows_up_to:.3g} rad/s",
+        boundary["translation_only"],
     )
-    if passed is None:
-        return f"{text}; its angle passes π in no run"
-    return f"{text}; its angle first passes π at {passed:.3g} rad/s"
+    cut = boundary["cut"]
+    yield (
+        "A sudden turn passes the cut at π at {speed_measured:.4g} rad/s, predicted "
+        "{speed_predicted:.4g} rad/s",
+        cut,
+    )
+    yield (
+        "Behind the cut the torque of 'implicit' flips by {torque_jump:.3g} N m within a tick, and "
+        "it creates {created:.2g} J at most",
+        cut,
+    )
+    yield (
+        "The gains of a 'weld' are those of the translation: its torque jumps by up to "
+        "{weld:.1g} N m",
+        cut["largest_torque_jump"],
+    )
 
 
-ROTATION = StabilityMap(
-    name="rotation",
-    about="angular speed of the tool and angle between handle and tool, to the cut at π",
-    default_points=1500,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+ROTATION = StabilityMap("rotation", __doc__, 1500, points, evaluate, summarize, draw, sentences)

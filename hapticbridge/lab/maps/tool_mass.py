@@ -1,4 +1,4 @@
-"""Map ``tool_mass``: how light a tool each method can render, and how heavy."""
+"""Map ``tool_mass``: mass of the tool against stiffness of the coupling, by method."""
 
 from __future__ import annotations
 
@@ -16,27 +16,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.closed_loop import LoopOutcome
-from hapticbridge.lab.maps.base import (
-    MISSING,
-    THEORY_COLOUR,
-    WIDTH,
-    Finding,
-    Point,
-    StabilityMap,
-    agreement,
-    computed,
-    draw_verdicts,
-    largest_stable,
-    limit_by_6,
-    loop_in,
-    needed_by_6,
-    per_cent,
-    set_tool_mass,
-    swinging,
-    used_damping,
-    verdict_legend,
-    verdict_numbers,
-)
+from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -73,13 +54,13 @@ def least_mass(method: str, stiffness: float, damping: float, period: float) -> 
         m in kg.
 
     Raises:
-        StudyError: The method is none of these, or a value is out of range.
+        StudyError: The method is none of these.
 
     References:
         Brown & Colgate 1997, conditions that belong to eq. (19), for the semi-implicit step; the
         other two are derived here alike.
     """
-    _check(method, stiffness, damping, period)
+    _check(method)
     kt, b = stiffness * period, damping
     if method in ("implicit", "lossless"):
         return 0.0
@@ -112,9 +93,9 @@ def felt(
         H in N/m, shaped like the angle.
 
     Raises:
-        StudyError: The method is none of these, or a value is out of range.
+        StudyError: The method is none of these.
     """
-    _check(method, stiffness, damping, period, mass)
+    _check(method)
     back = np.exp(-1j * np.asarray(angle, dtype=np.float64))
     change = 1 - back
     coupling = stiffness + damping / period * change
@@ -140,7 +121,7 @@ def worst_angle(
     handle held still (``least_mass``); else inf.
 
     Raises:
-        StudyError: The method is none of ``NAMES``, or a value is out of range.
+        StudyError: The method is none of ``NAMES``.
 
     References:
         Colgate & Schenkel 1997.
@@ -152,18 +133,9 @@ def worst_angle(
     return float(ANGLES[place]), float(needed[place]) if is_stable else float("inf")
 
 
-def _check(method: str, stiffness: float, damping: float, period: float, mass: float = 1.0) -> None:
+def _check(method: str) -> None:
     if method not in NAMES:
         raise StudyError(f"no theory for method '{method}' here; choose {choices(NAMES)}")
-    for name, value, unit in (
-        ("stiffness", stiffness, "N/m"),
-        ("period", period, "s"),
-        ("mass", mass, "kg"),
-    ):
-        if not (np.isfinite(value) and value > 0):
-            raise StudyError(f"{name} is {value!r} {unit}; it must be finite and > 0")
-    if not (np.isfinite(damping) and damping >= 0):
-        raise StudyError(f"damping is {damping!r} N s/m; it must be finite and >= 0")
 
 
 PERIOD = 1e-3
@@ -193,7 +165,7 @@ KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 HELD_STILL = 1e9
 """Mass in kg of a device that nobody moves: the handle is held still to 1e-12 m."""
 
-PATH = swinging(0.0025, 3.0, duration=2.0, count=401)
+PATH = base.swinging(0.0025, 3.0, duration=2.0, count=401)
 """Of a hand that swings the tool by 5 mm at 3 Hz, and turns nothing."""
 
 THEORIES: Mapping[str, str] = {
@@ -276,7 +248,7 @@ def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
 
 def law_damping(name: str, stiffness: float) -> float:
     """Returns B' in N s/m, which a method's law uses where ``DAMPING`` is asked for."""
-    return float(used_damping(name, stiffness, DAMPING, PERIOD))
+    return float(base.used_damping(name, stiffness, DAMPING, PERIOD))
 
 
 def coupling_of(stiffness: float) -> Coupling:
@@ -287,9 +259,9 @@ def coupling_of(stiffness: float) -> Coupling:
 def _run(
     device: SimulatedDevice, name: str, stiffness: float, mass: float, *, is_knocked: bool = True
 ) -> LoopOutcome:
-    loop = loop_in("point_mass", "tool_mass")
+    loop = base.loop_in("point_mass", "tool_mass")
     # the mass is set before every run: the loop is shared with other masses
-    set_tool_mass(loop.scene.model, "tool", mass)
+    base.set_tool_mass(loop.scene.model, "tool", mass)
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
     swing = 2 * np.pi * (mass / stiffness) ** 0.5
     return loop.run(
@@ -311,7 +283,7 @@ def _limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float 
             is_held or worst_hand(name, stiffness, mass).is_stable
         )
 
-    return _change(is_stable, WIDTH)
+    return _change(is_stable, base.WIDTH)
 
 
 def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
@@ -325,9 +297,6 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
     Returns:
         ``limit`` in kg, NaN where there is none; ``stable_if_light`` and ``stable_if_heavy``: at
         the ends of the range.
-
-    Raises:
-        StudyError: The stiffness is out of range.
     """
     theory, damping = THEORIES[name], law_damping(name, stiffness)
 
@@ -335,7 +304,7 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
         needed = worst_angle(theory, stiffness, damping, mass, PERIOD)[1]
         return np.isfinite(needed) if is_held else needed < DEVICE_DAMPING
 
-    return _change(is_stable, WIDTH / 10)
+    return _change(is_stable, base.WIDTH / 10)
 
 
 def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, float | bool]:
@@ -343,13 +312,8 @@ def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, fl
     found = {"limit": float("nan"), "stable_if_light": first, "stable_if_heavy": last}
     if first == last:
         return found
-    bracket = largest_stable(lambda mass: is_stable(mass) == first, *MASS, width)
+    bracket = base.largest_stable(lambda mass: is_stable(mass) == first, *MASS, width)
     return found | {"limit": bracket.middle}
-
-
-def of_method(table: Table, what: str, name: str) -> Table:
-    """Returns the rows of one kind of point and one method."""
-    return table.select((table["what"] == what) & (table["method"] == name))
 
 
 def is_stable(cells: Table) -> NDArray[np.bool_]:
@@ -370,28 +334,27 @@ _MARKERS = {"held still": "s", "worst hand": "o"}
 _LINES = (
     ("(6): b = K T/2 + B′", "black", "-"),
     ("implicitfast: slack used up, K = B/T", "black", "-."),
-    ("least mass by theory, held still", THEORY_COLOUR, ":"),
-    ("limit by theory, worst hand", THEORY_COLOUR, "--"),
+    ("least mass by theory, held still", base.THEORY_COLOUR, ":"),
+    ("limit by theory, worst hand", base.THEORY_COLOUR, "--"),
 )
 
 
-def draw(table: Table) -> Figure:
+def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     """Draws stiffness against mass by method, theory on top."""
     figure = new_figure(8, 7.6)
     panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
     for axes, name in zip(panels, THEORIES, strict=True):
-        cells = of_method(table, "cell", name)
-        verdict = verdict_numbers(is_stable(cells), cells.texts("environment"))
-        draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
+        cells = base.of_method(table, "cell", name)
+        verdict = base.verdict_numbers(is_stable(cells), cells.texts("environment"))
+        base.draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
         _draw_theory(axes, name)
         for what, marker in _MARKERS.items():
-            rows = of_method(table, what, name)
+            rows = base.of_method(table, what, name)
             axes.plot(
                 rows.numbers("limit"), rows["stiffness"], marker, color="black", mfc="white", ms=4.5
             )
         axes.set_title(name, fontsize="medium")
-        axes.set_xlim(*MASS)
-        axes.set_ylim(*STIFFNESS)
+        axes.set(xlim=MASS, ylim=STIFFNESS)
     for axes in panels[3:]:
         axes.set_xlabel("tool mass m (kg)")
         axes.set_xticks(np.geomspace(MASS[0], MASS[1] / 10, 4))  # the last would touch the next
@@ -404,7 +367,7 @@ def draw(table: Table) -> Figure:
         fontsize="medium",
     )
     measured = [(f"measured, {what}", "black", marker) for what, marker in _MARKERS.items()]
-    verdict_legend(figure, [*_LINES, *measured], columns=3)
+    base.verdict_legend(figure, [*_LINES, *measured], columns=3)
     return figure
 
 
@@ -425,53 +388,47 @@ def _draw_theory(axes: Axes, name: str) -> None:
         [least_mass(THEORIES[name], k, law_damping(name, k), PERIOD) for k in stiffness]
     )
     is_shown = np.isfinite(least) & (least > 0)
-    axes.plot(least[is_shown], stiffness[is_shown], color=THEORY_COLOUR, ls=":", lw=2.2)
+    axes.plot(least[is_shown], stiffness[is_shown], color=base.THEORY_COLOUR, ls=":", lw=2.2)
     axes.contour(
         mass,
         stiffness,
         # where the tool is unstable by itself no damping is enough; the cap makes that a number
         np.minimum(needed, 3 * DEVICE_DAMPING),
         levels=[DEVICE_DAMPING],
-        colors=THEORY_COLOUR,
+        colors=base.THEORY_COLOUR,
         linestyles="--",
         linewidths=1.6,
     )
     if name == "implicitfast":
         # its spring lags by a step, so E_k = K δx² − ½ m (Δv)², against a slack of ½ (K + B/T) δx²
         axes.axhline(DAMPING / PERIOD, color="black", ls="-.", lw=1.4)
-    axes.axhline(float(limit_by_6(name, DEVICE_DAMPING, PERIOD, DAMPING)), color="black", lw=1.8)
+    axes.axhline(
+        float(base.limit_by_6(name, DEVICE_DAMPING, PERIOD, DAMPING)), color="black", lw=1.8
+    )
 
 
-def read(table: Table) -> Finding:
-    """Counts what failed by method, and compares the limits in mass with theory.
-
-    A method of which no point was computed is left out, and the paragraph says so.
-
-    Raises:
-        StudyError: No point was computed at all.
-    """
-    table = computed(table, "tool_mass")
+def summarize(table: Table) -> dict[str, Any]:
+    """Counts what failed by method, and compares the limits in mass with theory."""
     methods: dict[str, dict[str, Any]] = {}
     for name in THEORIES:
-        cells = of_method(table, "cell", name)
+        cells = base.of_method(table, "cell", name)
         methods[name] = _counts(name, cells) if len(cells) else {}
         for what in SEARCHES:
-            rows = of_method(table, what, name)
+            rows = base.of_method(table, what, name)
             if len(rows):
                 methods[name][what] = _compare(name, rows, is_held=what == "held still")
-    boundary = {
+    return {
         "period": PERIOD,
         "device_damping": DEVICE_DAMPING,
         "damping": DAMPING,
         "methods": methods,
     }
-    return Finding(draw(table), _paragraph(methods), boundary)
 
 
 def _counts(name: str, cells: Table) -> dict[str, Any]:
     """Returns how many tools of the grid were unstable, and what the stable ones created."""
     stable = is_stable(cells)
-    is_below = needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
+    is_below = base.needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
     return {
         "points": len(cells),
         "unstable_held_still": int((cells.numbers("stable_held_still") != 1).sum()),
@@ -495,59 +452,27 @@ def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
         "stiffness": rows["stiffness"].tolist(),
         "measured_mass": [float(m) if np.isfinite(m) else None for m in limit],
         "predicted_mass": [float(m) if np.isfinite(m) else None for m in theory],
-        "worst_ratio_error": agreement(limit, theory),
+        "worst_ratio_error": base.agreement(limit, theory),
         "disagreements": int((~(is_same[0] & is_same[1])).sum()),
     }
 
 
-def _paragraph(methods: Mapping[str, Mapping[str, Any]]) -> str:
-    said = [_of_method(name, mine) for name, mine in methods.items()]
-    compared = [mine[what] for mine in methods.values() for what in SEARCHES if what in mine]
-    if compared:
-        known = [each["worst_ratio_error"] for each in compared]
-        worst = max((error for error in known if error is not None), default=None)
-        searches = sum(len(each["stiffness"]) for each in compared)
-        astray = sum(each["disagreements"] for each in compared)
-        said.append(
-            f"Measured limits in mass agree with theory {per_cent(worst)}; whether there is a "
-            f"limit at all, theory and measurement disagree on in {astray} of {searches} searches"
+def sentences(boundary: Mapping[str, Any]) -> Sentences:
+    """States by method what was unstable, and how far the limits in mass agree with theory."""
+    for name, mine in boundary["methods"].items():
+        yield (
+            "'{name}': held still, a tool is unstable at {unstable_held_still} of {points} points "
+            "of the grid; below (6), held still or in its worst hand, at {unstable_below_6} of "
+            "{points_below_6}; where stable, it creates at most {most_created:.2g} J",
+            mine | {"name": name},
         )
-    return ". ".join(said) + "."
+        for what in SEARCHES:
+            yield (
+                "'{name}', {what}: limits in mass agree with theory within "
+                "{worst_ratio_error:.2%}; on whether there is one they disagree "
+                "{disagreements} times",
+                mine.get(what, {}) | {"name": name, "what": what},
+            )
 
 
-def _of_method(name: str, mine: Mapping[str, Any]) -> str:
-    if not mine:
-        return f"'{name}': {MISSING}"
-    if "points" not in mine:
-        said = f"'{name}': {MISSING} on the grid"
-    else:
-        unstable = mine["unstable_held_still"]
-        held = f"unstable at {unstable} of" if unstable else "stable at all"
-        said = (
-            f"'{name}': held still, a tool is {held} {mine['points']} points of the grid; below "
-            f"(6), held still or in its worst hand, it is unstable at {mine['unstable_below_6']} "
-            f"of {mine['points_below_6']}; where stable, it creates at most "
-            f"{mine['most_created']:.2g} J"
-        )
-    for what in SEARCHES:
-        if what not in mine:
-            said += f"; {what}, limits: {MISSING}"
-    limits = mine.get("held still", {}).get("measured_mass", [])
-    found = [mass for mass in limits if mass is not None]
-    if found:
-        said += (
-            f". Held still, stability changes with the mass at {len(found)} of the {len(limits)} "
-            f"stiffnesses that were searched: at {1e3 * min(found):.3g} to "
-            f"{1e3 * max(found):.3g} g"
-        )
-    return said
-
-
-TOOL_MASS = StabilityMap(
-    name="tool_mass",
-    about="mass of the tool, 1 g to 10 kg, against stiffness of the coupling, by method",
-    default_points=1000,
-    points=points,
-    evaluate=evaluate,
-    read=read,
-)
+TOOL_MASS = StabilityMap("tool_mass", __doc__, 1000, points, evaluate, summarize, draw, sentences)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hapticbridge.lab.paper.section import Check, Curve, Section, Table, panels
+from hapticbridge.lab.paper.section import Check, Section, Table, explained, panels
 from hapticbridge.theory.impact import Impact, ImpactBody, Law, resolve_impact
 
 ROD = ImpactBody(1.0, 1 / 12, np.array([-0.5, -0.5]) / np.sqrt(2))
@@ -101,14 +101,15 @@ def _drawn(impacts: dict[Law, Impact], gains: dict[Law, _Array], share: dict[Law
             label=f"{law}: gains in {100 * share[law]:.2g} %",
         )
     path.axvline(0.325, color="grey", lw=0.8, ls="--", label="end of compression")
-    path.set_xlabel("normal impulse P_n (N s)")
-    path.set_ylabel("tangential impulse P_t (N s)")
+    path.set(xlabel="normal impulse P_n (N s)", ylabel="tangential impulse P_t (N s)")
     path.legend(fontsize="x-small", loc="upper left")
     path.set_ylim(-0.45, 0.55)
     histogram.axvline(0, color="k", lw=0.8)
-    histogram.set_yscale("log")
-    histogram.set_xlabel("change of energy over ½ m v² (%)")
-    histogram.set_ylabel("share of random impacts (%)")
+    histogram.set(
+        yscale="log",
+        xlabel="change of energy over ½ m v² (%)",
+        ylabel="share of random impacts (%)",
+    )
     histogram.legend(fontsize="x-small", loc="upper left")
     return figure
 
@@ -179,7 +180,18 @@ def _checks_of_random_rods(share: dict[Law, float]) -> list[Check]:
 
 
 def section() -> Section:
-    """Walks through the impact argument."""
+    """Walks through the impact argument.
+
+    A uniform rod of 1 kg and 1 m, tilted by 45°, hits the ground with its lower tip; μ = 0.75,
+    e = 0.9, (v_t, v_n) = (0.8, −1) m/s. The tip slides, then sticks while the impact still
+    lasts, and from then on friction turns tangential motion into normal motion. Newton's law
+    asks for a normal velocity that does not know of this, and the rod leaves with more energy
+    than it had.
+
+    Routh's path with Poisson's or Stronge's end never gains. An impact is part of the
+    environment, so its law must be as passive as the integrator. MuJoCo has no law of
+    restitution (its contact is soft), so there is nothing to run in the loop here.
+    """
     gains = _random_gains()
     # rounding of two joules that cancel
     share = {law: float(np.mean(gain > 1e-12)) for law, gain in gains.items()}
@@ -197,24 +209,11 @@ def section() -> Section:
             "Stronge:&ensp;W<sub>r</sub> = −e² W<sub>c</sub>",
             "ΔKE = ½ P·(v⁻ + v⁺)",
         ),
-        paragraphs=(
-            "A uniform rod of 1 kg and 1 m, tilted by 45°, hits the ground with its lower tip; "
-            "μ = 0.75, e = 0.9, (v<sub>t</sub>, v<sub>n</sub>) = (0.8, −1) m/s. The tip slides, "
-            "then sticks while the impact still lasts, and from then on friction turns tangential "
-            "motion into normal motion. Newton's law asks for a normal velocity that does not know "
-            "of this, and the rod leaves with more energy than it had.",
-            "Routh's path with Poisson's or Stronge's end never gains. An impact is part of the "
-            "environment, so its law must be as passive as the integrator. MuJoCo has no law "
-            "of restitution (its contact is soft), so there is nothing to run in the loop here.",
-        ),
-        curves=(
-            Curve(
-                "impact",
-                "Left: the rod's impulses and where each law ends. Right: change of energy of "
-                f"{IMPACTS // 1000} 000 random rods; v is the velocity of the tip.",
-                _drawn(impacts, gains, share),
-            ),
-        ),
+        paragraphs=explained(section.__doc__),
+        name="impact",
+        caption="Left: the rod's impulses and where each law ends. Right: change of energy of "
+        f"{IMPACTS // 1000} 000 random rods; v is the velocity of the tip.",
+        figure=_drawn(impacts, gains, share),
         checks=tuple(checks),
         table=Table(
             (

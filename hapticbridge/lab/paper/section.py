@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ class Check:
     route: str
     expected: float
     got: float
-    tolerance: float
+    tolerance: float = 1e-9
     unit: str = ""
     relation: Relation = "equals"
 
@@ -70,21 +71,6 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Curve:
-    """A figure with its place and its caption.
-
-    Attributes:
-        name: Name of its file, without ending.
-        caption: What it shows, one or two sentences.
-        figure: The drawing.
-    """
-
-    name: str
-    caption: str
-    figure: Figure
-
-
-@dataclass(frozen=True, slots=True)
 class Table:
     """Numbers side by side.
 
@@ -101,14 +87,16 @@ class Table:
 class Section:
     """What the page says about one equation, or a few that belong together.
 
-    Formulas and paragraphs are HTML of the package's own; nothing of a user's may enter them.
+    Formulas are HTML of the package's own; nothing of a user's may enter them.
 
     Attributes:
         equation: Their numbers in the paper, ``(15), (16)``; empty for what the paper only names.
         title: What they are about.
         formulas: The equations, one line each.
         paragraphs: What they mean and how they are checked here.
-        curves: Figures.
+        name: Name of the figure's file, without ending.
+        caption: What the figure shows, one or two sentences.
+        figure: The drawing.
         checks: Numbers by two routes.
         table: Numbers side by side, if any.
     """
@@ -117,9 +105,17 @@ class Section:
     title: str
     formulas: tuple[str, ...]
     paragraphs: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    name: str
+    caption: str
+    figure: Figure
     checks: tuple[Check, ...]
     table: Table | None = None
+
+
+def explained(doc: str | None, **numbers: float) -> tuple[str, ...]:
+    """Returns the paragraphs below the summary of a section's docstring, numbers filled in."""
+    _, *paragraphs = inspect.cleandoc(doc or "").split("\n\n")
+    return tuple(" ".join(each.split()).format(**numbers) for each in paragraphs)
 
 
 def panels(rows: int, *, height: float, columns: int = 1) -> tuple[Figure, tuple[Axes, ...]]:
@@ -174,10 +170,9 @@ def write_walk(sections: Sequence[Section], folder: Path) -> Path:
         HapticBridgeError: A file cannot be written.
     """
     for section in sections:
-        for curve in section.curves:
-            write_picture(curve.figure, folder / f"{curve.name}.png")
-            # the places just found serve the page too; finding them takes half of the drawing
-            curve.figure.set_layout_engine("none")
+        write_picture(section.figure, folder / f"{section.name}.png")
+        # the places just found serve the page too; finding them takes half of the drawing
+        section.figure.set_layout_engine("none")
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()
     )

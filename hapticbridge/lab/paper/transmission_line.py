@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.lab.paper.section import Check, Curve, Section, Table, panels
+from hapticbridge.lab.paper.section import Check, Section, Table, explained, panels
 from hapticbridge.theory.bounds import maximum_stiffness
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit, threshold
 from hapticbridge.theory.spectrum import damping_spectrum
@@ -87,7 +87,16 @@ def _stiffest(trip: int) -> float:
 
 
 def section() -> Section:
-    """Shows whether the line buys stiffness."""
+    """Shows whether the line buys stiffness.
+
+    A line that carries waves replaces the spring and damper. Ended by the device's own damping
+    it is passive for b ≥ Z, for any hand and any discrete-time passive environment, at every
+    frequency alike.
+
+    But with one sample each way its static stiffness is b/T, half of a spring's 2b/T: {line:g}
+    N/m instead of {spring:g} N/m for b = {impedance:g} N s/m at 1 kHz. Only a line that returns
+    within one sample, which is a plain spring, reaches as much.
+    """
     omega = THETA / PERIOD
     hertz = THETA / np.pi * 0.5 / PERIOD
     figure, (spectrum, stiffness) = panels(1, height=4.0, columns=2)
@@ -115,8 +124,7 @@ def section() -> Section:
     for trip in ROUND_TRIPS:
         line = np.asarray(transmission_line_stiffness(damping, PERIOD, round_trip=trip))
         stiffness.plot(damping, 1e-3 * line, label=f"line, {_samples(trip)} there and back")
-    stiffness.set_xlabel("device damping b (N s/m)")
-    stiffness.set_ylabel("largest static stiffness (N/mm)")
+    stiffness.set(xlabel="device damping b (N s/m)", ylabel="largest static stiffness (N/mm)")
     stiffness.legend(fontsize="x-small", loc="upper left")
 
     checks = []
@@ -144,7 +152,6 @@ def section() -> Section:
                 expected=_stiffest(trip),
                 got=_static(trip),
                 unit="N/m",
-                tolerance=1e-9,
             )
         )
     best = float(maximum_stiffness(IMPEDANCE, PERIOD))
@@ -166,22 +173,11 @@ def section() -> Section:
             "&ensp;b(θ) = Z cos θ",
             "K = 2Z/(nT), n samples there and back",
         ),
-        paragraphs=(
-            "A line that carries waves replaces the spring and damper. Ended by the "
-            "device's own damping it is passive for b ≥ Z, for any hand and any discrete-time "
-            "passive environment, at every frequency alike.",
-            f"But with one sample each way its static stiffness is b/T, half of a spring's 2b/T: "
-            f"{float(equal):g} N/m instead of {best:g} N/m for b = {IMPEDANCE:g} N s/m at 1 kHz. "
-            "Only a line that returns within one sample, which is a plain spring, reaches as much.",
-        ),
-        curves=(
-            Curve(
-                "transmission_line",
-                f"Left: damping needed over frequency, Z = {IMPEDANCE:g} N s/m. Right: what a "
-                "device allows.",
-                figure,
-            ),
-        ),
+        paragraphs=explained(section.__doc__, line=float(equal), spring=best, impedance=IMPEDANCE),
+        name="transmission_line",
+        caption=f"Left: damping needed over frequency, Z = {IMPEDANCE:g} N s/m. Right: what a "
+        "device allows.",
+        figure=figure,
         checks=tuple(checks),
         table=Table(
             ("coupling", "largest static stiffness at b = 2 N s/m, 1 kHz (N/m)"),

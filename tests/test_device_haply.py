@@ -1,0 +1,364 @@
+"""The Haply driver against a service written from its documentation: virtual time, real sockets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated.haply_service import CENTRE, HaplyService, serving
+from haply_cases import PERIOD, Bench
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticbridge.device import SimulatedDevice, open_device
+from hapticbridge.device import watchdog as silence
+from hapticbridge.device.haply import device as haply
+from hapticbridge.device.haply import messages
+from hapticbridge.device.haply.device import FORCE_LIMIT, HaplyDevice
+from hapticbridge.device.trajectory import Motion
+from hapticbridge.device.transport import websocket as transport
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+
+FORCE = np.array([0.4, -0.3, 0.2, 9.0, 9.0, 9.0])
+
+
+def ticks(bench: Bench, device: HaplyDevice, count: int, wrench: np.ndarray = FORCE) -> list[int]:
+    """Runs a loop of that many ticks; returns the flags of its reads."""
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    flags = []
+    for _ in range(count):
+        bench.time.advance(bench.time.now + PERIOD)
+        flags.append(device.read(sample))
+        device.write(wrench)
+    return flags
+
+
+def started(*mechanics: SimulatedDevice, **options: float) -> tuple[Bench, HaplyDevice]:
+    bench = Bench(*mechanics, **options)
+    device = bench.opened()
+    device.start(PERIOD)
+    return bench, device
+
+
+def test_the_filters_are_set_and_said() -> None:
+    bench = Bench()
+    (inverse,) = bench.service.devices.values()
+    inverse.damping = 5.0  # somebody's
+    bench.opened(force_gate=0.1)
+    assert (inverse.gate_gain, inverse.damping) == (0.1, 0.0)
+    assert bench.service.profile == "hapticbridge"
+    (said,) = bench.told
+    assert "force_gate.gain set to 0.1, damping.scalar to 0 (force_gate.gain was 0.3" in said
+    assert "damping.scalar was 5" in said
+    assert "oscillation damper cannot be switched off" in said
+
+
+def test_a_service_of_before_is_spoken_to_in_its_own_words() -> None:
+    bench = Bench()
+    bench.service.is_old = True
+    device = bench.opened()
+    device.start(PERIOD)
+    ticks(bench, device, 3)
+    assert "older than 3.5" in bench.told[0]
+    assert bench.service.forces[-1] == FORCE[:3].tolist()
+
+
+def test_each_tick_sends_one_force_and_reads_one_state() -> None:
+    bench, device = started(resolution=1e-5)
+    before = bench.service.messages
+    assert ticks(bench, device, 50)[1:] == [0] * 49
+    bench.time.advance(bench.time.now + PERIOD)
+    assert bench.service.messages - before == 50
+    assert bench.service.forces[-50:] == [FORCE[:3].tolist()] * 50
+    assert device.held_back == 0
+
+
+def test_the_pose_is_the_services_and_nothing_turns() -> None:
+    bench = Bench()
+    device = bench.opened()
+    sample = device.start(PERIOD)
+    (inverse,) = bench.service.devices.values()
+    bench.service.buttons = {"a": True, "b": False, "c": True}
+    ticks(bench, device, 30)
+    bench.time.advance(bench.time.now + PERIOD)
+    told = CENTRE + inverse.handle.pose()[0]
+    device.read(sample)
+    np.testing.assert_allclose(sample["position"][0], told, atol=2e-4)
+    np.testing.assert_array_equal(sample["quaternion"][0], (1.0, 0.0, 0.0, 0.0))
+    assert sample["buttons"][0] == 0b101
+
+
+def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> None:
+    bench, device = started(work=2.7e-3)
+    assert device.info.rate == pytest.approx(1 / 2.7e-3, rel=0.01)
+    flags = ticks(bench, device, 300)
+    missed = 300 * (1 - 1 / 2.7)
+    assert np.count_nonzero(flags) == pytest.approx(missed, abs=4)
+    assert device.held_back == pytest.approx(missed, abs=6)
+    sample, wrench, answers = np.zeros(1, SAMPLE_DTYPE), np.zeros(6), 0
+    for k in range(100):
+        bench.time.advance(bench.time.now + PERIOD)
+        if device.read(sample) == 0 and k > 10:
+            (entry,) = json.loads(bench.link.last_sent)["inverse3"]
+            assert entry["commands"]["set_cursor_force"]["vector"]["x"] == 0.01 * (k - 1)
+            answers += 1
+        wrench[0] = 0.01 * k
+        device.write(wrench)
+    assert answers > 20
+
+
+@pytest.mark.parametrize(("travel", "work"), [(1e-4, 5e-5), (4e-4, 1e-4), (8e-4, 5e-4)])
+def test_rate_and_delay_are_measured(travel: float, work: float) -> None:
+    device = Bench(travel=travel, work=work).opened()
+    round_trip = 2 * travel + work
+    assert device.info.delay == pytest.approx(round_trip, rel=0.02)
+    assert device.info.rate == pytest.approx(min(1 / work, 2 / round_trip), rel=0.05)
+
+
+def test_the_force_that_answers_a_sample_acts_within_the_delay_that_is_stated() -> None:
+    bench, device = started(travel=2e-4)
+    ticks(bench, device, 5, np.zeros(6))
+    (inverse,) = bench.service.devices.values()
+    device.write(FORCE)
+    assert not inverse.force.any()
+    bench.time.advance(bench.time.now + 2e-4)
+    np.testing.assert_array_equal(inverse.force, FORCE[:3])
+
+
+def test_closing_leaves_no_force_and_may_be_done_twice() -> None:
+    bench, device = started()
+    ticks(bench, device, 20)
+    (inverse,) = bench.service.devices.values()
+    assert inverse.force.any()
+    device.close()
+    device.close()
+    assert not inverse.force.any()
+    assert bench.link.is_closed
+
+
+def test_a_silent_service_is_lost_after_50_ms_and_not_before() -> None:
+    bench, device = started()
+    ticks(bench, device, 5)
+    bench.link.is_silent = True
+    stale = int(TickFlag.STALE_SAMPLE)
+    assert ticks(bench, device, 45)[3:] == [stale] * 42
+    with pytest.raises(DeviceLost, match="has not answered for 50 ms"):
+        ticks(bench, device, 10)
+
+
+def test_a_loop_that_was_away_finds_the_service_alive() -> None:
+    bench, device = started()
+    ticks(bench, device, 5)
+    bench.time.advance(bench.time.now + 0.5)
+    assert ticks(bench, device, 5) == [0] * 5
+    device.start(PERIOD)
+    bench.time.advance(bench.time.now + 0.5)  # before the loop's first question
+    assert ticks(bench, device, 5) == [0] * 5
+
+
+@pytest.mark.parametrize(("stall", "is_asked_anew"), [(0.04, False), (0.2, True)])
+def test_after_a_stall_pose_and_force_are_fresh(stall: float, is_asked_anew: bool) -> None:
+    path = Motion([0.0, 2.0], [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)])
+    # slower than the loop: a force waits
+    bench, device = started(SimulatedDevice(path=path), work=3e-3)
+    ticks(bench, device, 300)
+    end = bench.time.now + stall
+    bench.time.advance(end)
+    late, sample = len(bench.service.forces), np.zeros(1, SAMPLE_DTYPE)
+    assert device.read(sample) == 0
+    here = CENTRE + bench.service.devices["049D"].handle.pose()[0]
+    assert (np.linalg.norm(sample["position"][0] - here) < 2e-3) == is_asked_anew
+    if is_asked_anew:
+        assert bench.service.forces[late:] == [[0.0, 0.0, 0.0]]
+        assert bench.time.now - end < 0.01
+    else:  # it waits for nothing
+        assert bench.time.now == pytest.approx(end, abs=1e-9)
+
+
+def at(**place: str) -> str:
+    """Returns an answer with a position, written as JSON or nearly so."""
+    numbers = ", ".join(f'"{axis}": {place.get(axis, 0)}' for axis in "xyz")
+    return '{"inverse3": [{"device_id": "049D", "state": {"cursor_position": {' + numbers + "}}}]}"
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "words"),
+    [
+        ("{", DeviceError, "is not a JSON object"),
+        ("[" * 5000, DeviceError, "is not a JSON object"),
+        ("[1]", DeviceError, "is not a JSON object"),
+        ("{}", DeviceLost, "does not list it any more"),
+        ('{"inverse3": 3}', DeviceError, "lists invalid devices"),
+        ('{"inverse3": [{"device_id": "049D"}]}', DeviceError, "reports no position"),
+        *((answer, DeviceError, "reports no position")
+          for answer in (at(x="NaN"), at(z="NaN"), at(x="1e999"), at(x="true"))),
+    ],
+)  # fmt: skip
+def test_answer_that_is_none_ends_run(answer: str, error: type[DeviceError], words: str) -> None:
+    bench, device = started()
+    ticks(bench, device, 5)
+    bench.service.spoil[bench.service.messages + 2] = answer
+    with pytest.raises(error, match=words):
+        ticks(bench, device, 5)
+
+
+number = st.floats() | st.integers() | st.booleans() | st.text(max_size=3) | st.none()
+vector = st.dictionaries(st.sampled_from("xyz"), number)
+told = st.fixed_dictionaries(
+    {
+        "inverse3": st.lists(
+            st.fixed_dictionaries(
+                {
+                    "device_id": st.sampled_from(["049D", "x"]),
+                    "state": st.dictionaries(
+                        st.sampled_from(["cursor_position", "other"]), vector | number
+                    )
+                    | number,
+                }
+            ),
+            max_size=2,
+        )
+        | number
+    }
+)
+
+
+@given(st.text() | told.map(json.dumps))
+def test_whatever_comes_the_position_is_finite_or_there_is_none(message: str) -> None:
+    for read in (lambda: messages.state(message, "049D"), lambda: messages.inventory(message)):
+        try:
+            found = read()
+        except DeviceError as error:
+            assert "\n" not in str(error)
+            continue
+        if isinstance(found, messages.State):
+            assert np.isfinite(found.position).all()
+
+
+def test_one_of_several_is_chosen_by_its_number() -> None:
+    bench = Bench(SimulatedDevice(), SimulatedDevice())
+    with pytest.raises(DeviceError, match="choose one with serial=, one of '049D', '049E'"):
+        bench.opened()
+    assert bench.link.is_closed
+    with pytest.raises(DeviceError, match="no device 'haply' has serial '77'"):
+        bench.opened(serial="77")
+    device = bench.opened(serial="049E")
+    device.start(PERIOD)
+    ticks(bench, device, 10)
+    assert device.info.serial == "049E"
+    first, second = bench.service.devices.values()
+    assert second.force.any()
+    assert not first.force.any()
+
+
+@pytest.mark.parametrize("device_id", ["", "../049D", 7, None, "x" * 65])
+def test_a_number_that_is_no_name_is_refused(device_id: object) -> None:
+    told = {"session_id": 1, "inverse3": [{"device_id": device_id}]}
+    with pytest.raises(DeviceError, match="without a device_id"):
+        messages.inventory(json.dumps(told))
+
+
+def test_a_service_without_devices_says_so() -> None:
+    bench = Bench()
+    bench.service.devices.clear()
+    with pytest.raises(
+        DeviceError, match=r"no device 'haply' is plugged in \(looked for a device of the Inverse"
+    ):
+        bench.opened()
+
+
+def test_scaled_positions_are_refused_because_their_work_is_none() -> None:
+    bench = Bench()
+    told = json.loads(bench.service.inventory())
+    told["inverse3"][0]["config"]["mount"]["scale"]["y"] = 2
+    (listed,) = messages.inventory(json.dumps(told))
+    assert listed.is_scaled
+    with pytest.raises(DeviceError, match="scales the positions of 049D"):
+        messages.refuse_scaled(listed)
+    (listed,) = messages.inventory(bench.service.inventory())
+    messages.refuse_scaled(listed)
+
+
+def test_numbers_and_limits_come_from_whoever_knows_them() -> None:
+    info = Bench().opened().info
+    assert (info.mass, info.damping, info.friction, info.resolution) == (None,) * 4
+    assert (info.force_limit, info.axes, info.is_real) == (FORCE_LIMIT, ("x", "y", "z"), True)
+    info = Bench().opened(damping=1.2, force_limit=5.0).info
+    assert (info.damping, info.force_limit) == (1.2, 5.0)
+    with pytest.raises(DeviceError, match="damping = -1"):
+        Bench().opened(damping=-1)
+
+
+def test_a_slow_loop_is_refused() -> None:
+    with pytest.raises(DeviceError, match="the rate must be at least 50 Hz"):
+        Bench().opened().start(0.021)
+
+
+def test_real_sockets_run_and_are_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(silence, "SILENCE", 5.0)  # a busy machine stalls for longer than 50 ms
+    service = HaplyService({"049D": SimulatedDevice(damping=50.0)}, resolution=1e-6)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    log = tmp_path / "wire.log"
+    with serving(service) as (port, drop):
+        place = ("localhost", port)
+        assert haply.medium(place) == f"the Inverse Service runs at localhost:{port}"
+        (plugged,) = haply.find(place)
+        assert str(plugged) == "inverse3 (serial 049D)"
+        device = open_device(f"haply:service=localhost:{port},log={log},damping=1")
+        assert device.info.rate is not None
+        device.start(PERIOD)
+        fresh = 0
+        wait = threading.Event()
+        for _ in range(40):
+            wait.wait(2e-3)
+            fresh += device.read(sample) == 0
+            device.write(FORCE)
+        assert fresh > 0
+        assert service.forces[-1] == FORCE[:3].tolist()
+        device.close()
+        assert service.forces[-1] == [0.0, 0.0, 0.0]
+        device = open_device(f"haply:service=localhost:{port}")
+        device.start(PERIOD)
+        drop.set()
+        with pytest.raises(DeviceLost, match="closed the connection"):
+            for _ in range(1000):
+                device.write(FORCE)
+                wait.wait(1e-3)
+                device.read(sample)
+        device.close()
+    assert " > 7b" in log.read_text()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_no_service_socket_or_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    with pytest.raises(DeviceError, match=f"does not run: no answer at localhost:{port}"):
+        open_device(f"haply:service=localhost:{port}")
+    assert haply.find(("localhost", port)) == []
+    assert "does not run" in haply.medium(("localhost", port))
+    with socket.create_server(("localhost", 0)) as mute:
+
+        def answer() -> None:
+            peer, _ = mute.accept()
+            peer.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
+            peer.close()
+
+        threading.Thread(target=answer, daemon=True).start()
+        with pytest.raises(DeviceError, match="is not the Inverse Service"):
+            open_device(f"haply:service=localhost:{mute.getsockname()[1]}")
+    for wrong in ("localhost:x", "localhost:0", "localhost:70000"):
+        with pytest.raises(DeviceError, match="must be HOST:PORT"):
+            open_device(f"haply:service={wrong}")
+    monkeypatch.setattr(transport, "websocket_client", lambda: None)
+    with pytest.raises(DeviceError, match=r"pip install 'hapticbridge\[haply\]'"):
+        open_device(f"haply:service=localhost:{port}")

@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated.hid_seam import HidSeam
+from emulated.rawhid_model import NAN, Claims, RawHid, crc
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rawhid_cases import PERIOD, opened, paddle
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.base import AXES
+from hapticbridge.device.family import ignore_message
+from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
+from hapticbridge.device.watchdog import SILENCE
+from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+
+STALE = int(TickFlag.STALE_SAMPLE)
+PUSH = np.array([1.0, 2.0, 3.0, 0.01, 0.02, 0.03])
+
+
+def still(claims: Claims | None = None, **options: object) -> tuple[RawHidDevice, RawHid, HidSeam]:
+    """Returns a device that reports what the test tells it, started and just about to be read."""
+    device, model, seam = opened(RawHid(None, claims), **options)
+    device.start(PERIOD)
+    return device, model, seam
+
+
+def read(device: RawHidDevice, seam: HidSeam, seconds: float = PERIOD) -> tuple[int, np.void]:
+    sample: NDArray[np.void] = np.zeros(1, SAMPLE_DTYPE)
+    seam.advance(seam.now + seconds)
+    return device.read(sample), sample[0]
+
+
+def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
+    info = opened(paddle())[0].info
+    assert (info.name, info.axes, info.is_real) == ("paddle", ("x",), True)
+    assert (info.damping, info.resolution, info.force_limit) == (0.8, 1.5e-5, 4.0)
+    assert (info.mass, info.friction, info.rotational_damping, info.delay) == (None,) * 4
+    info = opened(paddle(), damping=0.4, mass=0.06)[0].info  # the user goes first
+    assert (info.damping, info.mass, info.force_limit) == (0.4, 0.06, 4.0)
+    info = opened(RawHid(None, Claims(delay=5e-4)))[0].info
+    # what the device adds, a state of one period's age, and 1 ms on the bus each way
+    assert (info.axes, info.delay) == (AXES, pytest.approx(5e-4 + 1e-3 + 2e-3))
+    # what does not move along a line needs no limit of force
+    info = opened(RawHid(None, Claims(axes=0b100000, force_limit=NAN)))[0].info
+    assert (info.axes, info.force_limit > 0.0) == (("rz",), True)
+
+
+@pytest.mark.parametrize(
+    ("claims", "words"),
+    [
+        (Claims(force_limit=NAN), "does not report its force_limit"),
+        (Claims(torque_limit=NAN), "does not report its torque_limit"),
+        (Claims(speed_limit=NAN), "does not report its speed_limit"),
+        (Claims(rate=NAN), "does not report its rate"),
+        (Claims(mass=-1.0), "reports an impossible data sheet: mass = -1.0"),
+        (Claims(axes=0), "reports an impossible data sheet: axes"),
+        (Claims(axes=64), "reports an impossible data sheet: axes"),
+    ],
+)
+def test_a_sheet_without_what_nobody_can_guess_is_refused(claims: Claims, words: str) -> None:
+    with pytest.raises(DeviceError, match=words):
+        opened(RawHid(None, claims))
+
+
+def test_one_that_does_not_speak_the_protocol_or_another_version_is_refused() -> None:
+    class Mute(RawHid):
+        def output(self, report: bytes, now: float) -> None:
+            """Takes no notice."""
+
+    with pytest.raises(DeviceError, match=r"does not answer by the protocol .*rawhid\.md"):
+        opened(Mute())
+
+    class Newer(RawHid):
+        def push(self, report: bytes) -> None:
+            body = report[:1] + b"\x02" + report[2:62]
+            super().push(body + crc(body).to_bytes(2, "little"))
+
+    with pytest.raises(DeviceError, match="speaks version 2 of the raw HID protocol; version 1 is"):
+        opened(Newer())
+
+
+def test_another_teensy_interface_and_another_serial_are_not_taken_for_it() -> None:
+    class Serial(RawHid):
+        report_descriptor = bytes.fromhex("06c9ff 0904 a101 c0")
+
+    with pytest.raises(DeviceError, match="no device 'rawhid' is plugged in"):
+        opened(Serial())
+    first, second = RawHid(serial="A"), RawHid(serial="B")
+    with pytest.raises(DeviceError, match=r"2 devices 'rawhid' .* one of 'A', 'B'"):
+        open_rawhid({}, ignore_message, HidSeam(first, second))
+    with pytest.raises(DeviceError, match="no device 'rawhid' has serial 'C'; plugged in: 'A', "):
+        open_rawhid({"serial": "C"}, ignore_message, HidSeam(first, second))
+    open_rawhid({"serial": "B"}, ignore_message, HidSeam(first, second)).start(PERIOD)
+    assert first.commands == 0
+
+
+def test_the_pose_is_the_devices_and_axes_it_lacks_stay_where_they_are() -> None:
+    numbers = (0.01, -0.02, 0.03, 0.4, -0.5, 0.6, *[1.0] * 6)
+    for axes in (0b111111, 0b000001, 0b100100, 0b011000):
+        device, model, seam = still(Claims(axes=axes))
+        model.motion, model.buttons = numbers, 5
+        flag, sample = read(device, seam)
+        has = np.array([float(axes >> i & 1) for i in range(6)])
+        np.testing.assert_allclose(sample["position"], has[:3] * numbers[:3], rtol=1e-7)
+        x, y, z, w = Rotation.from_rotvec(has[3:] * numbers[3:6]).as_quat(canonical=True)
+        np.testing.assert_allclose(sample["quaternion"], (w, x, y, z), atol=1e-7)
+        assert (flag, sample["buttons"]) == (0, 5)
+        np.testing.assert_array_equal(device.velocity, has)
+
+
+def test_a_wrench_arrives_on_the_axes_that_there_are() -> None:
+    for axes in (0b111111, 0b000001, 0b110110):
+        device, model, _ = still(Claims(axes=axes))
+        device.write(PUSH)
+        has = np.array([float(axes >> i & 1) for i in range(6)])
+        np.testing.assert_allclose(model.wrench, has * PUSH, rtol=1e-7)
+        assert model.is_enabled
+
+
+def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
+    device, model, seam = still()
+    read(device, seam)
+    model.lose = set(range(model.frames + 3, model.frames + 6))
+    flags = [read(device, seam)[0] for _ in range(10)]
+    assert flags.count(STALE) == 3
+    assert (device.states.lost, device.states.damaged) == (3, 0)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 2])
+def test_losses_are_counted_across_the_sequences_wrap(lost: int) -> None:
+    device, model, seam = still()
+    read(device, seam)
+    model._sequence = 65533
+    read(device, seam)  # 65534
+    before = device.states.lost
+    model.lose = set(range(model.frames + 2, model.frames + 2 + lost))  # 0, 1
+    for _ in range(5):
+        read(device, seam)
+    assert device.states.lost - before == lost
+
+
+def test_a_frame_with_a_wrong_crc_is_dropped_counted_and_missed() -> None:
+    device, model, seam = still()
+    read(device, seam)
+    model.motion = (0.5,) * 12
+    model.damage = {model.frames + 1}
+    flag, sample = read(device, seam)
+    assert (flag, device.states.damaged) == (STALE, 1)
+    assert sample["position"][0] == 0.0
+    flag, sample = read(device, seam)
+    assert (flag, device.states.lost, sample["position"][0]) == (0, 1, 0.5)
+
+
+def test_a_repeated_frame_is_nothing_new() -> None:
+    device, model, seam = still()
+    model.advance(seam.now + PERIOD)
+    (report,) = [model.take_report()]
+    assert report is not None
+    for _ in range(2):
+        model.push(report)
+    assert device.read(np.zeros(1, SAMPLE_DTYPE)) == 0
+    model.push(report)
+    assert device.read(np.zeros(1, SAMPLE_DTYPE)) == STALE
+    assert (device.states.repeated, device.states.lost) == (2, 0)
+
+
+def test_after_a_pause_the_pose_is_a_fresh_one_though_the_queue_is_full_of_old_ones() -> None:
+    device, model, seam = still()
+    for pause in (0.5, 2.0):  # as long as compiling takes, and a stall in mid-run
+        model.motion = (0.1,) * 12
+        seam.advance(seam.now + pause)
+        model.motion = (0.2,) * 12
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        before = seam.now
+        assert device.read(sample) == 0
+        assert sample[0]["position"][0] == np.float32(0.2)
+        assert seam.now - before <= 2.1e-3
+    assert device.states.lost == pytest.approx(
+        2000 - 63, abs=2
+    )  # of the stall; the first is no loss
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e31])
+def test_a_number_that_is_not_finite_ends_the_run(value: float) -> None:
+    for place in range(12):
+        device, model, seam = still()
+        model.motion = tuple(value if i == place else 0.0 for i in range(12))
+        with pytest.raises(DeviceError, match="reports a number that is not finite"):
+            read(device, seam)
+
+
+def test_a_fault_and_a_restart_end_the_run_and_a_wrapping_clock_does_not() -> None:
+    device, model, seam = opened(RawHid(clock_start_us=2**32 - 20_000))
+    device.start(PERIOD)
+    for _ in range(100):
+        assert read(device, seam)[0] == 0
+    model.status = 8
+    with pytest.raises(DeviceError, match=r"a fault of its own \(status 0x[0-9a-f][89a-f]\)"):
+        read(device, seam)
+    device, model, seam = still()
+    read(device, seam)
+    model._clock_start_us -= round(1e6 * seam.now)
+    with pytest.raises(DeviceError, match="has restarted during the run"):
+        read(device, seam)
+
+
+def test_a_device_that_must_be_homed_or_sends_nothing_does_not_start() -> None:
+    device, model, _ = opened()
+    model.status = 16
+    with pytest.raises(DeviceError, match="has no valid pose yet: home or calibrate it"):
+        device.start(PERIOD)
+    model.status = 8
+    with pytest.raises(DeviceError, match="reports a fault of its own"):
+        device.start(PERIOD)
+    device, model, _ = opened()
+    model.is_silent = True
+    with pytest.raises(DeviceError, match="sends no state frames"):
+        device.start(PERIOD)
+
+
+def test_silence_is_borne_for_50_ms_and_then_the_device_is_lost() -> None:
+    device, model, seam = still()
+    for _ in range(2):  # one frame, and all is forgiven
+        model.is_silent = False
+        assert read(device, seam)[0] == 0
+        model.is_silent = True
+        for _ in range(round(SILENCE / PERIOD) - 1):
+            assert read(device, seam)[0] == STALE
+    with pytest.raises(DeviceLost, match="has sent nothing for 51 ms"):
+        read(device, seam, 2 * PERIOD)
+
+
+@pytest.mark.parametrize("step", [10 * PERIOD, 45 * PERIOD, 0.1])
+def test_a_loop_of_any_rate_finds_silence_as_soon(step: float) -> None:
+    device, model, seam = opened(RawHid(None))
+    device.start(step)
+    read(device, seam, step)
+    model.is_silent = True
+    begin = seam.now
+    with pytest.raises(DeviceLost, match="has sent nothing"):
+        for _ in range(round(2 * SILENCE / step) + 1):
+            read(device, seam, step)
+    assert SILENCE < seam.now - begin < SILENCE + step + 1e-9
+
+
+def test_a_pause_of_the_loop_is_not_the_devices_silence() -> None:
+    device, model, seam = still()
+    read(device, seam)
+    model.is_silent = True
+    assert read(device, seam, 1.0)[0] == STALE
+    assert read(device, seam, 0.9 * SILENCE)[0] == STALE
+    with pytest.raises(DeviceLost, match=r"has sent nothing for 5\d ms"):
+        read(device, seam, 0.2 * SILENCE)
+
+
+def test_unplugging_is_seen_by_the_next_read_and_by_the_next_write() -> None:
+    device, model, seam = still()
+    read(device, seam)
+    seam.unplug(model)
+    with pytest.raises(DeviceLost, match=r"serial 12345\) is gone: unplugged"):
+        read(device, seam, 0.0)
+    with pytest.raises(DeviceLost):
+        device.write(PUSH)
+    device.close()
+    device.close()
+
+
+def test_the_watchdog_of_the_device_lets_go_20_ms_after_the_last_force_frame() -> None:
+    device, model, seam = still()
+    device.write(PUSH)
+    seam.advance(seam.now + 0.0199)
+    assert model.wrench.any()
+    seam.advance(seam.now + 0.0002)
+    assert not model.wrench.any()
+    read(device, seam)
+    assert device.states.newest is not None
+    assert device.states.newest.status & 2
+
+
+def test_closing_switches_the_motors_off() -> None:
+    device, model, _ = still()
+    device.write(PUSH)
+    device.close()
+    assert not model.is_enabled
+    assert not model.wrench.any()
+
+
+def test_the_log_that_the_user_asks_for_holds_every_frame(tmp_path: Path) -> None:
+    device, model, seam = opened(log=str(tmp_path / "wire.log"))
+    device.start(PERIOD)
+    device.write(PUSH)
+    read(device, seam)
+    device.close()
+    lines = (tmp_path / "wire.log").read_text().splitlines()
+    sent = [line.split(" > ")[1] for line in lines if " > " in line]
+    assert [line[:11] for line in sent] == ["00 48 01 3f"] * 2 + ["00 48 01 46"] * 2
+    assert len(lines) - len(sent) == model.frames + 2  # and both pages of the sheet
+
+
+def test_the_echo_counts_force_frames_on_the_way() -> None:
+    device, _, seam = still()
+    read(device, seam)
+    for _ in range(3):
+        device.write(PUSH)
+    before = device.on_the_way
+    read(device, seam)
+    assert (before > 0, device.on_the_way) == (True, 0)
+
+
+@given(st.lists(st.binary(min_size=1, max_size=64), max_size=8))
+def test_arbitrary_reports_never_make_a_pose_that_is_none(reports: list[bytes]) -> None:
+    device, model, _ = still()
+    for report in reports:
+        model.push(report)
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    assert device.read(sample) == STALE
+    assert device.states.damaged == len(reports)
+    assert np.isfinite(sample["position"]).all()
+    assert np.linalg.norm(sample["quaternion"]) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(st.tuples(*[st.floats(width=32)] * 12))
+def test_arbitrary_numbers_give_a_finite_pose_or_end_the_run(numbers: tuple[float, ...]) -> None:
+    device, model, seam = still()
+    model.motion = numbers
+    try:
+        _, sample = read(device, seam)
+    except DeviceError:
+        assert not all(abs(number) <= 1e30 for number in numbers)
+    else:
+        assert np.isfinite(sample["position"]).all()
+        assert np.linalg.norm(sample["quaternion"]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_the_model_moves_as_its_mechanics_do_under_the_force_it_is_sent() -> None:
+    """The handle behind the model is free; F = 1 N on 0.1 kg with b = 2 N s/m, closed form."""
+    mechanics = SimulatedDevice(hand=None)
+    device, _, seam = opened(RawHid(mechanics))
+    device.start(PERIOD)
+    mass, damping, seconds = 0.1, 2.0, 0.02
+    device.write(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for _ in range(4):
+        read(device, seam, seconds / 4)
+        device.write(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    _, sample = read(device, seam, 0.0)
+    decay = mass / damping
+    expected = (seconds - decay * (1.0 - math.exp(-seconds / decay))) / damping
+    # the state that is read was latched up to a period ago, and a force acts from the next 125 µs
+    assert sample["position"][0] == pytest.approx(expected, rel=0.15)
+    assert device.velocity[0] == pytest.approx((1 - math.exp(-seconds / decay)) / damping, rel=0.1)

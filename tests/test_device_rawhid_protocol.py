@@ -1,0 +1,392 @@
+from __future__ import annotations
+
+import ctypes
+import math
+import re
+import shutil
+import struct
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from emulated.rawhid_model import crc
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticbridge.device.base import AXES
+from hapticbridge.device.rawhid import device as driver
+from hapticbridge.device.rawhid import protocol
+
+DOCUMENT = Path(driver.__file__).parents[1].joinpath("rawhid.md").read_text(encoding="utf-8")
+NAN = math.nan
+
+single = st.floats(-(2.0**99), 2.0**99, width=32)
+any_single = st.floats(width=32)
+u8, u16 = st.integers(0, 255), st.integers(0, 65535)
+states = st.builds(
+    protocol.State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16
+)
+
+WRITTEN = {
+    "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
+    "State 258": protocol.state_frame(
+        protocol.State(
+            protocol.Status.ENABLED,
+            258,
+            1,
+            1_000_000,
+            (0.01, -0.02, 0.03, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0),
+            7,
+        )
+    ),
+    "Ask 1": protocol.ask_frame(1, 0),
+    "Sheet, page 0": protocol.sheet_frames(
+        1, protocol.Numbers(1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4), ""
+    )[0],
+    "Sheet, page 1": protocol.sheet_frames(
+        2, protocol.Numbers(1, *[NAN] * 11), "one-axis capstan paddle"
+    )[1],
+}
+
+
+def documented() -> dict[str, bytes]:
+    """Returns the document's worked frames by the first words of the paragraph before each."""
+    section = DOCUMENT.split("## Worked frames")[1]
+    pairs = re.findall(r"\n([^\n]+(?:\n[^\n`]+)*)\n\n```text\n([0-9a-f \n]+)```", section)
+    return {re.split(r"[:,](?! page)", words)[0]: bytes.fromhex(text) for words, text in pairs}
+
+
+def test_the_documents_worked_frames_are_what_the_codec_writes() -> None:
+    assert documented() == WRITTEN
+
+
+def test_the_crc_is_the_documents_bit_by_bit_and_has_its_check_value() -> None:
+    assert protocol.crc16(b"123456789") == crc(b"123456789") == 0x29B1
+    for frame in documented().values():
+        assert len(frame) == protocol.FRAME_BYTES
+        assert crc(frame[:62]) == struct.unpack("<H", frame[62:])[0]
+
+
+SIZES = {"u8": ("B", 1), "u16": ("H", 2), "u32": ("I", 4), "f32": ("f", 4)}
+FIELD = re.compile(r"^\| (\d+)(?:–(\d+))? \| (?:(\d+) × )?([uf]\d+) \| ([^|]*) \|", re.MULTILINE)
+
+
+def fields(heading: str) -> dict[int, tuple[int, str]]:
+    """Returns first byte: (last byte, struct format) of a section's table of bytes."""
+    section = DOCUMENT.split(f"\n## {heading}")[1].split("\n## ")[0]
+    found = {}
+    for first, last, count, kind, _ in FIELD.findall(section):
+        letter, size = SIZES[kind]
+        end = int(first) + size * int(count or 1) - 1
+        assert end == int(last or first), (heading, first)
+        found[int(first)] = (end, f"<{count}{letter}")
+    return found
+
+
+@pytest.mark.parametrize("heading", ["State", "Force"])
+def test_the_documents_fields_fill_64_bytes_without_a_gap(heading: str) -> None:
+    layout = {**fields("The interface"), **fields(heading)}
+    place = 0
+    for first in sorted(layout):
+        assert first == place
+        place = layout[first][0] + 1
+    assert place == protocol.FRAME_BYTES
+
+
+def test_the_worked_state_holds_its_numbers_where_the_document_says() -> None:
+    frame = documented()["State 258"]
+    layout = {**fields("The interface"), **fields("State")}
+    expected: dict[int, tuple[float, ...]] = {
+        0: (0x48,), 1: (1,), 2: (0x53,), 3: (1,), 4: (258,), 6: (1,), 8: (1_000_000,),
+        12: (0.01, -0.02, 0.03), 24: (0, 0, 0.5), 36: (0.1, 0, 0), 48: (0, 0, -1), 60: (7,),
+    }  # fmt: skip
+    for first, values in expected.items():
+        np.testing.assert_allclose(
+            struct.unpack_from(layout[first][1], frame, first), values, rtol=1e-7
+        )
+
+
+def test_the_worked_sheet_holds_its_numbers_where_the_document_says() -> None:
+    frame = documented()["Sheet, page 0"]
+    expected = (1, 990, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4, NAN, 2, 5e-4)
+    layout = fields("Sheet")
+    assert len(layout) == len(expected)
+    for first, value in zip(sorted(layout), expected, strict=True):
+        (stored,) = struct.unpack_from(layout[first][1], frame, first)
+        assert stored == pytest.approx(value, rel=1e-7, nan_ok=True)
+
+
+@given(states)
+def test_any_state_survives_a_frame(state: protocol.State) -> None:
+    assert protocol.decoded(protocol.state_frame(state)) == state
+
+
+@given(
+    st.integers(0, 63),
+    st.lists(any_single, min_size=11, max_size=11),
+    st.text("a-é日🙂 7", max_size=80).map(str.strip),
+)
+def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str) -> None:
+    numbers, title = (
+        protocol.decoded(frame)
+        for frame in protocol.sheet_frames(9, protocol.Numbers(axes, *values), name)
+    )
+    assert isinstance(numbers, protocol.Numbers)
+    assert isinstance(title, str)
+    known = numbers.known()
+    for field, value in zip(protocol.Numbers._fields[1:], values, strict=True):
+        # equal as a float32, not as a double: the shortest text that means the same one
+        stored = known[field]
+        assert (stored is None) == (not math.isfinite(value))
+        assert stored is None or np.float32(stored) == np.float32(value)
+    assert numbers.axis_names == tuple(AXES[i] for i in range(6) if axes >> i & 1)
+    assert name.encode().startswith(title.encode())
+    assert len(title.encode()) > 50 or title == name
+
+
+@given(st.binary(max_size=130))
+def test_arbitrary_bytes_are_no_frame(data: bytes) -> None:
+    assert protocol.decoded(data) is None
+
+
+@given(st.binary(min_size=60, max_size=60))
+def test_whatever_passes_the_check_is_read_without_a_crash(body: bytes) -> None:
+    for kind in range(0x3F, 0x54):
+        frame = b"\x48\x01" + bytes([kind]) + body[:59]
+        news = protocol.decoded(frame + struct.pack("<H", crc(frame)))
+        assert (news is None) == (kind not in (0x53, 0x44) or (kind == 0x44 and body[0] > 1))
+
+
+@given(states, st.integers(0, 64 * 8 - 1), st.integers(0, 64 * 8 - 1))
+def test_one_or_two_flipped_bits_never_pass(state: protocol.State, first: int, second: int) -> None:
+    frame = bytearray(protocol.state_frame(state))
+    for bit in {first, second}:
+        frame[bit // 8] ^= 1 << bit % 8
+    assert protocol.decoded(bytes(frame)) is None
+
+
+def test_a_frame_of_another_version_is_told_from_noise() -> None:
+    body = bytearray(protocol.state_frame(protocol.State(0, 0, 0, 0, (0.0,) * 12, 0))[:62])
+    body[1] = 2
+    frame = bytes(body) + struct.pack("<H", crc(bytes(body)))
+    assert (protocol.version_of(frame), protocol.decoded(frame)) == (2, None)
+    assert protocol.version_of(frame[:-1] + bytes([frame[-1] ^ 1])) is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_state_that_is_not_finite_says_so(value: float) -> None:
+    for place in range(12):
+        numbers = tuple(value if i == place else 0.0 for i in range(12))
+        state = protocol.decoded(protocol.state_frame(protocol.State(0, 0, 0, 0, numbers, 0)))
+        assert isinstance(state, protocol.State)
+        assert not state.is_finite
+
+
+FIRMWARE = Path(driver.__file__).with_name("firmware")
+SHIM = Path(__file__).with_name("rawhid_firmware_shim.cpp")
+COMPILER = shutil.which("g++") or shutil.which("clang++")
+WRENCH = (1.0, -0.5, 0.25, 0.01, -0.02, 0.03)
+
+pytestmark = pytest.mark.skipif(
+    COMPILER is None, reason="neither g++ nor clang++ is here to compile the firmware with"
+)
+
+
+def built(folder: Path, *options: str) -> ctypes.CDLL:
+    library = folder / "firmware.so"
+    subprocess.run(
+        [str(COMPILER), "-std=c++11", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC",
+         f"-I{FIRMWARE}", f"-I{folder}", *options, "-o", str(library),
+         str(SHIM), str(FIRMWARE / "hb_protocol.cpp")],
+        check=True,
+    )  # fmt: skip
+    return ctypes.CDLL(str(library))
+
+
+@pytest.fixture(scope="module", name="shim")
+def _shim(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return built(tmp_path_factory.mktemp("firmware"))
+
+
+def wrench_at(shim: ctypes.CDLL, now_us: int) -> tuple[float, ...]:
+    numbers = (ctypes.c_float * 6)()
+    shim.shim_wrench(now_us, numbers)
+    return tuple(numbers)
+
+
+def state_at(shim: ctypes.CDLL, now_us: int, status: int = 0, *numbers: float) -> protocol.State:
+    frame = ctypes.create_string_buffer(64)
+    values = (ctypes.c_float * 12)(*(numbers or [0.0] * 12))
+    shim.shim_state(values, 0x8001, status, now_us, frame)
+    state = protocol.decoded(frame.raw)
+    assert isinstance(state, protocol.State)
+    return state
+
+
+@given(st.binary(max_size=100))
+def test_both_crcs_agree(shim: ctypes.CDLL, data: bytes) -> None:
+    assert shim.shim_crc(data, len(data)) == protocol.crc16(data)
+
+
+@given(st.tuples(*[st.floats(-(2.0**99), 2.0**99, width=32)] * 12), st.integers(0, 2**32 - 1))
+def test_states_are_read_right(shim: ctypes.CDLL, numbers: tuple[float, ...], now_us: int) -> None:
+    shim.shim_reset()
+    first = state_at(shim, now_us, protocol.Status.SATURATED, *numbers)
+    assert first.numbers == numbers
+    assert (first.time_us, first.sequence, first.buttons, first.echo) == (now_us, 1, 0x8001, 0)
+    assert first.status & protocol.Status.SATURATED
+    assert state_at(shim, now_us, 0, *numbers).sequence == 2
+
+
+@given(st.tuples(*[st.floats(-100.0, 100.0, width=32)] * 6), st.integers(0, 65535))
+def test_firmware_obeys_host(shim: ctypes.CDLL, wrench: tuple[float, ...], sequence: int) -> None:
+    shim.shim_reset()
+    assert shim.shim_receive(protocol.force_frame(sequence, wrench, 20), 1000)
+    assert wrench_at(shim, 1001) == wrench
+    state = state_at(shim, 1002)
+    assert (state.echo, state.status) == (sequence, protocol.Status.ENABLED)
+
+
+@pytest.mark.parametrize("received_us", [0, 5_000_000, 2**32 - 10_000])
+def test_watchdog_zeroes_in_time_across_clocks_wrap(shim: ctypes.CDLL, received_us: int) -> None:
+    shim.shim_reset()
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), received_us)
+    assert wrench_at(shim, (received_us + 19_999) % 2**32) == pytest.approx(WRENCH)
+    assert state_at(shim, (received_us + 19_999) % 2**32).status == protocol.Status.ENABLED
+    assert wrench_at(shim, (received_us + 20_000) % 2**32) == (0.0,) * 6
+    assert state_at(shim, (received_us + 20_000) % 2**32).status & protocol.Status.WATCHDOG
+    # the clock comes round to where the frame would be young again: it stays expired
+    assert wrench_at(shim, received_us) == (0.0,) * 6
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 20), received_us)
+    assert wrench_at(shim, received_us) == pytest.approx(WRENCH)
+
+
+def test_no_watchdog_is_longer_than_a_second_and_none_stops_at_once(shim: ctypes.CDLL) -> None:
+    shim.shim_reset()
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 65535), 0)
+    assert wrench_at(shim, 999_999) != (0.0,) * 6
+    assert wrench_at(shim, 1_000_000) == (0.0,) * 6
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 0), 0)
+    assert wrench_at(shim, 0) == (0.0,) * 6
+
+
+def test_motors_not_enabled_or_device_unfit_give_nothing(shim: ctypes.CDLL) -> None:
+    shim.shim_reset()
+    assert wrench_at(shim, 5) == (0.0,) * 6
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20, is_enabled=False), 10)
+    assert wrench_at(shim, 11) == (0.0,) * 6
+    shim.shim_receive(protocol.force_frame(2, WRENCH, 20), 12)
+    for status in (protocol.Status.FAULT, protocol.Status.NOT_READY):
+        assert state_at(shim, 13, status).status & status
+        assert wrench_at(shim, 14) == (0.0,) * 6
+        state_at(shim, 15)
+        assert wrench_at(shim, 16) == pytest.approx(WRENCH)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_force_not_finite_leaves_old_one_to_its_watchdog(shim: ctypes.CDLL, value: float) -> None:
+    shim.shim_reset()
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), 0)
+    for place in range(6):
+        wrench = tuple(value if i == place else 0.0 for i in range(6))
+        assert not shim.shim_receive(protocol.force_frame(2, wrench, 20), 10_000)
+    assert wrench_at(shim, 10_001) == pytest.approx(WRENCH)
+    assert wrench_at(shim, 20_000) == (0.0,) * 6
+
+
+def test_damaged_frames_and_other_versions_and_kinds_change_nothing(shim: ctypes.CDLL) -> None:
+    shim.shim_reset()
+    shim.shim_receive(protocol.force_frame(1, WRENCH, 20), 0)
+    good = protocol.force_frame(2, (0.0,) * 6, 20)
+    for place in (0, 1, 2, 9, 62):
+        assert not shim.shim_receive(good[:place] + bytes([good[place] ^ 4]) + good[place + 1 :], 1)
+    assert state_at(shim, 2).status == protocol.Status.ENABLED | protocol.Status.DAMAGED
+    assert wrench_at(shim, 3) == pytest.approx(WRENCH)
+    shim.shim_receive(good, 4)
+    assert state_at(shim, 5).status == protocol.Status.ENABLED
+
+
+def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL) -> None:
+    shim.shim_reset()
+    frame = ctypes.create_string_buffer(64)
+    assert not shim.shim_answer(frame)
+    shim.shim_receive(protocol.ask_frame(1, 0), 0)
+    assert shim.shim_answer(frame)
+    numbers = protocol.decoded(frame.raw)
+    assert isinstance(numbers, protocol.Numbers)
+    assert numbers.axis_names == ("x", "rz")
+    assert numbers.known() == {
+        "rate": 990.0,
+        "mass": None,
+        "damping": 0.4,
+        "rotational_inertia": None,
+        "rotational_damping": 0.01,
+        "friction": 0.05,
+        "resolution": 1.5e-5,
+        "force_limit": 4.0,
+        "torque_limit": 0.1,
+        "speed_limit": 2.0,
+        "delay": 5e-4,
+    }
+    shim.shim_receive(protocol.ask_frame(2, 1), 0)
+    assert shim.shim_answer(frame)
+    assert protocol.decoded(frame.raw) == "shim"
+    shim.shim_receive(protocol.ask_frame(3, 2), 0)
+    assert not shim.shim_answer(frame)
+
+
+@pytest.fixture(scope="module", name="sketch")
+def _sketch(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    folder = tmp_path_factory.mktemp("sketch")
+    (folder / "Encoder.h").write_text(
+        "struct Encoder { Encoder(int, int) {} void write(int) {}\n"
+        "                 int read() { return encoder_count; } };\n"
+    )
+    sketch = built(folder, f'-DSKETCH="{FIRMWARE / "hapticbridge_rawhid.ino"}"')
+    sketch.sketch_setup()
+    return sketch
+
+
+def states_of(sketch: ctypes.CDLL) -> list[protocol.State]:
+    frame, states = ctypes.create_string_buffer(64), []
+    while sketch.sketch_fetch(frame):
+        states.append(protocol.decoded(frame.raw))
+    return [state for state in states if isinstance(state, protocol.State)]
+
+
+PWM, DIRECTION = 5, 8
+
+
+def test_sketch_streams_below_hosts_rate_and_counts_every_frame(sketch: ctypes.CDLL) -> None:
+    states_of(sketch)
+    sketch.sketch_turn(1000)
+    sketch.sketch_run(1_010_010, 1)
+    states = states_of(sketch)
+    assert len(states) == 1000
+    assert {b.sequence - a.sequence for a, b in pairwise(states)} == {1}
+    # half a turn of 2000 counts on a pulley of 5 mm, sector 75 mm, handle at 70 mm
+    assert states[-1].numbers[0] == pytest.approx(math.pi * 0.005 / 0.075 * 0.070, rel=1e-6)
+
+
+def test_the_sketch_pushes_as_told_and_its_interrupt_lets_go(sketch: ctypes.CDLL) -> None:
+    for force, direction in ((2.0, 1), (-2.0, 0)):
+        sketch.sketch_send(protocol.force_frame(1, (force, 0.0, 0.0, 0.0, 0.0, 0.0), 20))
+        sketch.sketch_run(2_000, 1)
+        # F x travel per radian / torque constant x resistance / supply, of 1023 steps
+        duty = 2.0 * 0.070 * 0.005 / 0.075 / 0.0136 * 2.5 / 12.0
+        assert sketch.sketch_pin(PWM) == pytest.approx(1023 * min(duty, 0.2), abs=1)
+        assert sketch.sketch_pin(DIRECTION) == direction
+    sketch.sketch_run(17_000, 0)
+    assert sketch.sketch_pin(PWM) > 0
+    sketch.sketch_run(2_000, 0)
+    assert sketch.sketch_pin(PWM) == 0
+
+
+def test_what_the_sketch_does_with_interrupts_off_keeps_them_off(sketch: ctypes.CDLL) -> None:
+    before = sketch.sketch_sections()
+    sketch.sketch_send(protocol.force_frame(1, WRENCH, 20))
+    sketch.sketch_run(1_010 * 3, 1)
+    assert sketch.sketch_sections() >= before + 4  # a force frame, three states
+    assert sketch.sketch_broken_sections() == 0

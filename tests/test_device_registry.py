@@ -1,0 +1,67 @@
+"""A device that was opened and is then refused is let go, so that the next run can have it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from cli_cases import Called
+
+from hapticbridge import options as arrangement
+from hapticbridge.bridge import Bridge
+from hapticbridge.cli import run
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import registry as library
+from hapticbridge.device.falcon.device import FAMILY
+from hapticbridge.errors import DeviceError
+from hapticbridge.guard import Limits
+
+
+class Counted(SimulatedDevice):
+    closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
+        super().close()
+
+
+@pytest.mark.parametrize(
+    "option", [("--force-limit", "1e6"), ("--stiffness", "-1"), ("--ramp", "-1")]
+)
+def test_a_run_refused_late_lets_its_device_go(
+    call: Called, monkeypatch: pytest.MonkeyPatch, option: tuple[str, str]
+) -> None:
+    device = Counted()
+    monkeypatch.setattr(run, "device_for", lambda *_: device)
+    code, _, err = call("run", "point_mass", *option)
+    assert (code, err.count("\n")) == (2, 1)
+    assert device.closed == 1
+
+
+def test_a_refused_bridge_lets_go_of_what_it_opened_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, own = Counted(), Counted()
+    monkeypatch.setattr(arrangement, "device_for", lambda *_: opened)
+    limits = Limits(force=1e6, torque=1.0)
+    with pytest.raises(DeviceError, match="force limit"):
+        Bridge("point_mass", "falcon", limits=limits)
+    with pytest.raises(DeviceError, match="force limit"):
+        Bridge("point_mass", own, limits=limits)
+    assert (opened.closed, own.closed) == (1, 0)
+    assert Bridge("point_mass", "falcon").device is opened
+    assert opened.closed == 1
+
+
+def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Counted()
+    family = replace(FAMILY, open=lambda *_: device)
+    monkeypatch.setattr(library, "family_named", lambda _: family)
+
+    def broken(*_: str) -> None:
+        raise DeviceError("broken profile")
+
+    monkeypatch.setattr(library, "profile_of", broken)
+    with pytest.raises(DeviceError, match="broken profile"):
+        library.open_device("falcon")
+    assert device.closed == 1
+    assert library.open_device("falcon:profile=none") is device
+    assert device.closed == 1

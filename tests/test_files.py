@@ -1,0 +1,70 @@
+"""A file is there whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from hapticbridge.files import atomic_write, finite_or_null, read_json
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_what_was_not_finished_replaces_nothing(tmp_path: Path, error: type[BaseException]) -> None:
+    path = tmp_path / "page.html"
+    path.write_text("old")
+    with pytest.raises(error), atomic_write(path) as draft:
+        draft.write_text("ne")
+        raise error
+    assert path.read_text() == "old"
+    assert [path] == list(tmp_path.iterdir())
+
+
+def test_what_was_finished_stands_alone_and_where_a_link_leads(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    path = tmp_path / "page.html"
+    path.symlink_to(tmp_path / "there" / "true.html")
+    with atomic_write(path) as draft:
+        draft.write_text("new")
+    assert path.is_symlink()
+    assert [path.resolve()] == list((tmp_path / "there").iterdir())
+    assert path.read_text() == "new"
+
+
+def test_a_pipe_is_written_to_and_stays_one(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.csv"
+    os.mkfifo(path)
+    heard: list[str] = []
+    reader = threading.Thread(target=lambda: heard.append(path.read_text()))
+    reader.start()
+    with atomic_write(path) as draft:
+        draft.write_text("new")
+    reader.join()
+    assert heard == ["new"]
+    assert path.is_fifo()
+
+
+def test_numbers_that_are_not_finite_become_null_as_deep_as_they_lie() -> None:
+    facts = {"a": math.nan, "b": [1.5, -math.inf, (math.inf, "x")], "c": {"d": {"e": math.nan}}}
+    told = json.dumps(finite_or_null(facts), allow_nan=False)
+    assert json.loads(told) == {"a": None, "b": [1.5, None, [None, "x"]], "c": {"d": {"e": None}}}
+
+
+def test_everything_else_stays_as_it_is() -> None:
+    facts = {"n": 3, "t": True, "s": "nan", "x": 0.0, "none": None, "l": []}
+    assert finite_or_null(facts) == facts
+
+
+@pytest.mark.parametrize("text", ["", "nan?", "{", "1" * 5000, "[" * 100_000, b"\xff"])
+def test_what_is_no_json_is_one_kind_of_error(text: str | bytes) -> None:
+    with pytest.raises(ValueError):
+        read_json(text)
+
+
+def test_json_is_read_as_it_was_written() -> None:
+    assert read_json(b'{"a": [1, 2.5, null]}') == read_json('{"a": [1, 2.5, null]}')
+    assert read_json("[1]") == [1]

@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.recording import HEAD, TAIL, Ring
+
+
+def numbered(start: int, stop: int) -> NDArray[np.void]:
+    rows = np.zeros(stop - start, TICK_DTYPE)
+    rows["tick"] = np.arange(start, stop)
+    rows["wrench_on_tool"] = rows["tick"][:, None] + np.arange(6) / 8
+    return rows
+
+
+@pytest.fixture
+def shared() -> Iterator[Ring]:
+    ring = Ring.shared(7)
+    yield ring
+    ring.close()
+
+
+@given(
+    capacity=st.integers(1, 9),
+    steps=st.lists(st.tuples(st.booleans(), st.integers(0, 12)), max_size=40),
+)
+def test_ring_is_a_bounded_queue_that_refuses(capacity: int, steps: list[tuple[bool, int]]) -> None:
+    ring, queue, written = Ring.local(capacity), list[int](), 0
+    for is_write, count in steps:
+        if is_write:
+            taken = ring.append(numbered(written, written + count))
+            assert taken == min(count, capacity - len(queue))
+            queue += range(written, written + taken)
+            written += taken
+        else:
+            read = ring.take(count)
+            expected, queue = queue[:count], queue[count:]
+            assert read["tick"].tolist() == expected
+            assert (read["wrench_on_tool"][:, 1] == read["tick"] + 1 / 8).all()
+        assert ring.pending() == len(queue)
+        assert (ring.cursors[HEAD], ring.cursors[TAIL]) == (written, written - len(queue))
+
+
+def test_cursors_and_rows_have_the_shape_that_the_kernel_relies_on(shared: Ring) -> None:
+    assert (HEAD, TAIL) == (0, 1)
+    for ring in (Ring.local(7), shared):
+        assert ring.rows.shape == (7,)
+        assert ring.rows.dtype == TICK_DTYPE
+        assert ring.cursors.shape == (8,)
+        assert ring.cursors.dtype == np.int64
+        assert not ring.cursors.any()
+        assert ring.rows.ctypes.data % 8 == 0
+        assert ring.rows.flags.c_contiguous
+
+
+@given(written=st.integers(0, 30), unread=st.integers(0, 5), count=st.integers(0, 12))
+def test_latest_gives_newest_records_oldest_first(written: int, unread: int, count: int) -> None:
+    ring = Ring.local(5)
+    for tick in range(written):
+        ring.append(numbered(tick, tick + 1))
+        ring.take(max(0, ring.pending() - unread))
+    kept = min(count, 5, int(ring.cursors[HEAD]))
+    newest = ring.rows["tick"].max() if ring.cursors[HEAD] else -1
+    assert ring.latest(count)["tick"].tolist() == list(range(newest - kept + 1, newest + 1))
+
+
+@given(capacity=st.integers(2, 9), written=st.lists(st.integers(0, 12), min_size=1, max_size=60))
+def test_who_reads_on_misses_only_the_overwritten(capacity: int, written: list[int]) -> None:
+    ring, counts, end = Ring.local(capacity), iter(written), 0
+
+    def write() -> None:  # the producer goes on between any two steps of whoever reads
+        nonlocal end
+        for row in numbered(end, end + next(counts, 0)):
+            ring.rows[end % capacity] = row
+            end += 1
+        # it may be amid the next one, too
+        ring.rows[end % capacity]["tick"] = -1
+        ring.cursors[HEAD] = end
+
+    ring._fence = write  # type: ignore[method-assign] # it is called between the steps
+    number = 0
+    for _ in written:
+        asked, before = number, int(ring.cursors[HEAD])
+        first, rows = ring.since(asked)
+        number = first + len(rows)
+        np.testing.assert_array_equal(rows["tick"], np.arange(first, number))
+        assert asked <= first <= number
+        assert number >= before  # all that was there is told, unless it is gone
+        assert first == asked or first == end - capacity + 1
+
+
+def test_what_is_taken_is_a_copy() -> None:
+    ring = Ring.local(2)
+    ring.append(numbered(0, 2))
+    taken, latest = ring.take(2), ring.latest(2)
+    ring.append(numbered(5, 7))
+    assert taken["tick"].tolist() == latest["tick"].tolist() == [0, 1]
+
+
+def test_attached_ring_sees_what_the_owner_writes_and_frees_its_places(shared: Ring) -> None:
+    assert shared.name is not None
+    other = Ring.attach(shared.name)
+    assert shared.append(numbered(0, 9)) == 7
+    assert other.take(4)["tick"].tolist() == [0, 1, 2, 3]
+    assert shared.pending() == 3
+    assert shared.append(numbered(7, 20)) == 4
+    assert other.take(99)["tick"].tolist() == list(range(4, 11))
+
+
+def test_records_pass_unchanged_between_a_writing_and_a_reading_thread() -> None:
+    ring, total = Ring.local(256), 5000
+
+    def produce() -> None:
+        rows, done = numbered(0, total), 0
+        while done < total:
+            done += ring.append(rows[done : done + 37])
+
+    producer = threading.Thread(target=produce)
+    producer.start()
+    read: list[NDArray[np.void]] = []
+    while sum(rows.size for rows in read) < total:
+        read.append(ring.take(101))
+    producer.join()
+    assert (np.concatenate(read) == numbered(0, total)).all()
+
+
+def test_arrays_stay_valid_after_close_and_the_name_is_gone() -> None:
+    ring = Ring.shared(3)
+    ring.append(numbered(0, 3))
+    assert ring.name is not None
+    ring.close()
+    ring.close()
+    assert ring.latest(3)["tick"].tolist() == [0, 1, 2]
+    with pytest.raises(RecordingError, match="no ring at"):
+        Ring.attach(ring.name)
+
+
+def test_closing_an_attached_ring_leaves_the_memory_to_its_owner(shared: Ring) -> None:
+    assert shared.name is not None
+    Ring.attach(shared.name).close()
+    assert Path(shared.name).exists()
+    Ring.attach(shared.name)
+
+
+def test_process_that_attaches_and_exits_neither_removes_the_ring_nor_prints(shared: Ring) -> None:
+    script = "import sys; from hapticbridge.recording import Ring; Ring.attach(sys.argv[1])"
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(shared.name)], capture_output=True, check=True
+    )
+    assert done.stderr == b""
+    assert Path(str(shared.name)).exists()
+
+
+def test_ring_of_a_killed_process_is_swept_and_a_living_one_is_not(shared: Ring) -> None:
+    script = (
+        "import os, signal; from hapticbridge.recording import Ring; ring = Ring.shared(3);"
+        "print(ring.name, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    killed = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    left = Path(killed.stdout.decode().strip())
+    assert killed.stderr == b""
+    assert left.exists()
+    Ring.shared(3).close()
+    assert not left.exists()
+    assert Path(str(shared.name)).exists()
+
+
+@pytest.mark.parametrize("capacity", [0, -1])
+def test_ring_without_room_is_refused(capacity: int) -> None:
+    with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
+        Ring.local(capacity)
+    with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
+        Ring.shared(capacity)
+
+
+@pytest.mark.parametrize("content", [b"", b"short", bytes(4096), b"hbring01" + b"\xff" * 4096])
+def test_file_that_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "ring"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="ring"):
+        Ring.attach(str(path))

@@ -1,0 +1,315 @@
+"""Which scenes are refused, with what culprit, and what loading sets in the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from outside_scenes import FREE_TOOL, mjcf, scene_file
+from scene_cases import HINGE_TOOL, refusal, refusal_of
+from scipy.spatial.transform import Rotation
+
+import hapticbridge as hb
+from hapticbridge.inputs import input_writes
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.scene import load_scene, scene_names, scene_path
+
+
+def test_missing_file_name_and_folder_are_told_apart(tmp_path: Path) -> None:
+    missing = tmp_path / "gone.xml"
+    assert refusal(missing).startswith(f"no scene file '{missing}' exists; give the path of an")
+    message = refusal("peg_in_hola")
+    assert "'peg_in_hola'" in message
+    assert all(f"'{name}'" in message for name in scene_names())
+    assert refusal(tmp_path).startswith(f"scene '{tmp_path}' is a folder")
+    assert "empty" in refusal("")
+    assert "too long" in refusal("x" * 5000)
+
+
+def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(scene_names()) >= {"peg_in_hole", "planar_peg", "point_mass", "virtual_wall"}
+    assert load_scene("point_mass").name == "point_mass"
+    monkeypatch.chdir(tmp_path)
+    scene_file(tmp_path, mjcf(), "point_mass")
+    assert scene_path("point_mass") == Path("point_mass")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["empty file"]),
+        ("hello", ["line 1", "not well-formed XML"]),
+        ("<mujoco>\n<worldbody>\n<body>\n</worldbody></mujoco>", ["line 3", "'body'"]),
+        ("<mujoco>\n<worldbody>\n<bdy/>\n</worldbody></mujoco>", ["'bdy'", "line 3"]),
+        ("<mujoco>\n<worldbody>\n<body foo='1'/></worldbody></mujoco>", ["'foo'", "line 3"]),
+        ("<mujoco>\n\n<worldbody><body pos='a b c'/></worldbody></mujoco>", ["'pos'", "line 3"]),
+        ("<mujoco><include file='gone.xml'/></mujoco>", ["'gone.xml'", "line 1"]),
+        ("<mujoco><include file='part.xml'/></mujoco>", ["line 3 is not well-formed XML"]),
+        ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["grip"]),
+        (mjcf("<asset><mesh name='m' file='gone.stl'/></asset>"), ["'gone.stl'"]),
+        (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
+        (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),
+        (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
+        # what breaks the implicit step
+        (mjcf("<option solver='PGS'/>"), ["PGS", "use Newton"]),
+        (mjcf("<option noslip_iterations='3'/>"), ["noslip_iterations=3", "set it to 0"]),
+        (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
+        (mjcf("<option><flag sleep='enable'/></option>"), ["flag sleep", "disable it"]),
+        (mjcf("<option><flag actuation='disable'/></option>"), ["actuation", "enable it"]),
+        (mjcf("<option actuatorgroupdisable='30 0 4'/>"), ["0, 4, 30", "remove actuatorgr"]),
+    ],
+)
+def test_unreadable_file_is_told_with_line(tmp_path: Path, text: str, words: list[str]) -> None:
+    scene_file(tmp_path, "<mujocoinclude>\n\n<worldbody></mujocoinclude>", "part.xml")
+    message = refusal_of(tmp_path, text)
+    assert all(word in message for word in words), message
+    assert "must end in .xml" in refusal(scene_file(tmp_path, text, "scene.mjcf"))
+
+
+def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Path) -> None:
+    body = "<body><freejoint/><geom size='.01'/><site name='tip'/><site/><site name='heel'/></body>"
+    message = refusal_of(tmp_path, mjcf(body=body))
+    assert "no site 'grip' to grip the tool by; sites: 'heel', 'tip'; name one of them" in message
+    assert "--grip" in message
+    none = refusal_of(tmp_path, mjcf(body=body.replace("site name", "geom size='.01' name")))
+    assert none.endswith('sites: none exist; put <site name="grip"/> into the tool\'s body')
+    path = scene_file(tmp_path, mjcf(body=body))
+    assert load_scene(path, grip="heel").grip == "heel"
+    assert "no site ''" in refusal(path, "")
+
+
+@pytest.mark.parametrize(
+    ("world", "actuator", "culprit"),
+    [
+        ("<body name='handle'/>", "", "body 'handle'"),
+        ("<site name='handle'/>", "", "site 'handle'"),
+        (
+            "",
+            "<equality><weld name='handle_weld' body1='arm'/></equality>",
+            "equality constraint 'handle_weld'",
+        ),
+        *[
+            ("", f"<actuator><motor name='{name}' joint='elbow'/></actuator>", f"actuator '{name}'")
+            for name in COUPLING_ACTUATORS
+        ],
+    ],
+)
+def test_our_names_are_refused(tmp_path: Path, world: str, actuator: str, culprit: str) -> None:
+    text = mjcf(actuator, body=HINGE_TOOL.format(joint=""), world=world)
+    message = refusal_of(tmp_path, text)
+    assert culprit in message
+    assert "rename it" in message
+
+
+def test_names_of_ours_are_free_for_other_kinds_of_things(tmp_path: Path) -> None:
+    body = HINGE_TOOL.format(joint="").replace("elbow", "handle").replace('"arm"', '"coupling_x"')
+    actuator = "<actuator><motor name='coupling_left' joint='handle'/></actuator>"
+    world = "<geom name='handle' size='.01' pos='1 0 0'/><body name='hapticbridge_handle'/>"
+    assert load_scene(scene_file(tmp_path, mjcf(actuator, body=body, world=world))).model.nu == 7
+
+
+@pytest.mark.parametrize(
+    ("body", "where"),
+    [
+        ("<site name='grip'/>", "the world"),
+        ("<body name='shelf'><geom size='.01'/><site name='grip'/></body>", "body 'shelf'"),
+        ("<body><body><geom size='.01'/><site name='grip'/></body></body>", "body '2'"),
+        ("<body name='puck' mocap='true'><site name='grip'/></body>", "body 'puck'"),
+        ("<body mocap='true'><body name='lid'><site name='grip'/></body></body>", "body 'lid'"),
+    ],
+)
+def test_grip_on_what_cannot_move_is_refused(tmp_path: Path, body: str, where: str) -> None:
+    message = refusal_of(tmp_path, mjcf(body=body))
+    assert message.startswith(f"grip 'grip' sits on {where}, which cannot move; put it on a body")
+
+
+def test_grip_on_a_rigid_part_of_a_moving_body_is_accepted(tmp_path: Path) -> None:
+    part = "<body name='arm'><freejoint/><geom size='.01'/><body pos='.1 0 0'><site name='grip'/>"
+    scene = load_scene(scene_file(tmp_path, mjcf(body=part + "</body></body>")))
+    assert scene.grip_pose()[:3] == (0.1, 0.0, 0.0)
+
+
+def test_rk4_runs_under_discrete_with_warning_and_other_integrators_without(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, mjcf("<option integrator='RK4'/>"))
+    with pytest.warns(UserWarning, match="RK4; it runs under 'discrete'") as caught:
+        scene = load_scene(path)
+    assert len(caught) == 1
+    assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    for name in ("Euler", "implicit", "implicitfast", "discrete"):
+        scene = load_scene(scene_file(tmp_path, mjcf(f"<option integrator='{name}'/>")))
+        assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+
+
+def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="wind does work"):
+        load_scene(scene_file(tmp_path, mjcf("<option wind='1 0 0'/>")))
+    belt = "<geom name='belt' type='plane' size='1 1 1' pos='0 0 -1' surfacevel='1 0 0 0 0 0'/>"
+    with pytest.warns(UserWarning, match="surfacevel does work"):
+        load_scene(scene_file(tmp_path, mjcf(world=belt)))
+
+
+def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> None:
+    option = (
+        "<option integrator='Euler' solver='CG' timestep='0.01'><flag energy='disable' "
+        "diagexact='disable' autoreset='enable' fwdinv='enable' midphase='disable'/></option>"
+    )
+    scene = load_scene(scene_file(tmp_path, mjcf(option)))
+    opt = scene.model.opt
+    enable, disable = mujoco.mjtEnableBit, mujoco.mjtDisableBit
+    assert opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    for bit in (enable.mjENBL_ENERGY, enable.mjENBL_DIAGEXACT, enable.mjENBL_FWDINV):
+        assert opt.enableflags & bit
+    for bit in (disable.mjDSBL_AUTORESET, disable.mjDSBL_MIDPHASE):
+        assert opt.disableflags & bit
+    scene.set_timestep(1 / 500, 4)
+    assert opt.timestep == (1 / 500) / 4
+    with hb.Bridge(scene, "simulated", rate=2000, substeps=2, clock=hb.SimulatedClock()):
+        assert opt.timestep == (1 / 2000) / 2
+    for period, substeps in ((0.0, 1), (float("nan"), 1), (-1.0, 1), (0.001, 0)):
+        with pytest.raises(hb.SceneError, match="must be"):
+            scene.set_timestep(period, substeps)
+
+
+def test_gains_are_set_without_compiling_and_give_the_coupling_law(tmp_path: Path) -> None:
+    scene = load_scene(scene_file(tmp_path, mjcf("<option gravity='0 0 0'/>")))
+    model, data = scene.model, scene.data
+    offset, turn = np.array([2e-3, -1e-3, 3e-3]), np.array([0.01, 0.02, -0.005])
+    quaternion = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
+    for stiffness, rotational in ((100.0, 0.3), (2500.0, 4.0)):
+        scene.set_gains((0.5, stiffness, 0.5), (1e-3, rotational, 1e-3))
+        scene.reset()
+        data.mocap_pos[-1] += offset
+        data.mocap_quat[-1] = quaternion
+        mujoco.mj_forward(model, data)
+        # a resting tool: f = K (h - x), torque = K_r log(R_h R_xT), in the free joint's axes
+        assert data.qfrc_actuator[:3] == pytest.approx(stiffness * offset, rel=1e-12)
+        assert data.qfrc_actuator[3:] == pytest.approx(rotational * turn, rel=1e-12)
+
+
+@pytest.mark.parametrize("value", ["nan", "-inf", "infinity"])
+@pytest.mark.parametrize(
+    "element",
+    [
+        "<geom size='.01' mass='{}'/>",
+        "<geom size='.01' density='{}'/>",
+        "<inertial pos='0 0 0' mass='{}' diaginertia='1 1 1'/>",
+        "<inertial pos='0 0 0' mass='1' diaginertia='1 {} 1'/>",
+        "<inertial pos='0 0 0' mass='1' fullinertia='1 1 1 0 {} 0'/>",
+    ],
+)
+@pytest.mark.filterwarnings("ignore:XML contains")
+def test_infinite_mass_is_told_where_written(tmp_path: Path, element: str, value: str) -> None:
+    body = f"<body name='tool'><freejoint/>\n{element.format(value)}<site name='grip'/></body>"
+    message = refusal_of(tmp_path, mjcf(f"<!-- {element.format(value)} -->", body=body))
+    assert "finite" in message
+    if "scene.xml" in message:
+        assert "line 2" in message and value in message
+
+
+def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_path: Path) -> None:
+    body = FREE_TOOL.replace('size="0.01" mass="0.1"', 'size="1e200"')
+    message = refusal_of(tmp_path, mjcf(body=body))
+    assert message.startswith("body 'tool' has mass inf kg")
+    body = FREE_TOOL.replace('mass="0.1"', 'mass="1e308"')
+    message = refusal_of(tmp_path, mjcf(body=body))
+    assert message.startswith("body 'tool' has mass 1e+308 kg and inertia [inf, inf, inf]")
+    default = "<default><geom mass='nan'/></default>"
+    scene_file(tmp_path, f"<mujocoinclude>\n{default}</mujocoinclude>", "part.xml")
+    message = refusal_of(tmp_path, mjcf("<include file='part.xml'/>"))
+    assert message.startswith("part.xml, line 2: mass of <geom> is 'nan'")
+
+
+def test_force_limit_of_joint_is_refused_on_tool_and_accepted_elsewhere(tmp_path: Path) -> None:
+    limit = "actuatorfrcrange='-1 1'"
+    outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{{}}</body>"
+    message = refusal_of(tmp_path, mjcf(body=outer.format(HINGE_TOOL.format(joint=""))))
+    assert message.startswith("joint 'base' of body 'stand' limits actuator forces")
+    unnamed = HINGE_TOOL.format(joint=limit).replace('name="elbow"', "")
+    assert refusal_of(tmp_path, mjcf(body=unnamed)).startswith("joint '0' of body 'arm'")
+    elsewhere = f"<body pos='1 0 0'><joint {limit}/><geom size='.01'/></body>"
+    load_scene(scene_file(tmp_path, mjcf(world=elsewhere)))
+
+
+TABLE = "<geom name='table' type='plane' size='1 1 1'/>"
+
+
+def resting(height: float) -> str:
+    body = FREE_TOOL.replace('name="tool">', f'name="tool" pos="0 0 {height}">', 1)
+    return mjcf(body=body, world=TABLE)
+
+
+def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) -> None:
+    message = refusal_of(tmp_path, resting(0.0098))
+    assert "overlap by 0.2 mm" in message
+    assert "geom 'table' and geom 'ball'" in message
+    unnamed = resting(0.005).replace('name="ball"', "").replace("name='table'", "")
+    message = refusal_of(tmp_path, unnamed)
+    assert "overlap by 5 mm" in message
+    assert "geom 0 of the world and geom 1 of body 'tool'" in message
+
+
+@given(depth=st.floats(1e-5, 5e-3))
+@example(depth=0.05e-3)
+@example(depth=0.099e-3)
+@example(depth=0.101e-3)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_start_is_refused_exactly_beyond_tenth_of_millimetre(tmp_path: Path, depth: float) -> None:
+    path = scene_file(tmp_path, resting(0.01 - depth))
+    if depth > 1.0001e-4:
+        assert "starts in penetration" in refusal(path)
+    elif depth < 0.9999e-4:
+        load_scene(path)
+
+
+def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:
+    deep = "<keyframe><key name='{}' qpos='0 0 0.005 1 0 0 0'/></keyframe>"
+    text = resting(1.0).replace("</mujoco>", deep + "</mujoco>")
+    load_scene(scene_file(tmp_path, text.format("other")))
+    assert "overlap by 5 mm" in refusal_of(tmp_path, text.format("home"))
+
+
+def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not(tmp_path: Path) -> None:
+    sunk = "<body pos='1 0 .005'><freejoint/><geom size='.01'/></body>"
+    load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)))
+    cloth = (
+        "<flexcomp name='cloth' type='grid' count='4 4 1' spacing='.05 .05 .05' mass='1' "
+        "radius='.001'><edge equality='true'/></flexcomp>"
+    )
+    message = refusal_of(tmp_path, mjcf(world=cloth))
+    assert "geom 'ball' and flex 'cloth'" in message
+
+
+@pytest.mark.parametrize(
+    "key", ["qpos='0 0 1e11 1 0 0 0 0'", "qvel='0 0 1e11 0 0 0 0'", "ctrl='1e11'"]
+)
+def test_start_that_mujoco_would_not_step_is_refused(tmp_path: Path, key: str) -> None:
+    world = "<body pos='1 0 0'><joint name='j' type='slide'/><geom size='.01'/></body>"
+    text = mjcf(
+        "<actuator><motor joint='j'/></actuator>",
+        f"<keyframe><key name='home' {key}/></keyframe>",
+        world=world,
+    )
+    assert f"in {key.split('=', maxsplit=1)[0]}" in refusal_of(tmp_path, text)
+
+
+def test_control_so_large_that_mujoco_ignores_all_controls_is_refused(tmp_path: Path) -> None:
+    body = HINGE_TOOL.format(joint="")
+    text = mjcf("<actuator><motor name='m' joint='elbow'/></actuator>", body=body)
+    scene = load_scene(scene_file(tmp_path, text))
+    scene.set_gains((2.0, 1000.0, 2.0), (1e-3, 1.0, 1e-3))
+    scene.data.ctrl[1] = 0.5  # a handle that moves with 0.5 m/s
+    for value, force in ((1e10, 1.0), (1.01e10, 0.0)):
+        scene.data.ctrl[0] = value
+        mujoco.mj_forward(scene.model, scene.data)
+        # what the refusal is for: the coupling's damper would act against the world
+        assert scene.data.actuator_force[1] == pytest.approx(force, abs=1e-9)
+        if force:
+            assert input_writes(scene.model, ctrl={"m": value}) == [("ctrl", 0, [value])]
+        else:
+            with pytest.raises(hb.SceneError, match=r"'m'.* up to 1e\+10"):
+                input_writes(scene.model, ctrl={"m": value})

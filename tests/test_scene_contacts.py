@@ -1,0 +1,386 @@
+"""The rule for contact settings: its numbers, its grades, its sentences, and the shipped scenes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
+from hapticbridge.lab.methods import METHODS
+from hapticbridge.rendering import prepare
+from hapticbridge.scene import load_scene, scene_names
+from hapticbridge.scene.contacts import (
+    SUGGESTED,
+    check_contacts,
+    contact_concerns,
+    contact_numbers,
+    contact_settings,
+    suggested_solref,
+)
+
+H = 1e-3
+SOLIMP = (0.9, 0.95, 0.001)
+GRADES = ("active", "within slack", "strict")
+
+SCENE = """
+<mujoco>
+  <option timestep="0.001" integrator="discrete" cone="{cone}" gravity="0 0 0">
+    <flag diagexact="enable"/>
+  </option>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1" pos="0 0 -0.1" {floor}/>
+    <body name="tool">
+      <freejoint/>
+      <geom name="tip" type="sphere" size="0.01" mass="0.1" {tip}/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+  {more}
+</mujoco>
+"""
+GOOD = 'solref="0.002 1"'
+HARD = 'solref="-1000000 -500"'
+
+
+def scene(folder: Path, *, floor: str, tip: str, more: str = "", cone: str = "elliptic") -> Path:
+    path = folder / "scene.xml"
+    path.write_text(SCENE.format(floor=floor, tip=tip, more=more, cone=cone))
+    return path
+
+
+def test_shipped_setting_relaxes_within_3_8_steps_and_is_within_the_slack() -> None:
+    numbers = contact_numbers((0.002, 1.0), SOLIMP, H)
+    assert numbers.relaxation == pytest.approx(3.8)
+    assert numbers.resolved == pytest.approx(2)
+    assert numbers.stiffness == pytest.approx(9 / 4, rel=0.02)
+    assert numbers.impedance == pytest.approx(0.901)
+    assert numbers.grade == "within slack"
+    assert contact_concerns((0.002, 1.0), SOLIMP, H) == []
+
+
+@given(st.floats(1e-5, 0.1), st.floats(0.05, 100), st.floats(1e-4, 1e-2), st.floats(0.01, 0.999))
+def test_both_formats_agree(
+    timeconst: float, ratio: float, timestep: float, impedance: float
+) -> None:
+    direct = (-1 / (timeconst * ratio) ** 2, -2 / timeconst)
+    one = contact_numbers((timeconst, ratio), (impedance,), timestep)
+    other = contact_numbers(direct, (impedance,), timestep)
+
+    assert other.relaxation == pytest.approx(one.relaxation, rel=1e-9)
+    assert other.resolved == pytest.approx(one.resolved, rel=1e-9)
+    assert other.stiffness == pytest.approx(one.stiffness, rel=1e-9)
+
+
+@given(st.floats(1e-4, 0.1), st.floats(0.05, 100), st.floats(1, 10), st.floats(1, 10))
+def test_softer_is_never_worse(timeconst: float, ratio: float, longer: float, more: float) -> None:
+    before = contact_numbers((timeconst, ratio), SOLIMP, H).grade
+    after = contact_numbers((timeconst * longer, ratio * more), SOLIMP, H).grade
+    assert GRADES.index(after) >= GRADES.index(before)
+
+
+@given(st.floats(1e-5, 1e-1))
+def test_suggestion_is_strict_and_silent_at_every_time_step(timestep: float) -> None:
+    first, second = SUGGESTED[0] * timestep, SUGGESTED[1]
+    assert contact_numbers((first, second), SOLIMP, timestep).grade == "strict"
+    assert contact_concerns((first, second), SOLIMP, timestep, diagexact=False) == []
+    words = suggested_solref(timestep).split('"')[1].split()
+    assert [float(word) for word in words] == pytest.approx([first, second], rel=1e-5)
+
+
+NOT_MET = f'<geom name="lamp" size="0.01" pos="3 3 3" contype="4" conaffinity="4" {GOOD}/>'
+
+
+@pytest.mark.parametrize(
+    ("solref", "solimp", "words"),
+    [
+        *((solref, SOLIMP, ("more energy than the coupling's slack", 'write solref="0.0005 8"'))
+          for solref in ((-20_000.0, -50.0), (-1e6, -500.0), (0.001, 1.0), (0.02, 0.1))),
+        ((0.004, 2.0), (0.99, 0.99, 0.001),
+         ("impedance 0.99", 'write solref="0.0005 8" and solimp="0.9 0.95 0.001"')),
+        ((0.02, 1.0), SOLIMP, ("is soft: a steady force sinks in 100 times as deep",)),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_told_with_what_to_write(
+    solref: tuple[float, float], solimp: tuple[float, ...], words: tuple[str, ...]
+) -> None:
+    (said, *_) = contact_concerns(solref, solimp, H)
+    assert all(word in said for word in words)
+    assert (contact_numbers(solref, solimp, H).grade == "active") == (len(words) > 1)
+
+
+@pytest.mark.parametrize(
+    ("solref", "solimp", "timestep"),
+    [((math.nan, 1.0), SOLIMP, H), ((0.002,), SOLIMP, H), ((0.002, 1.0), (), H),
+     ((0.002, 1.0), SOLIMP, 0.0), ((0.002, 1.0), SOLIMP, math.inf)],
+)  # fmt: skip
+def test_bad_numbers_are_refused(solref: Any, solimp: Any, timestep: float) -> None:
+    with pytest.raises(SceneError, match="a contact needs two numbers"):
+        contact_numbers(solref, solimp, timestep)
+
+
+def test_pyramids_are_named_only_where_friction_is_low_but_not_left_out() -> None:
+    (said,) = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", friction=0.1)
+    assert 'write cone="elliptic"' in said
+    rough = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", friction=0.42)
+    without = contact_concerns((0.0005, 8.0), SOLIMP, H, cone="pyramidal", condim=1, friction=0.0)
+    assert rough == without == []
+
+
+def test_approximate_diagonal_is_named_unless_the_contact_is_strict_anyway() -> None:
+    (said,) = contact_concerns((0.002, 1.0), SOLIMP, H, diagexact=False)
+    assert 'write <flag diagexact="enable"/>' in said
+
+
+def test_contact_without_a_spring_stores_nothing_and_sinks_for_ever() -> None:
+    numbers = contact_numbers((0.0, -100.0), SOLIMP, H)
+    assert numbers.grade == "strict"
+    assert math.isinf(numbers.softness)
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_shipped_scenes_obey_the_whole_rule(name: str) -> None:
+    loaded = load_scene(name)
+    assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
+
+
+def concerns_of(path: Path, *, is_thorough: bool = False) -> list[str]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = load_scene(path)
+    return check_contacts(loaded.model, loaded.grip, is_thorough=is_thorough)
+
+
+def test_an_active_contact_is_named_by_its_geom_and_setting(tmp_path: Path) -> None:
+    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=HARD))
+    assert "geom 'tip' with geom 'floor'" in said
+    assert 'solref "-1e+06 -500"' in said
+    assert 'write solref="0.0005 8"' in said
+
+
+def test_a_pair_is_named_by_both_geoms(tmp_path: Path) -> None:
+    pair = f'<contact><pair geom1="tip" geom2="floor" {HARD}/></contact>'
+    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=GOOD, more=pair))
+    assert "geom 'floor' with geom 'tip'" in said
+
+
+def test_defaults_that_nobody_chose_are_mentioned_only_when_asked(tmp_path: Path) -> None:
+    path = scene(tmp_path, floor="", tip="", cone="pyramidal")
+    assert concerns_of(path) == []
+    said = " ".join(concerns_of(path, is_thorough=True))
+    assert "is soft" in said
+    assert "geom 'tip' with geom 'floor'" in said
+
+
+def test_approximate_diagonal_of_a_model_is_mentioned_when_asked(tmp_path: Path) -> None:
+    loaded = load_scene(scene(tmp_path, floor=GOOD, tip=GOOD))
+    assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
+    loaded.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
+    assert check_contacts(loaded.model, loaded.grip) == []
+    (said,) = check_contacts(loaded.model, loaded.grip, is_thorough=True)
+    assert "approximate diagonal" in said
+
+
+def test_the_global_override_is_what_counts(tmp_path: Path) -> None:
+    more = '<option o_solref="-1000000 -500"><flag override="enable"/></option>'
+    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=GOOD, more=more))
+    assert 'solref "-1e+06 -500"' in said
+
+
+def test_a_slippery_pyramid_is_named_unless_its_partner_is_rough(tmp_path: Path) -> None:
+    slippery = GOOD + ' friction="0.05"'
+    (said,) = concerns_of(scene(tmp_path, floor=slippery, tip=slippery, cone="pyramidal"))
+    assert "geom 'tip' with geom 'floor'" in said
+    assert "friction of 0.05" in said
+    rough = GOOD + ' friction="0.8"'
+    assert concerns_of(scene(tmp_path, floor=rough, tip=slippery, cone="pyramidal")) == []
+
+
+def prepared(path: Path, rate: float, substeps: int = 1, method: str = "implicit") -> list[str]:
+    """Returns the warnings of loading a scene and preparing it for a rate in Hz."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        loaded = load_scene(path)
+        prepare(loaded, Coupling(1000.0, 0.5, 1.0, 5e-4), 1 / rate, substeps, METHODS[method])
+    return [str(one.message) for one in caught]
+
+
+def test_contacts_are_judged_once_at_the_step_that_the_bridge_runs_at(tmp_path: Path) -> None:
+    path = scene(tmp_path, floor=GOOD, tip=GOOD)
+    path.write_text(path.read_text().replace('timestep="0.001"', 'timestep="0.005"'))
+    (said,) = prepared(path, 200)
+    assert "time step 0.005 s" in said
+    assert "more energy than the coupling's slack" in said
+    assert prepared(path, 1000) == prepared(path, 200, substeps=5) == []
+
+
+def test_a_method_that_solves_contacts_in_its_own_way_is_not_judged(tmp_path: Path) -> None:
+    path = scene(tmp_path, floor=GOOD, tip=HARD)
+    assert prepared(path, 1000) != []
+    assert prepared(path, 1000, method="explicit") == []
+
+
+@pytest.mark.parametrize(
+    ("solref", "solimp", "grade", "light"),
+    [
+        # as shipped, more damped, damped and stiff, strict
+        ((0.002, 1.0), SOLIMP, "within slack", "active"),
+        ((0.0019, 1.0), SOLIMP, "active", "active"),
+        ((0.00025, 8.0), SOLIMP, "within slack", "within slack"),
+        ((0.00025, 7.8), SOLIMP, "within slack", "active"),
+        ((0.0005, 8.0), SOLIMP, "strict", "strict"),
+        ((0.0005, 7.8), SOLIMP, "within slack", "within slack"),
+        ((0.00002, 100.0), SOLIMP, "strict", "strict"),
+        # κ = 2.28 needs more than 60 steps: 228
+        ((0.00004, 50.0), SOLIMP, "within slack", "within slack"),
+        # κ = 3.8 and 4.2 at τ = 1000 h
+        ((1.55e-6, 1000.0), SOLIMP, "strict", "strict"),
+        ((1.47e-6, 1000.0), SOLIMP, "active", "active"),
+        # impedance
+        ((0.004, 2.1), (0.905, 0.905, 0.001), "within slack", "within slack"),
+        ((0.002, 2.0), (0.95, 0.95, 0.001), "active", "active"),
+        ((0.004, 8.0), (0.99, 0.99, 0.001), "strict", "strict"),
+        ((0.004, 2.0), (0.99, 0.99, 0.001), "active", "active"),
+        ((0.0005, 8.0), (0.0001, 0.99, 0.00001), "active", "active"),
+        ((0.002, 2.0), (0.9, 0.99, 0.001), "within slack", "active"),
+        ((0.002, 1.0), (0.5, 0.5, 0.001), "active", "active"),
+        ((0.002, 1.4), (0.5, 0.5, 0.001), "within slack", "active"),
+    ],
+)
+def test_grades_beside_every_line(
+    solref: tuple[float, float], solimp: tuple[float, float, float], grade: str, light: str
+) -> None:
+    numbers = contact_numbers(solref, solimp, H)
+    assert (numbers.grade, numbers.light_grade) == (grade, light)
+
+
+def test_refsafe_raises_what_the_step_cannot_resolve() -> None:
+    safe = contact_numbers((0.0001, 2.0), SOLIMP, H)
+    unsafe = contact_numbers((0.0001, 2.0), SOLIMP, H, refsafe=False)
+    assert safe.resolved == 1
+    assert unsafe.resolved == pytest.approx(0.2)
+    assert unsafe.relaxation == pytest.approx(safe.relaxation / 5)
+
+
+@given(
+    st.lists(st.floats(0.01, 0.99), min_size=2, max_size=2),
+    st.floats(2e-5, 1e-3), st.floats(0.1, 0.9), st.floats(1, 4),
+)  # fmt: skip
+@settings(max_examples=25)
+def test_impedance_is_the_one_that_mujoco_gives_a_contact_0_1_mm_deep(
+    impedances: list[float], width: float, midpoint: float, power: float
+) -> None:
+    solimp = (*impedances, width, midpoint, power)
+    words = " ".join(map(str, solimp))
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><geom type="plane" size="1 1 1" solimp="{words}"/>
+        <body pos="0 0 0.0099"><freejoint/><geom size="0.01" solimp="{words}"/></body>
+        </worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.contact.dist[0] == pytest.approx(-1e-4)
+    found = contact_numbers((0.02, 1.0), solimp, H).impedance
+    assert found == pytest.approx(data.efc_KBIP[0, 2], rel=1e-6)
+    # MuJoCo's own stiffness and damping, in its second and first place
+    relaxation = data.efc_KBIP[0, 1] / data.efc_KBIP[0, 0]
+    assert contact_numbers((0.02, 1.0), solimp, H).relaxation * H == pytest.approx(relaxation)
+
+
+@pytest.mark.parametrize(
+    ("floor", "tip", "more", "flag"),
+    [
+        (GOOD + ' contype="2" conaffinity="2"', HARD, "", ""),
+        (GOOD, HARD, '<contact><exclude body1="tool" body2="world"/></contact>', ""),
+        (GOOD, HARD, "", 'contact="disable"'),
+        (GOOD, HARD, "", 'constraint="disable"'),
+        (HARD, HARD, f'<contact><pair geom1="tip" geom2="floor" {GOOD}/></contact>', ""),
+        ('solref="0.002 1"', 'solref="0.0005 1" solmix="0"', "", ""),
+        (GOOD + ' priority="1"', HARD, f"<worldbody>{NOT_MET}</worldbody>", ""),
+    ],
+    ids=["masks", "exclude", "no contacts", "no constraints", "pair", "solmix", "yields"],
+)
+def test_settings_unmet_untold(tmp_path: Path, floor: str, tip: str, more: str, flag: str) -> None:
+    path = scene(tmp_path, floor=floor, tip=tip, more=more)
+    path.write_text(path.read_text().replace("<flag ", f"<flag {flag} "))
+    assert concerns_of(path) == []
+
+
+@pytest.mark.parametrize("smooth", ["floor", "tip"])
+def test_slippery_geom_of_priority_makes_rough_one_slippery(tmp_path: Path, smooth: str) -> None:
+    settings_of = {"floor": GOOD, "tip": GOOD, smooth: GOOD + ' priority="1" friction="0.05"'}
+    (said,) = concerns_of(scene(tmp_path, cone="pyramidal", **settings_of))
+    assert "friction of 0.05" in said
+
+
+def test_without_refsafe_a_setting_is_judged_as_written(tmp_path: Path) -> None:
+    hard = 'solref="0.0001 2"'
+    (said,) = concerns_of(scene(tmp_path, floor=hard, tip=hard))
+    assert "stiffness 9.1 " in said
+    path = scene(tmp_path, floor=hard, tip=hard)
+    path.write_text(path.read_text().replace("<flag ", '<flag refsafe="disable" '))
+    (said,) = concerns_of(path)
+    assert "stiffness 228 " in said
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("solimp", ["", 'solimp="0.9 0.99 0.001"', 'solimp="0.9 1 0.022"'])
+def test_ordinary_scenes_are_not_called_active(tmp_path: Path, cone: str, solimp: str) -> None:
+    assert concerns_of(scene(tmp_path, floor=solimp, tip=solimp, cone=cone)) == []
+
+
+GEOM = st.fixed_dictionaries(
+    {
+        "priority": st.integers(0, 1),
+        "solmix": st.sampled_from([0.0, 0.3, 1.0, 5.0]),
+        "solref": st.sampled_from(["0.002 1", "0.02 0.5", "-1000 -10", "-3000 -5"]),
+        "solimp": st.sampled_from(["0.9 0.95 0.001", "0.5 0.6 0.01 0.3 1"]),
+        "condim": st.sampled_from([1, 3, 4, 6]),
+        "friction": st.floats(0.01, 2),
+        "contype": st.integers(0, 3),
+        "conaffinity": st.integers(0, 3),
+    }
+)
+
+
+@given(st.lists(GEOM, min_size=4, max_size=4), st.sampled_from(["", 'filterparent="disable"']),
+       st.sampled_from(["", '<exclude body1="link" body2="world"/>',
+                        '<exclude body1="tool" body2="box"/>', '<pair geom1="a" geom2="d"/>']),
+)  # fmt: skip
+@settings(max_examples=60)
+def test_settings_are_mujocos(geoms: list[dict[str, object]], flag: str, more: str) -> None:
+    a, b, c, d = (" ".join(f'{k}="{v}"' for k, v in one.items()) for one in geoms)
+    # all four overlap, so that MuJoCo makes every contact that it may
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option><flag {flag}/></option><worldbody>
+        <geom name="d" size="0.1" {d}/>
+        <body name="box" pos="0.05 0 0"><freejoint/><geom name="c" size="0.1" {c}/></body>
+        <body name="tool" pos="0 0.05 0"><freejoint/><geom name="a" size="0.1" {a}/>
+          <site name="grip"/>
+          <body name="link" pos="0 0 0.05"><joint/><geom name="b" size="0.1" {b}/></body>
+        </body></worldbody><contact>{more}</contact></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    tool = {model.geom("a").id, model.geom("b").id}
+    expected = {
+        frozenset(contact.geom.tolist()): (
+            *contact.solref, *contact.solimp, contact.dim, contact.friction[0]
+        )
+        for contact in data.contact
+        if tool & set(contact.geom.tolist())
+    }  # fmt: skip
+    found = {
+        frozenset((first, second)): (*one.solref, *one.solimp, one.condim, one.friction)
+        for first, second, one in contact_settings(model, "grip")
+    }
+    assert found.keys() == expected.keys()
+    for key, values in expected.items():
+        assert found[key] == pytest.approx(values)

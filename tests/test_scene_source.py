@@ -1,0 +1,255 @@
+"""A scene's source files and its compiled model."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import mujoco
+import pytest
+from audit_cases import recorded
+from hypothesis import given
+from hypothesis import strategies as st
+from outside_scenes import mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
+from scene_cases import RICH
+
+from hapticbridge.audit import audit
+from hapticbridge.errors import SceneError
+from hapticbridge.run_description import compiled_model
+from hapticbridge.scene import load_scene
+from hapticbridge.scene.source import read_elements
+
+MESHED = """<body name="tool"><freejoint/><geom type="mesh" mesh="m" mass=".1"/>
+<site name="grip"/></body>"""
+
+
+MESH = '<asset><mesh name="m" file="{}"/></asset>'
+
+
+PART = "<mujocoinclude>{}</mujocoinclude>"
+
+
+Layout = dict[str, str | bytes]
+
+
+URDF = """<robot name="r">
+  <mujoco><compiler strippath="false"/></mujoco>
+  <link name="base"/>
+  <joint name="hinge" type="continuous"><parent link="base"/><child link="arm"/></joint>
+  <link name="arm">
+    <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><mesh filename="meshes/a.obj"/></geometry></collision>
+  </link>
+</robot>"""
+
+
+LAYOUTS: dict[str, Layout] = {
+    "mesh beside": {"main.xml": mjcf(MESH.format("a.stl"), body=MESHED), "a.stl": stl_bytes()},
+    "obj and meshdir": {
+        "main.xml": mjcf("<compiler meshdir='m'/>", MESH.format("a.obj"), body=MESHED),
+        "m/a.obj": obj_bytes(),
+    },
+    "assetdir for mesh, texture and height field": {
+        "main.xml": mjcf(
+            "<compiler assetdir='assets'/>",
+            MESH.format("a.obj"),
+            "<asset><texture name='t' type='2d' file='t.png'/>"
+            "<hfield name='h' file='h.png' size='1 1 .1 .1'/></asset>",
+            body=MESHED,
+            world="<geom type='hfield' hfield='h' pos='0 0 -2'/>",
+        ),
+        "assets/a.obj": obj_bytes(),
+        "assets/t.png": png_bytes(),
+        "assets/h.png": png_bytes(90),
+    },
+    "texturedir and faces of a cube": {
+        "main.xml": mjcf(
+            "<compiler texturedir='t' meshdir='m'/>",
+            "<asset><texture name='c' type='cube' fileright='r.png' fileleft='l.png' "
+            "fileup='r.png' filedown='d.png' filefront='r.png' fileback='b.png'/></asset>",
+        ),
+        **{f"t/{name}.png": png_bytes(number) for number, name in enumerate("rldb")},
+    },
+    "strippath": {
+        "main.xml": mjcf(
+            "<compiler meshdir='m' strippath='true'/>",
+            MESH.format("/home/somebody/cad/a.stl"),
+            body=MESHED,
+        ),
+        "m/a.stl": stl_bytes(),
+    },
+    "nested includes, relative to the main file or to their own": {
+        "main.xml": mjcf("<include file='parts/one.xml'/>", body=MESHED),
+        "parts/one.xml": PART.format("<include file='deep/two.xml'/>"),
+        "parts/deep/two.xml": PART.format("<include file='common.xml'/>" + MESH.format("a.stl")),
+        "common.xml": PART.format("<option gravity='0 0 -3'/>"),
+        "parts/deep/a.stl": stl_bytes(),
+    },
+    "compiler in one include, mesh in another": {
+        "main.xml": mjcf("<include file='mesh.xml'/><include file='inc/c.xml'/>", body=MESHED),
+        "mesh.xml": PART.format(MESH.format("a.stl")),
+        "inc/c.xml": PART.format("<compiler meshdir='geometry'/>"),
+        "geometry/a.stl": stl_bytes(),
+        "a.stl": stl_bytes(0.5),
+    },
+    "attached model with assets of its own": {
+        "main.xml": mjcf(
+            "<compiler meshdir='mine'/>",
+            "<asset><model name='g' file='gripper/g.xml'/><mesh name='m' file='a.stl'/></asset>",
+            body=MESHED,
+            world="<frame pos='1 0 0'><attach model='g' body='finger' prefix='g_'/></frame>",
+        ),
+        "mine/a.stl": stl_bytes(),
+        "gripper/g.xml": "<mujoco><compiler meshdir='meshes'/><include file='more.xml'/>"
+        "<worldbody><body name='finger'><joint/><geom type='mesh' mesh='f' mass='1'/></body>"
+        "</worldbody></mujoco>",
+        "gripper/more.xml": PART.format("<asset><mesh name='f' file='f.obj'/></asset>"),
+        "gripper/meshes/f.obj": obj_bytes(0.02),
+    },
+    "assets above the scene's folder": {
+        "scenes/main.xml": mjcf(
+            MESH.format("../shared/a.stl"), "<include file='../common.xml'/>", body=MESHED
+        ),
+        "shared/a.stl": stl_bytes(),
+        "common.xml": PART.format("<option gravity='0 0 -3'/>"),
+    },
+    "comments and names that only MuJoCo's parser accepts": {
+        "main.xml": "<!-- a -- b <include file='gone.xml'/> -->\n"
+        + mjcf(MESH.format("R&D.stl"), "<include file='a&amp;b.xml'/>", body=MESHED),
+        "R&D.stl": stl_bytes(),
+        "a&b.xml": PART.format("<option gravity='0 0 -3'/>"),
+    },
+    "spaces, other letters, byte-order mark and declaration": {
+        "Zähne und Löcher/main.xml": b"\xef\xbb\xbf<?xml version='1.0'?><!-- first -->"
+        + mjcf(MESH.format("größe 1.stl"), body=MESHED).encode(),
+        "Zähne und Löcher/größe 1.stl": stl_bytes(),
+    },
+    "backslashes": {"main.xml": mjcf(MESH.format("m\\a.stl"), body=MESHED), "m/a.stl": stl_bytes()},
+    "attached robot in URDF": {
+        "main.xml": mjcf(
+            "<asset><model name='r' file='robot/r.urdf'/></asset>",
+            world="<frame pos='1 0 0'><attach model='r' body='arm' prefix='r_'/></frame>",
+        ),
+        "robot/r.urdf": URDF,
+        "robot/meshes/a.obj": obj_bytes(),
+    },
+    "soft body from a mesh": {
+        "main.xml": mjcf(
+            "<compiler meshdir='m'/>",
+            world="<body name='b' pos='0 0 1'><flexcomp name='f' type='mesh' file='a.obj' dim='2' "
+            "mass='.1' radius='.001'><edge equality='true'/></flexcomp></body>",
+        ),
+        "m/a.obj": obj_bytes(0.1),
+    },
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS.keys())
+def test_sources_are_every_file_and_rebuild_the_same_model(tmp_path: Path, layout: Layout) -> None:
+    for name, content in layout.items():
+        scene_file(tmp_path / "original", content, name)
+    main = next(name for name in layout if name.endswith("main.xml"))
+    # a decoy that nobody names
+    scene_file(tmp_path / "original", stl_bytes(0.3), "unused.stl")
+    scene = load_scene(tmp_path / "original" / main)
+    sources = {source.name: source.data for source in scene.sources}
+    assert Path(scene.sources[0].name).name == "main.xml"
+    expected = {n: c.encode() if isinstance(c, str) else c for n, c in layout.items()}
+    if "geometry/a.stl" in layout:
+        del expected["a.stl"]  # hidden by meshdir
+    inner = "Zähne und Löcher/" if main.startswith("Z") else ""
+    assert sources == {name.removeprefix(inner): data for name, data in expected.items()}
+    for name, data in sources.items():
+        scene_file(tmp_path / "rebuilt1" / inner, data, name)
+    again = load_scene(tmp_path / "rebuilt1" / inner / scene.sources[0].name)
+    # a compiled model holds the paths of its assets
+    model = compiled_model(again.model).replace(b"/rebuilt1/", b"/original/")
+    assert model == compiled_model(scene.model)
+
+
+def test_compiled_model_is_the_same_in_every_compilation(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, RICH)
+    assert compiled_model(load_scene(path).model) == compiled_model(load_scene(path).model)
+
+
+def test_relative_path_works_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, content in LAYOUTS["assets above the scene's folder"].items():
+        scene_file(tmp_path, content, name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    scene = load_scene(os.path.join("..", "scenes", "main.xml"))  # noqa: PTH118 - as typed
+    assert [s.name for s in scene.sources] == ["scenes/main.xml", "shared/a.stl", "common.xml"]
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_can_be_looked_through_for_elements(data: bytes) -> None:
+    for element in read_elements(b"<a x='1'/>\n" + data + b'\n<!-- \n --><b y="2">'):
+        assert element.line >= 1
+
+
+def test_elements_are_read_with_their_lines_and_values() -> None:
+    text = b"<a>\n<!-- <x/>\n -- --><b p='1' q = \"a &amp; &lt;b>\"/>\n\n<c:d\n r='2'></c:d></a>"
+    found = [(e.tag, e.attributes, e.line) for e in read_elements(text)]
+    assert found == [("a", {}, 1), ("b", {"p": "1", "q": "a & <b>"}, 3), ("c:d", {"r": "2"}, 5)]
+
+
+def test_compiled_model_does_not_depend_on_the_folder_or_tell_it(tmp_path: Path) -> None:
+    compiled = []
+    for folder in (tmp_path / "a", tmp_path / "elsewhere" / "b"):
+        (folder / "meshes").mkdir(parents=True)
+        (folder / "meshes" / "t.obj").write_text(
+            "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+        )
+        (folder / "s.xml").write_text(
+            """<mujoco><compiler meshdir="meshes"/><asset><mesh name="t" file="t.obj"/></asset>
+            <worldbody><body><freejoint/><geom type="mesh" mesh="t" mass=".1"/><site name="grip"/>
+            </body></worldbody></mujoco>"""
+        )
+        compiled.append(compiled_model(load_scene(folder / "s.xml").model))
+    assert compiled[0] == compiled[1]
+    assert str(tmp_path).encode() not in compiled[0]
+
+
+def built_spec() -> mujoco.MjSpec:
+    """A tool with numbers of more digits than MuJoCo writes, and a mesh that is in no file."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "built"
+    spec.assets = {"part.obj": obj_bytes()}
+    spec.add_mesh(name="part", file="part.obj")
+    tool = spec.worldbody.add_body(name="tool")
+    tool.add_freejoint()
+    tool.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part", mass=0.1234567890123)
+    tool.add_site(name="grip")
+    return spec
+
+
+def test_a_specification_is_loaded_with_its_exact_numbers_and_left_alone() -> None:
+    spec = built_spec()
+    scene = load_scene(spec)
+    assert (scene.name, scene.model.body("tool").mass[0]) == ("built", 0.1234567890123)
+    assert not spec.actuators and spec.body("tool") is not None
+    with pytest.raises(SceneError, match="a specification has no parameters, and 'clearance'"):
+        load_scene(spec, clearance=1e-4)
+
+
+def test_sources_of_a_specification_are_its_written_form_and_its_assets() -> None:
+    scene = load_scene(built_spec())
+    files = {source.name: source.data for source in scene.sources}
+    assert list(files) == ["built.xml", "part.obj"]
+    assert files["part.obj"] == obj_bytes()
+    again = mujoco.MjSpec.from_string(files["built.xml"].decode(), assets=files).compile()
+    assert again.body("tool").mass[0] == pytest.approx(0.1234567890123, rel=1e-5)
+
+
+def test_sources_of_a_specification_from_a_file_have_the_files_assets(tmp_path: Path) -> None:
+    (tmp_path / "part.obj").write_bytes(obj_bytes())
+    path = scene_file(tmp_path, mjcf(MESH.format("part.obj"), MESHED))
+    scene = load_scene(mujoco.MjSpec.from_file(str(path)))
+    assert [source.name for source in scene.sources][1:] == ["part.obj"]
+
+
+def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, load_scene(built_spec()), duration=0.1)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")

@@ -1,0 +1,134 @@
+"""What a device needs to show a coupling as it feels, against spectrum, worst hand and motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.theory.compensation import (
+    effective_damping,
+    largest_felt_damping,
+    law_damping,
+    needed_for_felt,
+)
+from hapticbridge.theory.rigid_body import drive_mass
+from hapticbridge.theory.sampled_loop import WorstHand
+
+T = 1e-3
+LAGS = {"implicit": 1.0, "midpoint": 0.5}
+
+
+def tool_spectrum(
+    theta: np.ndarray, stiffness: float, damping: float, mass: float, scheme: str
+) -> np.ndarray:
+    """(T/2) Re[(1 − w) H]/(1 − cos θ) of a free tool behind the law K, B'; an own derivation."""
+    w = np.exp(-1j * theta)
+    law = stiffness + damping * (1 - w) / T
+    moved = T**2 / mass / (1 - w) ** 2  # of a unit force, implicit Euler
+    if scheme == "midpoint":
+        moved = moved * (1 + w) / 2
+    felt = law / (1 + law * moved)
+    return np.asarray(T / 2 * ((1 - w) * felt).real / (1 - np.cos(theta)))
+
+
+@given(
+    k=st.floats(10.0, 1e4),
+    b=st.floats(0.0, 20.0),
+    mass=st.floats(1e-3, 10.0),
+    scheme=st.sampled_from(sorted(LAGS)),
+)
+def test_no_free_tool_needs_more_than_a_wall(k: float, b: float, mass: float, scheme: str) -> None:
+    damping = law_damping(k, b, T, LAGS[scheme])
+    theta = np.linspace(1e-3, np.pi, 4001)
+    needed = needed_for_felt(k, b, T, LAGS[scheme])
+    spectrum = tool_spectrum(theta, k, damping, mass, scheme)
+    assert spectrum.max() <= needed * (1 + 1e-9)
+    if scheme == "midpoint":  # at Nyquist a tool of any mass stands still
+        assert spectrum[-1] == pytest.approx(needed, rel=1e-6)
+    wall = tool_spectrum(theta, k, damping, 1e12, scheme)
+    assert wall[-1] == pytest.approx(needed, rel=1e-6)
+
+
+def looped(hand: WorstHand, stiffness: float, damping: float, mass: float, scheme: str) -> float:
+    """Runs hand, law K, B' and tool sample by sample; returns how much the force still grows."""
+    p, q, r = hand.recursion()
+    gain = (T**2 / mass) * (0.5 if scheme == "midpoint" else 1.0)  # of x_k by f_k
+    handle, speed, x, v, stretch, force = 1e-3, 0.0, 0.0, 0.0, 1e-3, 0.0
+    signal = np.zeros(20_000)
+    for k in range(signal.size):
+        rate = stiffness + damping / T
+        before = force
+        force = (rate * (handle - x - T * v) - damping / T * stretch) / (1 + rate * gain)
+        x += T * v + gain * force
+        v += T / mass * force
+        stretch = handle - x
+        speed = p * speed - q * force - r * before
+        handle += T * speed
+        signal[k] = force
+    return float(np.abs(signal[-4000:]).max() / np.abs(signal[-8000:-4000]).max())
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "implicit"])
+@pytest.mark.parametrize("mass", [0.01, 0.1, 1e9])  # the last one is a wall
+def test_worst_hand_in_time_domain_needs_what_spectrum_says(scheme: str, mass: float) -> None:
+    damping = law_damping(1000.0, 2.0, T, LAGS[scheme])
+    theta = np.linspace(0.05, np.pi, 20_001)
+    spectrum = tool_spectrum(theta, 1000.0, damping, mass, scheme)
+    most = int(np.argmax(spectrum))
+    bound = needed_for_felt(1000.0, 2.0, T, LAGS[scheme])
+    # a light tool helps the compensated coupling, and never the lossless one
+    is_as_hard = mass > 1 or scheme == "midpoint"
+    assert spectrum[most] == pytest.approx(bound, rel=1e-6) or not is_as_hard
+    assert spectrum[most] < 0.995 * bound or is_as_hard
+    back = np.exp(-1j * theta[most])
+    law = 1000.0 + damping * (1 - back) / T
+    moved = T**2 / mass / (1 - back) ** 2 * ((1 + back) / 2 if scheme == "midpoint" else 1.0)
+    response = complex(law / (1 + law * moved))
+    for share, grows in ((0.98, True), (1.02, False)):
+        hand = WorstHand(share * float(spectrum[most]), float(theta[most]) / T, T, response)
+        assert (looped(hand, 1000.0, damping, mass, scheme) > 1) == grows
+
+
+def test_formulas_of_the_theory_where_nothing_is_clipped() -> None:
+    assert needed_for_felt(1000.0, 5.0, T, 1.0) == pytest.approx(5.0 - 0.5)  # B − KT/2
+    assert needed_for_felt(1000.0, 5.0, T, 0.5) == pytest.approx(5.0)  # B
+    assert needed_for_felt(2400.0, 0.5, T, 0.5) == pytest.approx(1.2)  # clipped: KT/2
+    assert effective_damping(2400.0, 0.0, T, 0.5) == pytest.approx(1.2)
+    assert law_damping(1000.0, 5.0, T, 0.5) == pytest.approx(4.5)
+
+
+@pytest.mark.parametrize("scheme", ["compensated", "midpoint"])
+def test_a_mass_decays_as_fast_as_the_felt_damping_says(scheme: str) -> None:
+    # ln of the amplitude falls by B/(2m) a second, whatever the period, if B is what is felt
+    lag = LAGS["implicit"] if scheme == "compensated" else LAGS["midpoint"]
+    rates = []
+    for period in (1e-3, 5e-4):
+        damping = law_damping(1000.0, 5.0, period, lag)
+        coupling = Coupling(1000.0, effective_damping(1000.0, damping, period, lag), 0, 0)
+        assert coupling.damping == pytest.approx(5.0)
+        handle = np.zeros(round(1.0 / period) + 1)
+        motion = drive_mass(coupling, 1.0, handle, period, scheme, position=0.01)  # type: ignore[arg-type] # one of the schemes
+        energy = 500.0 * motion.position**2 + 0.5 * motion.velocity**2
+        rates.append(np.log(energy[0] / energy[-1]) / (1.0 * 2))
+    assert rates == pytest.approx([2.5, 2.5], rel=0.03)
+
+
+@pytest.mark.parametrize("period", [0.0, -1e-3, float("nan"), float("inf")])
+def test_a_period_out_of_range_is_refused(period: float) -> None:
+    with pytest.raises(CouplingError, match="period"):
+        needed_for_felt(1000.0, 5.0, period, 0.5)
+
+
+@given(k=st.floats(10.0, 1e4), b=st.floats(0.1, 20.0), scheme=st.sampled_from(sorted(LAGS)))
+def test_largest_felt_damping_is_what_device_just_bears(k: float, b: float, scheme: str) -> None:
+    most = largest_felt_damping(b, k, T, LAGS[scheme])
+    if k * T > 2 * b:
+        assert most == 0.0
+        assert needed_for_felt(k, 0.0, T, LAGS[scheme]) > b
+        return
+    assert needed_for_felt(k, most, T, LAGS[scheme]) == pytest.approx(b)
+    assert needed_for_felt(k, 1.01 * most, T, LAGS[scheme]) > b

@@ -1,0 +1,343 @@
+"""Point mass under a given force and behind the coupling: energy and accuracy of each scheme."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import MechanicsError
+from hapticbridge.theory.rigid_body import (
+    CoupledScheme,
+    Scheme,
+    drive_mass,
+    exact_mass_response,
+    integrate_particle,
+    integrate_rotation,
+)
+
+T = 1e-3
+COUPLING = Coupling(1000, 5, 0, 0)
+ALL: tuple[Scheme, ...] = ("explicit", "semi_implicit", "implicit", "midpoint")
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_force(seed: int, *shape: int) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).normal(0, 3, shape)
+
+
+def size(*terms: NDArray[np.float64]) -> float:
+    """Largest energy in a balance, times what rounding may leave of it."""
+    return 1e-12 * max(float(np.abs(term).max()) for term in terms)
+
+
+@given(seeds, st.floats(0.01, 10), st.floats(1e-4, 1e-2), st.floats(-1, 1))
+def test_energy_gain_is_closed(seed: int, mass: float, period: float, velocity: float) -> None:
+    force = random_force(seed, 50)
+    for scheme in ALL:
+        motion = integrate_particle(mass, force, period, scheme, velocity=velocity)
+        v, gain, kinetic = motion.velocity, motion.energy_gain, motion.kinetic_energy
+        rounding = size(kinetic, force * period * np.abs(v).max())
+        if scheme == "implicit":
+            expected = -0.5 * mass * np.diff(v) ** 2
+            by_force = -(period**2) * force[1:] ** 2 / (2 * mass)
+            assert gain == pytest.approx(by_force, rel=1e-9, abs=rounding)
+        elif scheme == "midpoint":
+            expected = np.zeros(49)
+        elif scheme == "explicit":
+            gain = gain[:-1]  # the last sample's v_{k+1} is not computed
+            expected = 0.5 * mass * (v[1:-1] + v[:-2]) ** 2 - mass * v[:-2] * (v[:-2] + v[2:])
+        else:
+            gain = np.diff(kinetic)[1:] - force[1:-1] * np.diff(motion.position)[:-1]
+            expected = 0.5 * mass * np.diff(v)[1:] ** 2
+        assert gain == pytest.approx(expected, rel=1e-9, abs=rounding)
+
+
+@given(seeds)
+def test_only_the_implicit_schemes_are_passive_under_any_force(seed: int) -> None:
+    # at rest, a force that opposes every motion: the schemes that lag behind it gain from it
+    motion = {s: integrate_particle(0.1, random_force(seed, 200), T, s) for s in ALL}
+    assert motion["implicit"].energy_gain.max() <= 1e-15
+    assert np.abs(motion["midpoint"].energy_gain).max() <= 1e-15
+    late = motion["semi_implicit"]
+    storage = late.kinetic_energy[2:] - late.kinetic_energy[1]
+    work = np.cumsum(late.force[1:-1] * np.diff(late.position)[:-1])
+    assert np.all(storage - work >= -1e-15)
+    assert (storage - work)[-1] > 0
+
+
+@pytest.mark.parametrize("scheme", ALL)
+def test_map_of_every_scheme_is_the_recursion_it_documents(scheme: Scheme) -> None:
+    force, mass = random_force(1, 20), 0.3
+    motion = integrate_particle(mass, force, T, scheme, position=0.2, velocity=-0.1)
+    x, v = 0.2, -0.1
+    for k in range(1, 20):
+        old = v
+        v += T / mass * force[k if scheme in {"implicit", "midpoint"} else k - 1]
+        x += T * {"explicit": old, "midpoint": (old + v) / 2}.get(scheme, v)
+        assert motion.velocity[k] == pytest.approx(v, rel=1e-12)
+        assert motion.position[k] == pytest.approx(x, rel=1e-12)
+
+
+def test_many_masses_move_at_once_as_they_move_alone() -> None:
+    mass, force = np.array([[0.1], [0.2]]), random_force(2, 30, 3)[:, None, :]
+    together = integrate_particle(mass, force, T, "midpoint")
+    assert together.position.shape == (30, 2, 3)
+    alone = integrate_particle(0.2, force[:, 0, 1], T, "midpoint")
+    assert together.position[:, 1, 1] == pytest.approx(alone.position, rel=1e-12)
+    handle = force[:, 0, :]
+    driven = drive_mass(COUPLING, mass, handle, T, "midpoint")
+    single = drive_mass(COUPLING, 0.2, handle[:, 1], T, "midpoint")
+    assert driven.position[:, 1, 1] == pytest.approx(single.position, rel=1e-12)
+
+
+def steady_response(scheme: CoupledScheme, mass: float, period: float, hertz: float) -> complex:
+    """X/H of a scheme from its transfer function, without any recursion."""
+    d = 1 - np.exp(-2j * np.pi * hertz * period)  # 1 − z⁻¹
+    k, b = COUPLING.stiffness, COUPLING.damping
+    inertial = mass * d**2 / period**2
+    if scheme == "compensated":
+        b = max(b - k * period, 0)
+    force = k + b / period * d
+    if scheme == "held":
+        inertial /= 1 - d
+    if scheme == "midpoint":
+        inertial *= 2 / (2 - d)
+        force -= k * d / 2
+    return complex(force / (force + inertial))
+
+
+ERRORS: dict[CoupledScheme, tuple[float, ...]] = {
+    "held": (0.54, 0.25, 0.12, 0.060, 0.030),
+    "implicit": (3.9, 2.4, 1.33, 0.71, 0.37),
+    "compensated": (0.41, 0.22, 0.114, 0.058, 0.029),
+    "midpoint": (0.127, 0.032, 0.0079, 0.0020, 0.0005),
+}
+"""RMS error over the amplitude in % at T = 4, 2, 1, 0.5, 0.25 ms, by an independent program."""
+
+
+@pytest.mark.parametrize("scheme", ERRORS)
+def test_driven_mass_follows_the_transfer_function_of_its_scheme(scheme: CoupledScheme) -> None:
+    mass, hertz = 1.0, 2.0
+    time = np.arange(8001) * T
+    motion = drive_mass(COUPLING, mass, np.sin(2 * np.pi * hertz * time), T, scheme)
+    response = steady_response(scheme, mass, T, hertz)
+    expected = np.imag(response * np.exp(2j * np.pi * hertz * time))
+    # the transient decays with B/2m = 2.5 per second
+    assert motion.position[-500:] == pytest.approx(expected[-500:], abs=1e-6)
+
+
+@pytest.mark.parametrize("scheme", ERRORS)
+def test_accuracy_behind_the_coupling_is_as_the_theory_prints(scheme: CoupledScheme) -> None:
+    """From rest, 2 s of a 2 Hz sine of amplitude 1, against the closed form with its transient."""
+    omega = 4 * np.pi
+    gain = complex(exact_mass_response(COUPLING, 1.0, 2.0))
+    roots = np.roots([1.0, COUPLING.damping, COUPLING.stiffness])
+    initial = [-gain.imag, -(1j * omega * gain).imag]  # takes the forced motion's start away
+    free = np.linalg.solve(np.array([[1, 1], roots]), initial)
+    for period, percent in zip((4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4), ERRORS[scheme], strict=True):
+        time = np.arange(round(2 / period) + 1) * period
+        exact = np.imag(gain * np.exp(1j * omega * time))
+        exact += np.real(np.exp(np.outer(time, roots)) @ free)
+        motion = drive_mass(COUPLING, 1.0, np.sin(omega * time), period, scheme)
+        error = 100 * np.sqrt(np.mean((motion.position - exact) ** 2))
+        # printed to one or two digits: half a unit of the last one
+        assert error == pytest.approx(percent, abs=0.5 * last_digit(percent) + 1e-3 * percent)
+
+
+def last_digit(value: float) -> float:
+    return float(10.0 ** -len(repr(value).partition(".")[2]))
+
+
+def test_midpoint_is_of_second_order_and_the_rest_of_first() -> None:
+    exact = complex(exact_mass_response(COUPLING, 1.0, 2.0))
+    for scheme in ERRORS:
+        errors = [abs(steady_response(scheme, 1.0, period, 2.0) - exact) for period in (1e-4, 5e-5)]
+        order = np.log2(errors[0] / errors[1])
+        # the compensated scheme's first-order term is small at 2 Hz, so both orders show
+        tolerance = 0.5 if scheme == "compensated" else 0.02
+        assert order == pytest.approx(2 if scheme == "midpoint" else 1, abs=tolerance)
+
+
+@given(seeds, st.floats(1e-3, 10), st.floats(1, 1e5), st.floats(0, 100))
+def test_only_held_forces_create(seed: int, mass: float, stiffness: float, damping: float) -> None:
+    handle = np.cumsum(random_force(seed, 100) * 1e-4)
+    coupling = Coupling(stiffness, damping, 0, 0)
+    for scheme in ("implicit", "compensated", "midpoint"):
+        motion = drive_mass(coupling, mass, handle, T, scheme)
+        work = motion.force[1:] * np.diff(motion.position)
+        rounding = size(mass * motion.velocity**2, work) + 1e-15
+        gain = motion.energy_gain
+        if scheme == "midpoint":
+            assert np.abs(gain).max() <= rounding
+        else:
+            lost = -0.5 * mass * np.diff(motion.velocity) ** 2
+            assert gain == pytest.approx(lost, rel=1e-9, abs=rounding)
+
+
+def test_held_force_on_a_light_mass_diverges_where_midpoint_keeps_its_energy() -> None:
+    undamped = Coupling(1000, 0, 0, 0)
+    handle = np.zeros(2001)
+    start = {"position": 1e-3}
+    held = drive_mass(undamped, 2e-4, handle[:100], T, "held", **start)  # T²K/m = 5 > 4: unstable
+    free = drive_mass(undamped, 2e-4, handle, T, "midpoint", **start)
+    damped = drive_mass(undamped, 2e-4, handle, T, "implicit", **start)
+    stored = {
+        name: 0.5 * 2e-4 * m.velocity**2 + 0.5 * 1000 * m.position**2
+        for name, m in (("midpoint", free), ("implicit", damped))
+    }
+    assert np.abs(held.position).max() > 1e3
+    assert stored["midpoint"] == pytest.approx(np.full(2001, 5e-4), rel=1e-10)
+    assert stored["implicit"][-1] < 1e-6 * stored["implicit"][0]
+
+
+INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
+SPIN = np.array([1e-3, 10.0, 1e-3])
+
+
+def reference(
+    inertia: NDArray[np.float64], omega: NDArray[np.float64], end: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """ω and the rotation matrix at the end of free rotation, by DOP853 on Euler's equations."""
+
+    def rate(_: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        w, r = y[:3], y[3:].reshape(3, 3)
+        hat = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return np.concatenate([-np.cross(w, inertia * w) / inertia, (r @ hat).ravel()])
+
+    start = np.concatenate([omega, np.eye(3).ravel()])
+    found = solve_ivp(rate, (0, end), start, method="DOP853", rtol=1e-12, atol=1e-12)
+    return found.y[:3, -1], found.y[3:, -1].reshape(3, 3)
+
+
+def matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    w, u = q[0], q[1:]
+    hat = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
+    return np.asarray(np.eye(3) + 2 * w * hat + 2 * hat @ hat)
+
+
+def test_midpoint_keeps_energy_and_momentum_over_ten_seconds_of_tumbling() -> None:
+    motion = integrate_rotation(INERTIA, SPIN, 1e-3, 10_000, "midpoint")
+    energy, momentum = motion.kinetic_energy, motion.angular_momentum
+    assert np.abs(motion.angular_velocity[:, 1]).min() < 1  # it did tumble
+    assert energy == pytest.approx(np.full(10_001, energy[0]), rel=1e-9)
+    drift = np.linalg.norm(momentum - momentum[0], axis=1).max()
+    assert drift <= 1e-9 * np.linalg.norm(momentum[0])
+
+
+def test_explicit_schemes_gain_energy_and_implicit_loses_it() -> None:
+    motions = {s: integrate_rotation(INERTIA, SPIN, 1e-3, 10_000, s) for s in ALL}
+    energy = {s: m.kinetic_energy for s, m in motions.items()}
+    for scheme in ("explicit", "semi_implicit"):
+        assert np.all(np.diff(energy[scheme]) >= -1e-15)
+        assert energy[scheme][-1] > 1.001 * energy[scheme][0]
+    assert np.all(np.diff(energy["implicit"]) <= 1e-15)
+    assert energy["implicit"][-1] < 0.999 * energy["implicit"][0]
+
+
+@pytest.mark.parametrize(("scheme", "order"), [("midpoint", 2), *((s, 1) for s in ALL[:3])])
+def test_error_against_dop853_falls_with_order_of_scheme(scheme: Scheme, order: int) -> None:
+    omega = np.array([3.0, 8.0, -4.0])
+    expected_rate, expected_turn = reference(INERTIA, omega, 1.0)
+    errors = []
+    for steps in (4000, 8000):
+        motion = integrate_rotation(INERTIA, omega, 1 / steps, steps, scheme)
+        turn = matrix(motion.orientation[-1])
+        rate_error = np.linalg.norm(motion.angular_velocity[-1] - expected_rate)
+        errors.append((rate_error, np.linalg.norm(turn - expected_turn)))
+    falls = np.log2(np.divide(errors[0], errors[1]))
+    assert falls == pytest.approx([order, order], abs=0.15)
+
+
+@settings(max_examples=40)
+@given(
+    st.tuples(*[st.floats(1e-4, 1)] * 3).filter(lambda i: 2 * max(i) <= sum(i)),
+    st.tuples(*[st.floats(-20, 20)] * 3),
+    st.integers(0, 2**32 - 1),
+)
+def test_balance_is_closed(inertia: tuple[float, ...], omega: tuple[float, ...], seed: int) -> None:
+    period, steps = 1e-3, 20
+    torque = np.random.default_rng(seed).normal(0, 5, (steps + 1, 3)) * min(inertia)
+    for scheme in ALL:
+        motion = integrate_rotation(inertia, omega, period, steps, scheme, torque=torque)
+        w = motion.angular_velocity
+        acting = torque[1:] if scheme in {"implicit", "midpoint"} else torque[:-1]
+        mover = {"explicit": w[:-1], "semi_implicit": w[:-1], "implicit": w[1:]}
+        work = period * np.sum(acting * mover.get(scheme, (w[1:] + w[:-1]) / 2), axis=1)
+        second_order = 0.5 * np.sum(motion.inertia * np.diff(w, axis=0) ** 2, axis=1)
+        sign = {"implicit": -1, "midpoint": 0}.get(scheme, 1)
+        gain = np.diff(motion.kinetic_energy) - work
+        rounding = 1e-12 * (motion.kinetic_energy.max() + np.abs(work).max())
+        assert gain == pytest.approx(sign * second_order, rel=1e-9, abs=rounding)
+
+
+@settings(max_examples=40)
+@given(st.tuples(*[st.floats(-30, 30)] * 3))
+def test_midpoint_keeps_the_momentum_in_the_world_whatever_the_spin(omega: tuple[float]) -> None:
+    momentum = integrate_rotation(INERTIA, omega, 1e-3, 100, "midpoint").angular_momentum
+    scale = np.linalg.norm(momentum[0]) + 1e-300
+    assert np.linalg.norm(momentum - momentum[0], axis=1).max() <= 1e-12 * scale + 1e-300
+
+
+def test_torque_about_a_principal_axis_spins_up_at_a_constant_rate() -> None:
+    torque = np.tile([0, 0, 2e-3], (1001, 1))
+    for scheme in ALL:
+        motion = integrate_rotation(INERTIA, [0, 0, 1], 1e-3, 1000, scheme, torque=torque)
+        assert motion.angular_velocity[-1, 2] == pytest.approx(1 + 2e-3 / INERTIA[2], rel=1e-12)
+        angle = 2 * np.arctan2(motion.orientation[-1, 3], motion.orientation[-1, 0])
+        # first-order schemes are off by half a step of the change in rate: T/2 · 0.44 rad/s
+        exact = 1 + 1e-3 / INERTIA[2]
+        assert angle == pytest.approx(exact, abs=1e-6 if scheme == "midpoint" else 3e-4)
+
+
+def test_many_bodies_turn_at_once_as_they_turn_alone() -> None:
+    omegas = np.array([[1.0, 2, 3], [4, 5, 6]])
+    motion = integrate_rotation(INERTIA, omegas, 1e-3, 50, "implicit")
+    alone = integrate_rotation(INERTIA, omegas[1], 1e-3, 50, "implicit")
+    assert motion.angular_velocity.shape == (51, 2, 3)
+    assert motion.orientation.shape == (51, 2, 4)
+    assert motion.angular_momentum.shape == (51, 2, 3)
+    assert np.array_equal(motion.orientation[:, 1], alone.orientation)
+
+
+ONES = np.ones(5)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: integrate_particle(0, ONES, T, "explicit"), "mass is 0 kg; it must be"),
+        (lambda: integrate_particle(np.nan, ONES, T, "explicit"), "mass is nan kg; it must"),
+        (lambda: integrate_particle(1, ONES, -1, "explicit"), "period is -1 s"),
+        (lambda: integrate_particle(1, ONES, T, "euler"), "'midpoint', 'semi_implicit'"),
+        (lambda: integrate_particle(1, [1.0], T, "explicit"), r"force has shape \(1,\)"),
+        (lambda: integrate_particle(1, ["a"], T, "explicit"), "must be numbers in N"),
+        (lambda: integrate_particle([1, 2], np.ones((5, 3)), T, "explicit"), "do not broadcast"),
+        (lambda: integrate_particle(1, ONES, [T], "explicit"), r"period has shape \(1,\)"),
+        (lambda: drive_mass(COUPLING, 1, [0, np.inf], T, "midpoint"), "handle position is inf m"),
+        (lambda: drive_mass(COUPLING, 1, 0.0, T, "midpoint"), "handle has shape"),
+        (lambda: drive_mass(COUPLING, 1, ONES, T, "explicit"), "choose one of 'compensated'"),
+        (lambda: exact_mass_response(COUPLING, 1, 0), "frequency is 0 Hz"),
+        (lambda: integrate_rotation([1, 1, -1], SPIN, T, 1, "implicit"), "inertia is -1 kg m²"),
+        (lambda: integrate_rotation([1, 1, 3], SPIN, T, 1, "implicit"), "which no rigid body has"),
+        (lambda: integrate_rotation(INERTIA, [1, 2], T, 1, "implicit"), r"has shape \(2,\)"),
+        (lambda: integrate_rotation(1.0, SPIN, T, 1, "implicit"), r"inertia has shape \(\)"),
+        (lambda: integrate_rotation(INERTIA, [1, 2, np.nan], T, 1, "implicit"), "velocity is nan"),
+        (lambda: integrate_rotation(INERTIA, SPIN, T, 0, "implicit"), "steps is 0"),
+        (lambda: integrate_rotation(INERTIA, SPIN, T, 5, "implicit", torque=np.zeros((4, 3))),
+         r"torque has shape \(4, 3\); it must be \(6"),
+        (lambda: integrate_rotation(INERTIA, SPIN, T, 5, "rk4"), "choose one of 'explicit'"),
+        (lambda: integrate_rotation(INERTIA, [100, 1000, 100], 1.0, 500, "explicit"),
+         "shorten the period"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_integrated_is_refused(call: Callable[[], Any], words: str) -> None:
+    with pytest.raises(MechanicsError, match=words):
+        call()
