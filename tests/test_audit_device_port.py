@@ -170,8 +170,8 @@ def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) ->
     [
         (1, 10.0, {}),
         (2, 0.3, {}),  # the force is limited most of the time
-        (3, 10.0, {"scale": 2.0}),
-        (4, 10.0, {"force_scale": 0.5}),
+        (3, 10.0, {"workspace": Workspace(scale=2.0)}),
+        (4, 10.0, {"workspace": Workspace(force_scale=0.5)}),
     ],
 )
 def test_a_device_that_bears_the_coupling_is_never_kicked(

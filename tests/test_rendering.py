@@ -45,6 +45,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, check_prepared, default_method, method_named, prepare
 from hapticbridge.scene import load_scene
@@ -704,7 +705,7 @@ def test_meter_and_audit_scale_alike_what_the_scene_gives_up(method: str, tmp_pa
     """Force returns half as large for a handle that moves thrice as far: gained times 1/6."""
     path = tmp_path / "run.mcap"
     options: dict[str, Any] = {"contact_stiffness": 2e4} if method == "direct" else {}
-    options |= {"method": method, "scale": 3.0, "force_scale": 0.5}
+    options |= {"method": method, "workspace": Workspace(scale=3.0, force_scale=0.5)}
     summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, **options)
     report = audit(path)
     assert report.resimulation == "bit for bit"

@@ -27,6 +27,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand, SimulatedDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run_description import SOURCE_PREFIX
@@ -64,8 +65,8 @@ TURNED = [[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]
     "options",
     [
         {},
-        {"scale": 1.7, "force_scale": 0.9, "substeps": 3, "rate": 700},
-        {"method": "compensated", "rate": 3000, "axes": TURNED},
+        {"workspace": Workspace(scale=1.7, force_scale=0.9), "substeps": 3, "rate": 700},
+        {"method": "compensated", "rate": 3000, "workspace": Workspace(axes=TURNED)},
         {"method": "direct"},
     ],
 )
@@ -407,7 +408,7 @@ EVERY_LIMIT = Limits(
 REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
         ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0)),
-        {"limits": EVERY_LIMIT, "scale": 2.0},
+        {"limits": EVERY_LIMIT, "workspace": Workspace(scale=2.0)},
         TickFlag.SLEW_LIMITED,
     ),
     "the edge of the reach": (
