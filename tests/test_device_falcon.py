@@ -1,4 +1,4 @@
-"""A Falcon in the loop: what it reports, what it does with a force, and how it is lost."""
+"""A Falcon from power-on to its loss: program, homing, samples, forces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What keeps a tool behind a lossless coupling implicit, and for how long."""
+"""Limits, friction and equalities that keep a tool behind a lossless coupling implicit."""
 
 from __future__ import annotations
 

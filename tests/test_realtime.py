@@ -1,4 +1,4 @@
-"""What is asked of the system: given back, never refused in silence. Nothing grows in a tick."""
+"""Requests to the system: given back, never refused in silence. Nothing grows in a tick."""
 
 from __future__ import annotations
 

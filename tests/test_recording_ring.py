@@ -1,3 +1,5 @@
+"""The ring between two processes, against a queue."""
+
 from __future__ import annotations
 
 import subprocess
