@@ -1,3 +1,5 @@
+"""The contract that every device fulfils, and the refusals of data sheets and specifications."""
+
 from __future__ import annotations
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Recordings: what survives the file, what MCAP's own library reads, repair and refusals."""
+"""Recordings: contents, MCAP's own library, repair, refusals; changes, damage and cuts."""
 
 from __future__ import annotations
 

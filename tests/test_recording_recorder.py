@@ -1,3 +1,5 @@
+"""The recorder's process: every record of a run, also of one that is killed."""
+
 from __future__ import annotations
 
 import io
