@@ -219,7 +219,6 @@ def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
         (report_runs.active_by_quantisation, "device", "quantisation", "0.45 N"),
         (report_runs.active_by_mocap, "environment", "inputs", "'pusher' touched geom 'ball'"),
         (report_runs.active_beside_a_fan, "environment", "contact setting", "while geom 0 touched"),
-        (report_runs.active_with_a_fine_encoder, "device", "rate", "the coupling needs 5"),
         (report_runs.active_by_rotation, "device", "rate", "rotation: the device's damping"),
         (report_runs.active_by_repeated_samples, "device", "delay", "75% of the samples"),
     ],

@@ -288,20 +288,36 @@ def test_token_opens_and_nothing_else_does(way: str) -> None:
     assert "token" in address.refusal("//[", {"host": "localhost"})  # not a path
 
 
-def test_the_server_answers_its_own_page_alone(replay: Replay) -> None:
-    address = Address(0)
+def test_the_server_answers_its_own_page_alone_and_a_browser_keeps_its_token(
+    replay: Replay,
+) -> None:
+    address, host = Address(0), "127.0.0.1"
     with served(replay, address) as (theatre, port):
-        secret = f"/?token={address.token}"
-        assert theatre.url == f"http://127.0.0.1:{port}{secret}"
-        assert answer("127.0.0.1", port, secret)[0] == 200
-        assert answer("127.0.0.1", port, secret, Host="evil.example")[0] == 403
-        assert answer("127.0.0.1", port, secret, Origin="http://evil.example")[0] == 403
-        assert is_let_in("127.0.0.1", port, secret)
-        assert is_let_in("127.0.0.1", port, secret, origin=f"http://127.0.0.1:{port}")
-        assert not is_let_in("127.0.0.1", port, secret, origin="http://evil.example")
-        # a second Host beside the right one, as a careless proxy might read it
-        evil = {"Host": "evil.example"}
-        assert not is_let_in("127.0.0.1", port, secret, additional_headers=evil)
+        secret, evil = f"/?token={address.token}", "http://evil.example"
+        kept, wrong = f"hapticbridge_{port}={address.token}", f"hapticbridge_{port}=wrong"
+        assert theatre.url == f"http://{host}:{port}{secret}"
+        # path, headers, whether it is answered
+        requests: list[tuple[str, dict[str, str], bool]] = [
+            (secret, {}, True),
+            (secret, {"Host": "evil.example"}, False),
+            (secret, {"Origin": evil}, False),
+            ("/", {}, False),
+            ("/?token=wrong", {}, False),
+            ("/", {"Cookie": kept}, True),
+            ("/", {"Cookie": wrong}, False),
+        ]
+        for path, headers, is_answered in requests:
+            assert (answer(host, port, path, **headers)[0] == 200) is is_answered
+            # a second Host beside the right one, as a careless proxy might read it
+            options = {"additional_headers": headers}
+            assert is_let_in(host, port, path, **options) is is_answered
+        assert is_let_in(host, port, secret, origin=f"http://{host}:{port}")
+        assert answer(host, port)[1] == ""
+        _, cookie, _ = answer(host, port, secret)
+        assert cookie == f"{kept}; Path=/; HttpOnly; SameSite=Strict"
+        # through a tunnel from another port, which gets a cookie of its own
+        _, cookie, _ = answer(host, port, secret, Host="localhost:9000")
+        assert f"hapticbridge_9000={address.token}" in cookie
         with socket.socket() as probe, pytest.raises(OSError, match="refused"):
             probe.connect(("127.0.0.2", port))  # served on loopback's first address alone
 
@@ -314,30 +330,6 @@ def test_visers_way_out_to_the_internet_and_its_store_of_files_are_gone() -> Non
         assert not any(handlers[kind] for kind in handlers if kind.__name__.startswith(gone))
     finally:
         stop(server)
-
-
-def test_the_page_needs_the_token_and_a_browser_keeps_it(replay: Replay) -> None:
-    address, host = Address(0), "127.0.0.1"
-    with served(replay, address) as (_, port):
-        status, cookie, _ = answer(host, port)
-        assert (status, cookie) == (403, "")
-        assert answer(host, port, "/?token=wrong")[0] == 403
-        assert not is_let_in(host, port)
-        assert not is_let_in(
-            host, port, additional_headers={"Cookie": f"hapticbridge_{port}=wrong"}
-        )
-        status, cookie, _ = answer(host, port, f"/?token={address.token}")
-        assert status == 200
-        kept = f"hapticbridge_{port}={address.token}"
-        assert cookie == f"{kept}; Path=/; HttpOnly; SameSite=Strict"
-        assert answer(host, port, Cookie=kept)[0] == 200
-        assert is_let_in(host, port, additional_headers={"Cookie": kept})
-        # through a tunnel from another port, which gets a cookie of its own
-        tunnel = f"/?token={address.token}"
-        assert (
-            f"hapticbridge_9000={address.token}"
-            in answer(host, port, tunnel, Host="localhost:9000")[1]
-        )
 
 
 def test_a_port_that_cannot_be_had_is_named_and_not_exchanged(

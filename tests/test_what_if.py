@@ -7,7 +7,6 @@ import base64
 import json
 import math
 import re
-import warnings
 from collections.abc import Callable
 from dataclasses import astuple, replace
 from pathlib import Path
@@ -19,7 +18,6 @@ import report_runs
 from audit_cases import TAP, ScriptedDevice, SlowClock, recorded, rewritten
 from cli_cases import Called
 from numpy.typing import NDArray
-from report_runs import Made
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Command, Couple, Reset, Switch
@@ -487,21 +485,3 @@ def test_the_page_shows_both_verdicts_and_why(made_active: WhatIf, tmp_path: Pat
     assert text.count("[svg]") == 3
     for note in made_active.notes:
         assert note[1:40] in text
-
-
-@pytest.mark.filterwarnings("ignore:scene '.*fan.xml'")
-def test_a_fault_of_a_changed_run_is_laid_to_the_geoms_that_touched_in_it(
-    made: Made, tmp_path: Path
-) -> None:
-    """A body that is moved far away is the cause only where nobody knows what touched."""
-    recording, _ = made(report_runs.active_beside_a_fan)
-    with warnings.catch_warnings():  # of the scene the user was warned when it was recorded
-        warnings.simplefilter("error")
-        found = what_if(recording.path, {"stiffness": 2100})
-    page = tmp_path / "page.html"
-    write_what_if(found, page, scene=b"a picture")
-    text = text_of(page)
-    assert [run.report.verdict for run in found.runs] == ["active"] * 3
-    assert text.count("Likely cause: <strong>contact setting</strong>") == 3
-    assert text.count("while geom 0 touched geom") == 3
-    assert "As recorded, at the moment of the fault" in text
