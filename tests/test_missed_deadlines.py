@@ -9,7 +9,6 @@ import pytest
 import report_runs
 from audit_cases import ScriptedDevice, SlowClock, recorded
 from bridge_runs import sway
-from cli_cases import Called
 from rendering_runs import WALL
 
 from hapticbridge.audit import AuditReport, audit
@@ -27,7 +26,7 @@ from hapticbridge.summary import Summary
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.4])
+@pytest.mark.parametrize("seconds", [0.1, 0.4])
 def test_a_run_that_misses_deadlines_ends_when_the_clock_says(
     tmp_path: Path, seconds: float
 ) -> None:
@@ -85,12 +84,6 @@ def test_a_motion_that_ends_the_run_is_followed_to_its_end_however_long_it_takes
         assert bridge.run(0.2).ticks == 160
 
 
-def test_the_command_line_says_what_its_seconds_are(call: Called) -> None:
-    code, text, _ = call("run", "--help")
-    assert code == 0
-    assert "Seconds to run, by the clock" in " ".join(text.split())
-
-
 T = 1e-3
 B = 2.0
 """Damping of ``ScriptedDevice`` in N s/m."""
@@ -130,7 +123,7 @@ def check(summary: Summary, report: AuditReport, *, is_kicked: bool) -> None:
         assert report.port == "device"
 
 
-@pytest.mark.parametrize("missed", [0, 1, 2, 5])
+@pytest.mark.parametrize("missed", [0, 1, 5])
 @pytest.mark.parametrize("excess", [0.95, 1.05])
 def test_a_device_is_kicked_where_k_exceeds_2b_over_the_time_of_a_hold(
     tmp_path: Path, missed: int, excess: float
@@ -200,15 +193,14 @@ def test_curves_and_events_stand_on_the_same_clock(late: Recording) -> None:
         assert np.max(drawn) == pytest.approx(0.131)
 
 
-def test_without_a_missed_deadline_a_tick_is_due_at_the_end_of_its_period() -> None:
-    ticks = rows([1_000_000 * (k + 1) for k in range(5)])
-    np.testing.assert_allclose(due_times(ticks, T), T * np.arange(1, 6))
-    assert due_times(ticks[:0], T).shape == (0,)
-
-
-@pytest.mark.parametrize("due", [[1, 5, 4], [3, 3, 4], [0, 1, 2], [-(2**63), 1, 2]])
-def test_deadlines_that_cannot_be_are_not_drawn(due: list[int]) -> None:
+@pytest.mark.parametrize(
+    "due", [[1_000_000, 2_000_000, 3_000_000], [1, 5, 4], [3, 3, 4], [0, 1, 2], [-(2**63), 1, 2]]
+)
+def test_a_tick_is_due_at_the_end_of_its_period_also_where_deadlines_cannot_be(
+    due: list[int],
+) -> None:
     np.testing.assert_allclose(due_times(rows(due), T), (T, 2 * T, 3 * T))
+    assert due_times(rows([]), T).shape == (0,)
 
 
 def test_a_timeline_finds_the_tick_nearest_to_any_time(late: Recording) -> None:

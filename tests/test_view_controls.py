@@ -105,6 +105,8 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(tmp_
         until(lambda: stiffness(bridge) == pytest.approx(200.0))
         page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
         assert page.complaints == []
+        own = ("data:", "blob:", window.url.partition("?")[0])
+        assert [request[:99] for request in page.requests if not request.startswith(own)] == []
     told = events(tmp_path / "run.mcap", "coupling")
     assert before == LOOSE.stiffness
     assert told[-1]["stiffness"] == pytest.approx(200.0)
