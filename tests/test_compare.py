@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import recorded, rewritten, tapped
+from audit_cases import recorded, rewritten, tapped, without_share
 from cli_cases import Called
 from numpy.typing import NDArray
 
 from hapticbridge.compare import compare
 from hapticbridge.errors import RecordingError
+from hapticbridge.export import export
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording, reader
 
@@ -238,3 +239,20 @@ def test_another_guard_is_another_run_though_no_tick_shows_it(tap: Path, tmp_pat
     assert found.first is None
     assert list(found.decisive) == ["guard"]
     assert not found.is_same
+
+
+def test_a_recording_without_the_share_is_compared_and_exported_in_what_it_holds(
+    tap: Path, tmp_path: Path
+) -> None:
+    recording = read_recording(tap)
+    old = rewritten(recording, tmp_path / "old.mcap", ticks=without_share(recording))
+    for pair in ((tap, old), (old, tap)):
+        found = compare(*pair)
+        assert found.is_same
+        assert found.compared == len(recording.ticks)
+        assert found.notes == (f"{old} is of an earlier version, without share",)
+    written = export(old, "csv").files[0].read_text().splitlines()
+    assert len(written) == len(recording.ticks) + 1
+    assert written[0].endswith("injected_rotational_damping")
+    target = export(tap, "csv", tmp_path / "new.csv").files[0]
+    assert target.read_text().splitlines()[0].endswith(",share")

@@ -374,8 +374,8 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import os, sys, time
-from hapticbridge.device.last_word import LastWord
-word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
+from hapticbridge.device.watchdog import ForceOffGuardian
+word = ForceOffGuardian(sys.argv[1], b"\\0zero", b"\\1off")
 if sys.argv[2:] and (holder := os.fork()) == 0:
     time.sleep(60)  # as a worker of multiprocessing: it holds all that the bridge had open
     os._exit(0)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import DIRECT, FORCE_LIMITED, LOSSLESS, SLEW_LIMITED, WELD
 from hapticbridge.kernel.compared_methods import balance_contacts, weld_wrench
-from hapticbridge.kernel.guard import rise
+from hapticbridge.kernel.guard import transmitted_share
 from hapticbridge.kernel.handle import device_from_scene
 from hapticbridge.kernel.ledger import refresh_poses
 from hapticbridge.kernel.lossless import implicit_half, is_near, midpoint_torque
@@ -129,7 +129,7 @@ def _slewed(v: Vector, before: Vector, rise: float) -> tuple[Vector, bool]:
 
 
 @compiled
-def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
+def render(state: NDArray[np.void], row: NDArray[np.void], force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the one on the device.
 
     In this order: scale, passivity controller, limit by norm, slew limit, and what fades or starts
@@ -152,9 +152,7 @@ def render(state: NDArray[np.void], force: Vector, torque: Vector) -> None:
         s.flags |= SLEW_LIMITED
     store_vector(s.slewed[0:3], on_device)
     store_vector(s.slewed[3:6], torque_on_device)
-    share = rise(state)
-    if s.silent_ticks > 0:
-        share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
+    share = transmitted_share(state, row)
     if share != 1.0:
         on_device, torque_on_device = scaled(share, on_device), scaled(share, torque_on_device)
     s.passed = min(norm(on_device) / asked, 1.0) if asked > 0.0 else share

@@ -73,10 +73,22 @@ def held_energy(state: NDArray[np.void]) -> float:
 
 
 @compiled
-def rise(state: NDArray[np.void]) -> float:
-    """Goes one tick further in the ramp, and returns the share of the wrench that is let through.
+def transmitted_share(state: NDArray[np.void], row: NDArray[np.void]) -> float:
+    """Advances ramp and fade by one tick; returns and records the transmitted wrench share."""
+    s = state[0]
+    share = _rise(state)
+    if s.silent_ticks > 0:
+        share *= max(0.0, 1.0 - s.silent_ticks / s.fade_ticks)
+    row[0].share = share
+    return share
 
-    ``risen`` counts ticks, those in which the coupling holds more than ``ramp_energy`` in part.
+
+@compiled
+def _rise(state: NDArray[np.void]) -> float:
+    """Advances the ramp by one tick; returns its share of the wrench.
+
+    ``risen`` counts ticks; a tick in which the coupling stores more than ``ramp_energy`` counts in
+    part.
     """
     s = state[0]
     full = s.rise_ticks + 1.0

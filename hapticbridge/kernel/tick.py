@@ -185,7 +185,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         or has_warned(state)
     ):
         return _refuse(state)
-    render(state, force, torque)
+    render(state, row, force, torque)
     if s.scheme != LOSSLESS:  # there a contact may be near without a force
         s.active_contacts = ints(s.ncon, 1)[0]
     if s.active_contacts > 0:
