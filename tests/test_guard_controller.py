@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.guard import capped_sum
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -276,15 +275,6 @@ def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either
     state["energy"]["slack"] += 0.002
     observe_energy(state[0], nothing, nothing, T)
     assert observer["generated_energy"][0] == pytest.approx(0.008)
-
-
-def test_the_audits_capped_sum_is_the_recursion() -> None:
-    values = np.random.default_rng(4).normal(0.0, 0.02, (500, 2))
-    total, expected = np.zeros(2), []
-    for row in values:
-        total = np.maximum(total + row, -0.05)
-        expected.append(total)
-    np.testing.assert_allclose(capped_sum(values, 0.05), expected, atol=1e-15)
 
 
 def test_a_changed_injected_damping_does_not_pass_the_audit(tmp_path: Path) -> None:
