@@ -85,7 +85,7 @@ def stored_in_coupling(
 
     The second sum is the energy already stretched into the spring when the force is switched on, in
     a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
-    V_{k−1}(p_k)), p = h_k − x_{k−1}, is the work of a command that changes K (``kernel.tuning``);
+    V_{k−1}(p_k)), p = h_k − x_{k−1}, is the work of a command that changes K (``kernel.coupling``);
     neither scene nor coupling released it.
 
     Args:
