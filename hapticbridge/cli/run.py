@@ -381,5 +381,5 @@ class Run:
         gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         chosen = {name: value for name, value in gains.items() if value is not None}
         method, period = options.rendering_method, period_of(options.rate)
-        laws, scales = method.laws(options.substeps), options.workspace.scales
+        laws, scales = method.law_evaluations(options.substeps), options.workspace.scales
         return replace(default_coupling(info, period, *scales, laws, method), **chosen)
