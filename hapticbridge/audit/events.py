@@ -102,7 +102,7 @@ class RunEvents:
 
     def is_first(self, ticks: NDArray[np.void]) -> NDArray[np.bool_]:
         """Returns True for each record at a start or after a pause without force."""
-        return (ticks["tick"] == 0) | np.isin(ticks["tick"], self.resumed)
+        return np.asarray((ticks["tick"] == 0) | np.isin(ticks["tick"], self.resumed))
 
     def is_reset(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns True for each tick that began with a reset."""

@@ -141,7 +141,9 @@ class Resimulator:
     def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
         events = recording.events
         self._changes = deque(event for event in events if event.get("event") in _CHANGES)
-        self._resumed = [event.get("tick") for event in events if event.get("event") == "resume"]
+        self._resumed: list[Any] = [
+            event.get("tick") for event in events if event.get("event") == "resume"
+        ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
         self.model = model = attached_model(recording, parameters)

@@ -215,15 +215,17 @@ def may_fade(ticks: NDArray[np.void]) -> Flags:
     It fades during a clutch, while the force is off, and after several old samples.
     """
     is_off = (ticks["buttons"] & FORCE_OFF) != 0
-    return is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE)
+    return np.asarray(is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE))
 
 
 def _is_released(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
     """Returns True for each record in which the handle does not follow the device."""
     guarding, buttons = parameters.guarding, ticks["buttons"]
     is_released = (buttons & (guarding.clutch | CLUTCHED)) != 0
-    is_released |= (buttons & guarding.dead_man) == 0 if guarding.dead_man else False
-    return is_released | (np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach)
+    if guarding.dead_man:
+        is_released |= (buttons & guarding.dead_man) == 0
+    is_out = np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
+    return np.asarray(is_released | is_out)
 
 
 def _flag_faults(
