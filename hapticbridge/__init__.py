@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from hapticbridge.clock import RealClock as RealClock
     from hapticbridge.clock import SimulatedClock as SimulatedClock
     from hapticbridge.coupling import Coupling as Coupling
+    from hapticbridge.device import Device as Device
+    from hapticbridge.device import DeviceInfo as DeviceInfo
     from hapticbridge.device import open_device as open_device
     from hapticbridge.errors import CouplingError as CouplingError
     from hapticbridge.errors import DeviceError as DeviceError
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
     from hapticbridge.errors import SafetyTrip as SafetyTrip
     from hapticbridge.errors import SceneError as SceneError
     from hapticbridge.guard import Limits as Limits
+    from hapticbridge.options import BridgeOptions as BridgeOptions
+    from hapticbridge.options import Workspace as Workspace
+    from hapticbridge.record import SAMPLE_DTYPE as SAMPLE_DTYPE
+    from hapticbridge.record import TickFlag as TickFlag
     from hapticbridge.recording import read_recording as read_recording
     from hapticbridge.recording import repair as repair
     from hapticbridge.scene import Scene as Scene
@@ -47,6 +53,8 @@ else:
             "RealClock": "hapticbridge.clock",
             "SimulatedClock": "hapticbridge.clock",
             "Coupling": "hapticbridge.coupling",
+            "Device": "hapticbridge.device",
+            "DeviceInfo": "hapticbridge.device",
             "open_device": "hapticbridge.device",
             "CouplingError": "hapticbridge.errors",
             "DeviceError": "hapticbridge.errors",
@@ -55,6 +63,10 @@ else:
             "SafetyTrip": "hapticbridge.errors",
             "SceneError": "hapticbridge.errors",
             "Limits": "hapticbridge.guard",
+            "BridgeOptions": "hapticbridge.options",
+            "Workspace": "hapticbridge.options",
+            "SAMPLE_DTYPE": "hapticbridge.record",
+            "TickFlag": "hapticbridge.record",
             "read_recording": "hapticbridge.recording",
             "repair": "hapticbridge.recording",
             "Scene": "hapticbridge.scene",

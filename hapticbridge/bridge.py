@@ -1,217 +1,355 @@
-"""The bridge: one pass of its loop is one tick, from the device's pose to the device's wrench.
+"""Haptic bridge: a device and a MuJoCo scene, joined by a virtual coupling at a fixed rate.
 
     device ──sample──▶ handle ──▶ scene stepped by MuJoCo ──▶ wrench, energies ──▶ device, recording
 
-``Bridge._loop`` is the loop; the arithmetic before and after MuJoCo's step is in ``kernel.step``.
-What a bridge is made of is in ``arrangement``, what is open while it runs in ``opened``, and what
-can be asked of it meanwhile in ``commanded``.
+``Bridge._loop`` is the loop; ``kernel.tick`` is its arithmetic. ``options`` resolves and refuses
+before the device is started. ``session`` owns the resources of an open run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, Unpack
 
-import mujoco
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.clock import slept_ns
-from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
+from hapticbridge.certificate import condition_sentences
+from hapticbridge.clock import Clock, RealClock
+from hapticbridge.commands import Command, Repeat
+from hapticbridge.commands.command import Stop
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import Device
+from hapticbridge.errors import CommandError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import trip_reason
+from hapticbridge.inputs import Write, input_writes
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
-from hapticbridge.kernel.tick import can_split
-from hapticbridge.realtime import Grant, real_time, warn_of_refusals
-from hapticbridge.record import TickFlag
-from hapticbridge.session import Commanded
+from hapticbridge.options import (
+    DEFAULT_OPTIONS,
+    BridgeOptions,
+    OptionChanges,
+    RunSetup,
+    device_for_run,
+)
+from hapticbridge.realtime import real_time
+from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.scene import Scene, load_scene
+from hapticbridge.session import RecordOutput, Session, StopRequest
 from hapticbridge.signals import stopping_on_signals
-from hapticbridge.summary import Summary
+from hapticbridge.summary import Ledger, Summary
 
-SUSPENDED_NS = 50_000_000
-"""A sleep of the machine longer than this ends the run: nobody knows what became of the hand, of
-the device's power, or of who sits there. Reading two clocks differs by microseconds."""
+OnTick = Callable[[int], None]
+"""Function called with a tick's number before the tick, for scripted inputs."""
 
-RECORDER_LOOK = 0.1
-"""In s, how often the loop looks whether the recorder still lives: 4 µs each time. A run that is to
-be recorded ends with its recorder."""
-
-PICTURE_PERIOD = 1 / 30
-"""Time in s between two pictures of the scene for an onlooker. Eyes see no more; each costs the
-loop one copy of some microseconds, after the wrench is out."""
+_NOT_OPEN = "the bridge is not open; open it with 'with Bridge(...)' first"
 
 
-class Bridge(Commanded):
-    """Joins a device and a scene by a virtual coupling and runs the loop between them.
+class Bridge:
+    """Runs the haptic loop between a device and a scene.
 
-    Use it as a context manager: entering prepares everything and compiles what must be compiled,
-    leaving commands zero force, closes the device and closes the recording.
+    Each tick reads the device, moves the handle to its pose, steps the scene, sends the coupling's
+    wrench back and publishes one record. Use it as a context manager: entering compiles and starts
+    everything, leaving commands zero force and closes recording and device.
+
+        with Bridge("peg_in_hole", "falcon", rate=2000, recording="run.mcap") as bridge:
+            summary = bridge.run(duration=10.0)
+
+    Args:
+        scene: A loaded scene, a shipped scene's name, or a path to MJCF.
+        device: An open device, or a string for ``open_device``. A device opened from a string is
+            closed if the bridge is refused.
+        coupling: Stiffness and damping to be felt; None selects the stiffest safe coupling.
+        options: Rate, method, workspace, limits, buttons; see ``BridgeOptions``.
+        clock: Clock of the run; None is a ``RealClock``. A ``SimulatedClock`` runs as fast as
+            possible and equally in every run.
+        recording: File to write (``.mcap``), replaced if it exists; None records nothing.
+        observer: Second reader of the records, such as ``view.Window``. It is started when the
+            bridge is entered and closed when it is left.
+        **changes: Fields of ``BridgeOptions`` that differ from ``options``.
+
+    Attributes:
+        setup: The resolved setup: scene, coupling, method, guard.
+        device: The device.
+        clock: Clock of the run.
+        output: Destinations of the records.
+
+    Raises:
+        HapticBridgeError: A value is out of range, or two of them exclude each other. The message
+            names the value and the valid ones.
     """
 
-    _slept, _is_timed = 0, False
+    def __init__(
+        self,
+        scene: Scene | str | Path,
+        device: Device | str = "simulated",
+        coupling: Coupling | None = None,
+        options: BridgeOptions = DEFAULT_OPTIONS,
+        *,
+        clock: Clock | None = None,
+        recording: str | Path | None = None,
+        observer: RingObserver | None = None,
+        **changes: Unpack[OptionChanges],
+    ) -> None:
+        options = replace(options, **changes)
+        path = None if recording is None else Path(recording)
+        self.output = RecordOutput(path, observer, options.live)
+        self.clock = clock or RealClock()
+        loaded = scene if isinstance(scene, Scene) else load_scene(scene)
+        with device_for_run(loaded, device, self.clock) as self.device:
+            self.setup = RunSetup.resolve(
+                loaded,
+                self.device.info,
+                coupling,
+                options,
+                self.clock,
+                is_recorded=path is not None,
+            )
+        self._stop = StopRequest()
+        self._session: Session | None = None
 
-    def run(
-        self, duration: float | None = None, on_tick: Callable[[int], None] | None = None
-    ) -> Summary:
-        """Runs the loop. Called again, it goes on: the force rises from zero as at the start.
+    def __enter__(self) -> Self:
+        if self._session is not None:
+            raise HapticBridgeError("a bridge is opened once; make a new one for another run")
+        self._session = Session(self.setup, self.device, self.clock, self.output, self._stop)
+        return self
 
-        What is to ``stop`` a run and comes before it ends it before its first tick. Signals are
-        heeded while it runs; before and after, they do what they do in any program of Python's.
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.session.close(error)
+
+    def run(self, duration: float | None = None, on_tick: OnTick | None = None) -> Summary:
+        """Runs the loop. A second call continues; the force rises from zero as at the start.
+
+        Signals that end a program (Ctrl-C, SIGTERM, SIGHUP, Ctrl-Z …) end the run cleanly while it
+        lasts.
 
         Args:
-            duration: Time to run in s of the run's clock: deadlines that were skipped are time that
-                has passed, pauses without ticks are not. None runs until the device's motion ends,
-                which lasts as many ticks as it has samples, or for ever (Ctrl-C, SIGTERM, SIGHUP
-                and Ctrl-Z stop cleanly).
-            on_tick: Called with the tick's number before it, for scripted inputs.
+            duration: Time to run in s of the run's clock. Skipped deadlines count as time, pauses
+                between runs do not. None runs until the device's motion ends, one tick per sample,
+                or until a signal.
+            on_tick: Called with the tick's number before each tick, for scripted inputs.
 
         Returns:
-            What the run was; of all ticks so far, if ``run`` is called again.
+            The summary of all ticks so far.
 
         Raises:
-            SafetyTrip: The guard stopped the run, or the device failed; zero force was commanded
+            SafetyTrip: The guard stopped the run, or the device failed. Zero force was commanded
                 first, where it still could be.
             HapticBridgeError: The bridge is not open, or the duration is out of range.
         """
-        self._end, self._is_timed = self._end_of(duration), duration is not None
-        reason = ""
-        self._resume()
+        session, reason = self._open_session(), ""
+        session.begin(duration)
         with ExitStack() as stack:
-            stack.callback(self._heed_stops)
+            stack.callback(session.note_stop)
             stack.enter_context(stopping_on_signals(self.stop_on_signal))
-            if self._is_realtime:
-                self._note_grants(stack.enter_context(real_time()))
+            if self.setup.is_realtime:
+                session.note_grants(stack.enter_context(real_time()))
             try:
-                self._come_to_rest()
-                self.clock.start(round(self.period * 1e9))
-                self._slept = slept_ns()
-                reason = self._loop(on_tick)
+                session.start_clock()
+                reason = self._loop(session, on_tick)
             except DeviceError as error:
-                reason = f"tick {self._tick}: {error}"
+                reason = f"tick {session.tick}: {error}"
             finally:
-                unsent = self._silence()
+                unsent = session.command_zero_force()
         if reason or unsent:
-            self._trip(reason or unsent)
-        self._stopped_by = self._stopped_by or "duration"
-        return self.summary()
+            raise session.trip(reason or unsent)
+        session.stopped_by = session.stopped_by or "duration"
+        return session.summary()
 
-    def _loop(  # noqa: PLR0912, PLR0915 - one loop
-        self, on_tick: Callable[[int], None] | None
+    def _loop(  # noqa: PLR0912 - one loop
+        self, session: Session, on_tick: OnTick | None
     ) -> str:
-        """Runs the ticks until the end; returns why the kernel refused one, or nothing."""
-        state, row = self._binding.state, self._binding.row
-        model, data, substeps = self.scene.model, self.scene.data, range(self._substeps)
-        stream, records, cursors = self._stream, self._stream.rows, self._stream.cursors
-        sample, wrench = self._sample, self._binding.wrench_on_device
-        outside = self._binding.external_flags
-        before, answer, finish = self._before_step, self._answer_step, self._finish_tick
+        """Runs the ticks until the end; returns the reason of a trip, or an empty text."""
+        kernel, model, data = session.kernel, self.scene.model, self.scene.data
+        wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
         read_device, write_device = self.device.read, self.device.write
-        wait, now, hand_over = self.clock.wait, self.clock.now, self._publish
-        inputs, commands, later, read = (
-            self._inputs,
-            self._commands.waiting,
-            self._operator.later,
-            0,
-        )
-        whole_step, second_half, first_half = (
-            self.method.step,
-            mujoco.mj_step2,
-            mujoco.mj_fwdPosition,
-        )
-        is_ahead = self._is_pipelined and can_split(model, self.method.scheme)
-        stops, snapshot = self._stops, self._snapshot
-        buttons, mark = sample["buttons"], self._mark_button
-        held = mark  # a button that is held from the start on marks nothing
-        publish_positions = self._publish_positions
-        pictures = max(round(PICTURE_PERIOD / self.period), 1)
-        next_picture = self._tick
-        next_look, looks = self._tick, max(round(RECORDER_LOOK / self.period), 1)
-        while self._tick != self._end and not stops:
-            if self._tick >= next_look:
-                stream.look()
-                next_look += looks
+        state, row, sample = kernel.bound.state, kernel.bound.row, kernel.sample
+        before, answer, finish = kernel.before, kernel.answer, kernel.finish
+        step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half
+        stream, rows, cursors, wrench = session.stream, kernel.rows, kernel.cursors, kernel.wrench
+        inputs, commands, later = session.inputs, session.commands.waiting, session.executor.later
+        substeps, is_ahead, mark = kernel.substeps, kernel.is_ahead, session.mark
+        external_flags, next_chores, read = kernel.external_flags, session.tick, 0
+        while session.tick != session.end and not stops:
             deadline, wake, skipped = wait()
             if on_tick is not None:
-                on_tick(self._tick)
+                on_tick(session.tick)
             if inputs or commands or later:
-                self._take_changes()
-            news = outside[0] = read_device(sample)
-            read_before, read = read, now()
-            elapsed = 1e-9 * (read - read_before)
+                session.take_changes()
+            flags = external_flags[0] = read_device(sample)
+            last_read, read = read, now()
+            elapsed = 1e-9 * (read - last_read)
             for substep in substeps:
                 code = before(state, sample, row, substep, elapsed)
-                if code not in (OK, HALF_DONE):
-                    return trip_reason(code, self._tick)
-                step = second_half if code == HALF_DONE else whole_step
-                step(model, data)
+                if code == OK:
+                    step(model, data)
+                elif code == HALF_DONE:
+                    second_half(model, data)
+                else:
+                    return trip_reason(code, session.tick)
                 code = answer(state, row, substep)
             if code != OK:
-                return trip_reason(code, self._tick)
+                return trip_reason(code, session.tick)
             write_device(wrench)
             write = now()
-            if mark and buttons[0] & mark != held:
-                held = buttons[0] & mark
-                if held:
-                    self._event("mark", by="button")
-            if snapshot is not None and self._tick >= next_picture:
-                publish_positions(state, cursors, snapshot.head, snapshot.numbers)
-                next_picture += pictures
+            if mark is not None:
+                mark.look()
+            if session.tick >= next_chores:
+                next_chores = session.do_chores()
             if is_ahead:
                 first_half(model, data)
-            flags = news | stream.lost | (self._overrun(skipped) if skipped else 0)
-            stream.lost = 0
-            code = finish(
-                state, row, records, cursors, deadline, wake, read, write, flags, is_ahead
-            )
-            if code == BAD_RESULT:
-                return trip_reason(code, self._tick)
+            if skipped or stream.lost:
+                flags |= session.count_losses(skipped)
+            code = finish(state, row, rows, cursors, deadline, wake, read, write, flags, is_ahead)
             while code == RING_FULL and stream.makes_room(may_wait=not stops):
-                is_taken = hand_over(row, records, cursors, deadline, wake, read, write, flags)
-                code = OK if is_taken else RING_FULL
-            self._tick += 1
+                code = kernel.publish_again(deadline, wake, read, write, flags)
+            if code == BAD_RESULT:
+                return trip_reason(code, session.tick)
+            session.tick += 1
         return ""
 
-    def _note_grants(self, grants: tuple[Grant, ...]) -> None:
-        """Says once what was refused, and records what was granted."""
-        if not self._tick:
-            warn_of_refusals(self._grants + grants)
-        answers = {grant.name: grant.sentence for grant in self._grants + grants}
-        self._event("real_time", **answers)
+    def stop(self, by: str = "caller") -> None:
+        """Ends the run after the present tick; callable from ``on_tick`` and from any thread.
 
-    def _end_of(self, duration: float | None) -> int:
-        """Returns the tick before which a run ends that misses no deadline; −1: none."""
-        if duration is None:
-            length = self.device.info.duration
-            return -1 if length is None else max(self._tick, round(length / self.period) + 1)
-        if not np.isfinite(duration) or duration <= 0:
-            raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
-        return self._tick + max(round(duration / self.period), 1)
+        Without a run it ends the next one before its first tick, so that a late request never
+        leaves a force on.
 
-    def _resume(self) -> None:
-        """Starts the ramp; between two runs zero was commanded and the device may have moved."""
-        if not self._is_open:
-            raise HapticBridgeError("the bridge is not open; use 'with Bridge(...) as bridge:'")
-        if self._tick:
-            self._binding.resume()
-            self._event("resume", reason=self._stopped_by, **self._named_signal())
-        self._stopped_by = self._signal = ""
-
-    def _overrun(self, skipped: int) -> int:
-        """Counts a missed deadline, and ends the run where the machine was asleep meanwhile.
-
-        A run of so many seconds has so many ticks less; the one that was late is its last if it
-        came behind the end.
+        Args:
+            by: Origin of the request, for the summary and the event ``stop``; not empty.
         """
-        self._overruns += 1
-        self._skipped += skipped
-        if self._is_timed:
-            self._end = max(self._end - skipped, self._tick + 1)
-        asleep = slept_ns() - self._slept
-        if asleep > SUSPENDED_NS:
-            self._slept += asleep
-            self._event("suspended", seconds=1e-9 * asleep)
-            self.stop("suspend of the machine")
-        return int(TickFlag.OVERRUN)
+        self._stop.request(by)
 
-    def _trip(self, reason: str) -> None:
-        self._stopped_by = "trip"
-        self._event("trip", reason=reason)
-        raise SafetyTrip(reason, self._stream.latest(round(1.0 / self.period)))
+    def stop_on_signal(self, name: str) -> None:
+        """Ends the run as ``stop`` does, for a signal that the program received itself.
+
+        Args:
+            name: Name of the signal, for the recording.
+        """
+        self._stop.request("signal", name)
+
+    def command(self, command: Command, by: str = "caller") -> None:
+        """Queues a command for the run; callable from ``on_tick`` and from any thread.
+
+        It is executed between two ticks and recorded with its tick, so that the run can be
+        repeated.
+
+        Args:
+            command: A change of coupling or switches, a reset, a mark, or a stop.
+            by: Origin of the command, for the recording.
+
+        Raises:
+            CommandError: The device does not allow it, the last command is too recent, or the run
+                cannot execute it. Nothing changes then.
+        """
+        if isinstance(command, Stop):
+            self.stop(by)
+            return
+        if self._session is None or not self._session.is_open:
+            raise CommandError(_NOT_OPEN)
+        self._session.commands.offer(command, by)
+
+    def repeat_commands(self, events: Sequence[Mapping[str, Any]]) -> None:
+        """Applies recorded commands of another run before the next tick; call it in ``on_tick``.
+
+        The commands are applied without limit checks and without fading the force, because both
+        happened in the original run.
+
+        Args:
+            events: Events of the recording (``commands.CHANGES``), in order.
+        """
+        self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
+
+    def set_input(
+        self,
+        *,
+        ctrl: Mapping[str, ArrayLike] | None = None,
+        mocap: Mapping[str, ArrayLike] | None = None,
+        joint_force: Mapping[str, ArrayLike] | None = None,
+        body_wrench: Mapping[str, ArrayLike] | None = None,
+    ) -> None:
+        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
+
+        Move mocap bodies slowly. MuJoCo damps their welds and contacts against rest, so a fast
+        move can generate energy, and the environment is then called active.
+
+        Args:
+            ctrl: Controls by actuator of the scene.
+            mocap: Poses (x, y, z[, qw, qx, qy, qz]) in m by mocap body of the scene.
+            joint_force: Generalised forces by joint, in N or N m per degree of freedom.
+            body_wrench: Wrenches (force, torque) in N and N m by body, in the world frame about its
+                centre of mass.
+
+        Raises:
+            SceneError: A name does not exist or has the wrong number of values, or the method
+                cannot meter the work of inputs.
+        """
+        model = self.setup.scene.model
+        self.repeat_input(
+            input_writes(
+                model, ctrl=ctrl, mocap=mocap, joint_force=joint_force, body_wrench=body_wrench
+            )
+        )
+
+    def repeat_input(self, writes: list[Write]) -> None:
+        """Applies the writes of a recorded event ``input`` before the next tick.
+
+        Raises:
+            SceneError: The method cannot meter the work of inputs.
+        """
+        method = self.setup.method
+        if not method.meters_inputs:
+            raise SceneError(
+                f"method '{method.name}' cannot meter the work of inputs; use 'implicit'"
+            )
+        self._open_session().inputs.append(writes)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.setup.scene
+
+    @property
+    def period(self) -> float:
+        """T in s."""
+        return self.setup.period
+
+    @property
+    def session(self) -> Session:
+        """Resources of the run; they remain readable after the bridge was left.
+
+        Raises:
+            HapticBridgeError: The bridge was never opened.
+        """
+        if self._session is None:
+            raise HapticBridgeError(_NOT_OPEN)
+        return self._session
+
+    def _open_session(self) -> Session:
+        if self._session is None or not self._session.is_open:
+            raise HapticBridgeError(_NOT_OPEN)
+        return self._session
+
+    @property
+    def ledger(self) -> Ledger:
+        """Energies so far, by port."""
+        return Ledger.of(self.session.kernel.bound.state)
+
+    def latest_records(self, count: int) -> NDArray[np.void]:
+        """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
+        return self.session.stream.latest(count)
+
+    def conditions(self) -> tuple[str, ...]:
+        """Returns the conditions on device and method as sentences, once the bridge is open."""
+        return condition_sentences(self.device.info, self.session.parameters, self.setup.method)
+
+    def summary(self) -> Summary:
+        """Returns the summary of the run so far."""
+        return self.session.summary()

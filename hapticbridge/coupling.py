@@ -8,6 +8,14 @@ from numbers import Real
 
 from hapticbridge.errors import CouplingError
 
+SQUARED_LEVER = 1e-3
+"""Squared lever arm ℓ² in m² from translational to rotational gains: ℓ = 32 mm, about half the
+width of a hand, as in the default simulated device (0.002 N m s/rad over 2 N s/m). A longer lever
+holds the tool's orientation more stiffly and needs more rotational damping of the device."""
+
+_DERIVED = float("nan")
+# compared by identity, so that any other NaN is refused
+
 
 @dataclass(frozen=True, slots=True)
 class Coupling:
@@ -25,8 +33,13 @@ class Coupling:
     Attributes:
         stiffness: K in N/m, finite and > 0.
         damping: B in N s/m, finite and >= 0.
-        rotational_stiffness: K_r in N m/rad, finite and >= 0.
-        rotational_damping: B_r in N m s/rad, finite and >= 0.
+        rotational_stiffness: K_r in N m/rad, finite and >= 0; by default ℓ² K.
+        rotational_damping: B_r in N m s/rad, finite and >= 0; by default ℓ² B.
+
+    The defaults are those of the translational springs and dampers at a distance ℓ around the grip
+    (``SQUARED_LEVER``). On a device without torque they are never sent: they only hold the tool at
+    the handle's orientation, where 0 would leave it to fall about the grip as in a ball joint. On
+    a device with torque the condition for rotation holds them against its rotational damping.
 
     Raises:
         CouplingError: A value is not finite or out of range.
@@ -37,12 +50,16 @@ class Coupling:
 
     stiffness: float
     damping: float
-    rotational_stiffness: float
-    rotational_damping: float
+    rotational_stiffness: float = _DERIVED
+    rotational_damping: float = _DERIVED
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
+            if value is _DERIVED:
+                translational = getattr(self, field.name.removeprefix("rotational_"))
+                object.__setattr__(self, field.name, SQUARED_LEVER * translational)
+                continue
             is_number = isinstance(value, Real) and not isinstance(value, bool)
             if not is_number or not math.isfinite(value):
                 raise CouplingError(

@@ -13,7 +13,7 @@ from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.registry import DRIVERS
-from hapticbridge.errors import DeviceError, choices
+from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import handle_pose
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
@@ -53,7 +53,7 @@ class Limits:
         torque: Largest norm of the torque in N m, > 0.
         rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
         ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
-            stores much energy meanwhile (``kernel.ramp``).
+            stores much energy meanwhile (``kernel.guard``).
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
@@ -352,8 +352,8 @@ def guard_parameters_for(
     needed: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
     controller: str | None = None,
-    clutch: int | None = None,
-    dead_man: int | None = None,
+    clutch: int = 0,
+    dead_man: int = 0,
     is_absolute: bool = False,
 ) -> GuardParameters:
     """Returns the guard's parameters for a run.
@@ -373,26 +373,18 @@ def guard_parameters_for(
             than the coupling needs, else ``environment``. With enough damping the device port needs
             no controller. A spring turned far beyond the torque limit returns more than the credit
             covers, and an account of both ports would then blame a passive run.
-        clutch: Button that lets the device move without the handle.
-        dead_man: Button that must be held for any force.
+        clutch: Bit of the button that lets the device move without the handle; 0 without one.
+        dead_man: Bit of the button that must be held for any force; 0 without one.
         is_absolute: True if the device's pose is a pose in the scene; it is then not re-anchored
             before the first tick.
-
-    Raises:
-        DeviceError: The controller's name or a button is not valid.
     """
-    if controller is not None and controller not in CONTROLLERS:
-        raise DeviceError(f"unknown controller {controller!r}; choices: {choices(CONTROLLERS)}")
-    buttons = button_mask(clutch, "clutch"), button_mask(dead_man, "dead-man")
-    if buttons[0] and buttons[0] == buttons[1]:
-        raise DeviceError(f"clutch and dead-man are both button {clutch}; they exclude each other")
     force_rise, torque_rise = limits.rises(period)
     common = GuardParameters(
         force_rise=force_rise,
         torque_rise=torque_rise,
         fade_ticks=max(round(FADE / period), 1),
-        clutch=buttons[0],
-        dead_man=buttons[1],
+        clutch=clutch,
+        dead_man=dead_man,
         stretch=limits.stretch * scale,
         angle=limits.angle,
         reach=limits.reach_of(info),

@@ -1,22 +1,29 @@
-"""What a run is made of: device, scene, coupling, method, guard, checked against each other."""
+"""Options of a bridge, and the setup of a run that they resolve to.
+
+``BridgeOptions`` holds the user's choices. ``RunSetup.resolve`` completes them for a scene and a
+device, and refuses what they cannot do. The live loop and the studies share
+``RunSetup.parameters``, so a method on a device is computed equally in both.
+"""
 
 from __future__ import annotations
 
-from collections import deque
-from contextlib import ExitStack
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from typing import TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.certificate import default_coupling, required_axis_damping
 from hapticbridge.clock import Clock, RealClock, period_of
-from hapticbridge.commands import CommandQueue, CouplingLimits
+from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Device, DeviceInfo, device_for
-from hapticbridge.errors import RecordingError
+from hapticbridge.device import AXES, Device, DeviceInfo, device_for
+from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, choices
 from hapticbridge.guard import (
+    CONTROLLERS,
     UNLIMITED,
     Limits,
     button_mask,
@@ -24,7 +31,6 @@ from hapticbridge.guard import (
     limits_for,
     refuse_simulated_time,
 )
-from hapticbridge.inputs import Write
 from hapticbridge.kernel.parameters import (
     UNGUARDED,
     GuardParameters,
@@ -35,8 +41,6 @@ from hapticbridge.kernel.parameters import (
 )
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import wants_real_time
-from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.recording.recorder import RingObserver
 from hapticbridge.rendering import (
     Method,
     default_method,
@@ -44,12 +48,9 @@ from hapticbridge.rendering import (
     require_hazard_consent,
     resolve_contact_stiffness,
 )
-from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene import Scene
 
-# Map between the device's frame and the scene's, and the run parameters of a start.
-#
-# The live loop, the closed-loop sweeps and the studies build their parameters here. One method
-# on one device therefore has equal parameters in all of them.
+# Options of a user.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,282 +64,334 @@ class Workspace:
 
     Attributes:
         scale: Handle motion per device motion, without unit, finite and > 0.
-        force_scale: Force on the device per force on the tool, without unit, finite and > 0.
-            ``RunParameters`` checks both ranges.
-        axes: A, row by row.
-        is_absolute: True if the device's poses are poses in the scene.
+        force_scale: Force on the device per force on the tool, without unit, finite and > 0. None
+            takes ``scale``, which keeps power equal on both sides.
+        axes: Rotation A from the device's axes to the scene's: 3 × 3, or 9 numbers row by row.
+        absolute: True takes the device's poses as poses in the scene instead of relative to its
+            start.
+
+    Raises:
+        HapticBridgeError: A scale is out of range, or the axes are not a right-handed rotation.
     """
 
     scale: float = 1.0
-    force_scale: float = 1.0
-    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    is_absolute: bool = False
+    force_scale: float | None = None
+    axes: ArrayLike = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    absolute: bool = False
 
-    @classmethod
-    def of(
-        cls, scale: float, force_scale: float | None, axes: ArrayLike | None, *, is_absolute: bool
-    ) -> Workspace:
-        """Builds a workspace from the user's arguments.
+    def __post_init__(self) -> None:
+        for name, value in zip(("scale", "force_scale"), self.scales, strict=True):
+            if not math.isfinite(value) or value <= 0:
+                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+        object.__setattr__(self, "axes", rotation_numbers(self.axes))
 
-        Args:
-            scale: Handle motion per device motion.
-            force_scale: Force on the device per force on the tool; None takes ``scale``, which
-                keeps power equal on both sides.
-            axes: 3 × 3 rotation; None is the identity.
-            is_absolute: True if the device's poses are poses in the scene.
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Scales of motion and of force."""
+        return self.scale, self.scale if self.force_scale is None else self.force_scale
 
-        Raises:
-            HapticBridgeError: The axes are not a right-handed rotation.
-        """
-        return cls(
-            scale=scale,
-            force_scale=scale if force_scale is None else force_scale,
-            axes=rotation_numbers(np.eye(3) if axes is None else axes),
-            is_absolute=is_absolute,
-        )
+    @property
+    def rotation(self) -> tuple[float, ...]:
+        """The nine numbers of the rotation nearest to the given axes, row by row."""
+        return cast(tuple[float, ...], self.axes)
 
 
 SAME_FRAME = Workspace()
 """Workspace with equal axes and scales; the device starts at the grip."""
 
 
-def run_parameters(
-    scene: Scene,
-    coupling: Coupling,
-    method: Method,
-    first: NDArray[np.void],
-    *,
-    period: float,
-    felt: Coupling | None,
-    substeps: int = 1,
-    info: DeviceInfo | None = None,
-    limits: Limits = UNLIMITED,
-    workspace: Workspace = SAME_FRAME,
-    contact_stiffness: float | None = None,
-    guarding: GuardParameters = UNGUARDED,
-) -> RunParameters:
-    """Returns the parameters of a run that starts now.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BridgeOptions:
+    """Options of a bridge; the defaults suit a device with known damping.
 
-    Args:
-        scene: Scene after ``rendering.prepare``; the handle starts at its grip.
-        coupling: Requested coupling.
-        method: Rendering method.
-        first: The device's first sample, ``SAMPLE_DTYPE``, shape (1,).
-        period: T in s.
-        felt: Result of ``rendering.prepare``.
-        substeps: MuJoCo steps per tick.
-        info: The device, for its damping; None if unknown.
-        limits: Limits of the wrench.
+    Attributes:
+        rate: Ticks per second in Hz, 1 to 1e6.
+        substeps: MuJoCo steps per tick, 1 to 100. With more than one, the device receives the mean
+            of their wrenches and needs another damping (``certificate.required_damping``).
+        method: Name of the rendering method (``rendering.METHODS``). None selects ``lossless``, or
+            ``implicit`` with substeps, because ``lossless`` takes none.
+        contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
+        i_know: True accepts a hazardous method (``Method.hazard``) on a real device.
         workspace: Map from the device's frame to the scene's.
-        contact_stiffness: K_c in N/m for a massless tool; None takes the coupling's stiffness.
-        guarding: Guard parameters.
+        limits: Limits of the wrench and of the run; None takes the device's own.
+        controller: Passivity controller. ``damper`` acts when the device was given more than its
+            damping dissipates and the scene released. ``environment`` acts when the scene
+            generated more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
+            the device condition does not hold, else ``environment``.
+        clutch: Number of the device's button, from 0, that lets it move without the handle.
+        dead_man: Number of the button, from 0, that must be held for any force.
+        mark: Number of the button, from 0, that writes an event ``mark`` at each press.
+        realtime: True requests real time from the system while the loop runs. A refused request is
+            reported once, with the command that grants it. None requests it for a real device.
+        pipelined: True computes ahead, after the wrench was sent, what needs no new sample
+            (``kernel.tick.can_split``). The numbers are equal to the bit, the wrench is sent
+            sooner, and the whole tick takes 5 % longer. Between two ticks ``scene.data`` then holds
+            the contacts of the new positions, without forces. None does so on a real clock.
+        live: True shows the state of the run on standard error, from the recorder's process.
 
     Raises:
-        HapticBridgeError: A value is out of range.
+        HapticBridgeError: A value is out of range; the message names the valid ones.
     """
-    start = tuple(float(v) for v in (*first["position"][0], *first["quaternion"][0]))
-    burning, rotational = (None, None) if info is None else info.burning_damping
-    return RunParameters(
-        grip=scene.grip,
-        period=period,
-        substeps=substeps,
-        coupling=method.used(coupling, period / checked_substeps(substeps)),
-        scale=workspace.scale,
-        force_scale=workspace.force_scale,
-        axes=workspace.axes,
-        force_limit=limits.force,
-        torque_limit=limits.torque,
-        ramp_ticks=limits.ramp_ticks(period),
-        device_origin=IDENTITY_POSE if workspace.is_absolute else start,
-        handle_origin=IDENTITY_POSE if workspace.is_absolute else scene.grip_pose(),
-        device_start=start,
-        scheme=method.scheme,
-        felt=felt,
-        contact_stiffness=resolve_contact_stiffness(method, coupling, contact_stiffness),
-        device_damping=burning,
-        device_rotational_damping=rotational,
-        guarding=guarding,
-    )
+
+    rate: float = 1000.0
+    substeps: int = 1
+    method: str | None = None
+    contact_stiffness: float | None = None
+    i_know: bool = False
+    workspace: Workspace = SAME_FRAME
+    limits: Limits | None = None
+    controller: str | None = None
+    clutch: int | None = None
+    dead_man: int | None = None
+    mark: int | None = None
+    realtime: bool | None = None
+    pipelined: bool | None = None
+    live: bool = False
+
+    def __post_init__(self) -> None:
+        period_of(self.rate)
+        refuse_substeps(self.rendering_method.scheme, checked_substeps(self.substeps))
+        if self.controller is not None and self.controller not in CONTROLLERS:
+            raise DeviceError(
+                f"unknown controller {self.controller!r}; choices: {choices(CONTROLLERS)}"
+            )
+        for button, purpose in ((self.clutch, "clutch"), (self.dead_man, "dead-man")):
+            button_mask(button, purpose)
+        button_mask(self.mark, "mark")
+        if self.clutch is not None and self.clutch == self.dead_man:
+            raise DeviceError(
+                f"clutch and dead-man are both button {self.clutch}; they exclude each other"
+            )
+
+    @property
+    def rendering_method(self) -> Method:
+        """The named method, or the default for these substeps."""
+        if self.method is None:
+            return default_method(checked_substeps(self.substeps))
+        return method_named(self.method)
 
 
-class Arrangement:
-    """What a run is made of, chosen where it was left open and refused where it cannot be.
+DEFAULT_OPTIONS = BridgeOptions()
+"""Options of a bridge without choices of the user."""
 
-    A device that it opened itself is let go if something else is refused.
+
+class OptionChanges(TypedDict, total=False):
+    """Fields of ``BridgeOptions`` as keyword arguments."""
+
+    rate: float
+    substeps: int
+    method: str | None
+    contact_stiffness: float | None
+    i_know: bool
+    workspace: Workspace
+    limits: Limits | None
+    controller: str | None
+    clutch: int | None
+    dead_man: int | None
+    mark: int | None
+    realtime: bool | None
+    pipelined: bool | None
+    live: bool
+
+
+# Setup of a run.
+
+PRESCRIBED_MOTION = DeviceInfo(
+    name="prescribed motion", axes=AXES, force_limit=0.0, is_prescribed=True, is_real=False
+)
+"""Data sheet of a motion without a device, for studies; it does not react to any force."""
+
+
+@contextmanager
+def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator[Device]:
+    """Yields a device, opened if it is named by a string.
+
+    A device that was opened here is closed if the body raises. One that the caller opened is not.
+
+    Raises:
+        DeviceError: The device cannot be opened, or is bound to real time and the clock is
+            simulated.
+    """
+    if not isinstance(device, str):
+        yield device
+        return
+    refuse_simulated_time(device, clock)
+    opened = device_for(scene, device)
+    try:
+        yield opened
+    except BaseException:
+        opened.close()
+        raise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSetup:
+    """Scene, device, coupling, method and guard of a run, checked against each other.
 
     Attributes:
         scene: The loaded scene.
-        device: The device, open but not started.
-        coupling: K and B that should be felt.
-        method: How the tool is rendered.
-        clock: What gives the ticks their time.
+        coupling: Requested K and B.
+        method: The rendering method.
         period: T in s.
+        info: The device's data sheet.
+        substeps: MuJoCo steps per tick.
+        workspace: Map from the device's frame to the scene's.
+        limits: Limits of the wrench.
+        guard: Guard parameters.
+        contact_stiffness: K_c in N/m for a massless tool, else 0.
+        mark: Bit of the mark button; 0 without one.
+        is_realtime: True if real time is requested from the system.
+        is_pipelined: True if a tick computes ahead for the next one.
     """
 
-    def __init__(
-        self,
-        scene: Scene | str | Path,
-        device: Device | str = "simulated",
-        coupling: Coupling | None = None,
+    scene: Scene
+    coupling: Coupling
+    method: Method
+    period: float
+    info: DeviceInfo = PRESCRIBED_MOTION
+    substeps: int = 1
+    workspace: Workspace = SAME_FRAME
+    limits: Limits = UNLIMITED
+    guard: GuardParameters = UNGUARDED
+    contact_stiffness: float = 0.0
+    mark: int = 0
+    is_realtime: bool = False
+    is_pipelined: bool = False
+
+    @classmethod
+    def resolve(
+        cls,
+        scene: Scene,
+        info: DeviceInfo,
+        coupling: Coupling | None,
+        options: BridgeOptions,
+        clock: Clock,
         *,
-        rate: float = 1000.0,
-        substeps: int = 1,
-        method: str | None = None,
-        contact_stiffness: float | None = None,
-        i_know: bool = False,
-        recording: str | Path | None = None,
-        clock: Clock | None = None,
-        scale: float = 1.0,
-        force_scale: float | None = None,
-        axes: ArrayLike | None = None,
-        absolute: bool = False,
-        limits: Limits | None = None,
-        controller: str | None = None,
-        clutch: int | None = None,
-        dead_man: int | None = None,
-        live: bool = False,
-        onlooker: RingObserver | None = None,
-        pipelined: bool | None = None,
-        realtime: bool | None = None,
-        mark: int | None = None,
-    ) -> None:
-        """Checks everything that can be checked before the device is started.
+        is_recorded: bool = True,
+    ) -> RunSetup:
+        """Completes a user's options, and refuses what they cannot do.
 
         Args:
-            scene: A loaded scene, a name, or a path to MJCF.
-            device: A device, or what ``open_device`` understands.
-            coupling: K and B that should be felt; None chooses the stiffest safe one for the
-                device's damping (80 % of the bound, a quarter of b used as damping, less where
-                substeps need it; for a device of unknown damping, that of the default simulated
-                one).
-            rate: Ticks per second, 1 to 1e6.
-            substeps: MuJoCo steps per tick, 1 to 100. With more than one the mean of their wrenches
-                is sent, and the device needs another damping: ``certificate.required_damping``.
-            method: How the tool is rendered; see ``rendering.METHODS``. None: ``lossless``, or with
-                substeps, which that does not take, ``implicit``.
-            contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
-            i_know: Accept a method that may kick (``Method.hazard``) on a real device.
-            recording: File to write (``.mcap``), or None; an existing file is replaced.
-            clock: ``RealClock()`` by default; ``SimulatedClock()`` runs as fast as it goes.
-            scale: Handle motion per device motion.
-            force_scale: Force on the device per force on the tool; None takes ``scale``, which
-                keeps power equal on both sides.
-            axes: 3 × 3 rotation from the device's frame to the scene's.
-            absolute: Take the device's poses as poses in the scene instead of relative to its
-                start.
-            limits: Limits on the wrench, within the device's own; None takes these.
-            controller: Passivity controller: ``damper`` acts where the device was given more than
-                its damping burns and the scene gives up, ``environment`` where the scene created
-                more than the coupling's slack; ``off``. None: ``damper`` where the device
-                condition does not hold, else ``environment``.
-            clutch: Number of the device's button, from 0, that lets it move without the handle.
-            dead_man: Number of the button that must be held for any force.
-            live: Draw a status line on stderr, from the recorder's process.
-            onlooker: Who looks at the run from another process, as ``view.Window`` does; it is
-                started when the bridge is entered and closed when it is left.
-            pipelined: Compute what needs no new sample once the wrench is out, where scene and
-                method let it (``kernel.ahead``): the same numbers to the bit, the wrench sooner,
-                the whole tick 5 % longer. Between two ticks ``scene.data`` then holds the contacts
-                of the new positions, without forces. None: in real time, where a device waits.
-            realtime: Ask the system for real time while the loop runs (``realtime.real_time``);
-                what it refuses is warned of once, with the command that grants it. None: for a real
-                device.
-            mark: Number of the button that writes an event ``mark`` into the recording each time it
-                is pressed.
+            scene: The loaded scene.
+            info: The device's data sheet.
+            coupling: Requested K and B. None selects the stiffest safe coupling for the device's
+                damping: 80 % of the bound, with a quarter of b as damping, less where substeps need
+                it. A device of unknown damping counts as the default simulated one.
+            options: The user's options.
+            clock: Clock of the run.
+            is_recorded: True if the run is recorded.
 
         Raises:
-            HapticBridgeError: An argument is out of range; the message says which and what is
-                valid.
+            HapticBridgeError: Two of them exclude each other; the message names both.
         """
-        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        self.period = period_of(rate)
-        self._substeps = checked_substeps(substeps)
-        self.method = default_method(substeps) if method is None else method_named(method)
-        refuse_substeps(self.method.scheme, substeps)
-        self._workspace = Workspace.of(scale, force_scale, axes, is_absolute=absolute)
-        self._path = Path(recording) if recording is not None else None
-        self._is_live, self._onlooker = live, onlooker
-        self._mark_button = button_mask(mark, "mark")
-        if self._mark_button and self._path is None:
-            raise RecordingError(
-                f"button {mark} is to mark moments of a recording, but nothing is recorded; name a "
-                "file to record to"
-            )
-        self.clock = clock or RealClock()
-        self._is_pipelined = self.clock.name == RealClock.name if pipelined is None else pipelined
-        with ExitStack() as refused:
-            if isinstance(device, str):
-                refuse_simulated_time(device, self.clock)
-                device = device_for(self.scene, device)
-                refused.callback(device.close)  # else nobody could, if it is refused
-            self.device = device
-            self.coupling = coupling or default_coupling(
-                device.info,
-                self.period,
-                self._workspace.scale,
-                self._workspace.force_scale,
-                self.laws,
-                self.method,
-            )
-            self._limits = limits_for(device.info, limits)
-            self._guarding = guard_parameters_for(
-                device.info,
-                self._limits,
-                self.period,
-                needed=required_axis_damping(
-                    device.info,
-                    self.used,
-                    self.period,
-                    self._workspace.scale,
-                    self._workspace.force_scale,
-                    self.laws,
-                    self.method,
-                ),
-                scale=self._workspace.scale,
-                controller=controller,
-                clutch=clutch,
-                dead_man=dead_man,
-                is_absolute=self._workspace.is_absolute,
-            )
-            require_hazard_consent(self.method, is_real=device.info.is_real, i_know=i_know)
-            # refused here already
-            resolve_contact_stiffness(self.method, self.coupling, contact_stiffness)
-            refuse_simulated_time(device.info, self.clock)
-            self._is_realtime = wants_real_time(realtime, self.clock, is_real=device.info.is_real)
-            refused.pop_all()
-        self._contact_stiffness = contact_stiffness
-        self._sample = np.zeros(1, SAMPLE_DTYPE)
-        self._inputs: deque[list[Write]] = deque()
-        # who wants the run to end, and the signal's name if one does; other threads append
-        self._stops: deque[tuple[str, str]] = deque()
-        allowance = CouplingLimits(
-            info=self.device.info,
-            method=self.method,
-            start=self.rendered,
-            period=self.period,
-            scale=self._workspace.scale,
-            force_scale=self._workspace.force_scale,
-            substeps=self._substeps,
-            limits=self._limits,
+        method, period, substeps = (
+            options.rendering_method,
+            period_of(options.rate),
+            options.substeps,
         )
-        self._commands = CommandQueue(allowance, is_recorded=self._path is not None)
+        scales, laws = options.workspace.scales, method.laws(substeps)
+        if options.mark is not None and not is_recorded:
+            raise RecordingError(
+                f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
+                " name a file to record to"
+            )
+        refuse_simulated_time(info, clock)
+        requested = coupling or default_coupling(info, period, *scales, laws, method)
+        law = method.used(requested, period / substeps)
+        limits = limits_for(info, options.limits)
+        guard = guard_parameters_for(
+            info,
+            limits,
+            period,
+            needed=required_axis_damping(info, law, period, *scales, laws, method),
+            scale=scales[0],
+            controller=options.controller,
+            clutch=button_mask(options.clutch, "clutch"),
+            dead_man=button_mask(options.dead_man, "dead-man"),
+            is_absolute=options.workspace.absolute,
+        )
+        require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
+        is_real_clock = clock.name == RealClock.name
+        return cls(
+            scene=scene,
+            info=info,
+            coupling=requested,
+            method=method,
+            period=period,
+            substeps=substeps,
+            workspace=options.workspace,
+            limits=limits,
+            guard=guard,
+            contact_stiffness=resolve_contact_stiffness(
+                method, requested, options.contact_stiffness
+            ),
+            mark=button_mask(options.mark, "mark"),
+            is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
+            is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
+        )
 
     @property
-    def used(self) -> Coupling:
-        """The coupling whose law gives the wrench; ``coupling`` is what should be felt."""
-        return self.method.used(self.coupling, self.period / self._substeps)
+    def law(self) -> Coupling:
+        """Coupling of the law: K and B', for which the device needs b >= s (K T/2 + B')."""
+        return self.method.used(self.coupling, self.period / self.substeps)
 
     @property
-    def rendered(self) -> Coupling:
-        """``coupling``, but for damping below what the method can show; ``Method.rendered``."""
-        return self.method.rendered(self.used, self.period / self._substeps)
+    def attainable(self) -> Coupling:
+        """Requested coupling, with damping raised to the least that the method can render."""
+        return self.method.rendered(self.law, self.period / self.substeps)
 
     @property
-    def reach(self) -> float:
-        """Distance of the device in m from the origin of its frame that ends handle and force."""
-        return self._guarding.reach
+    def law_evaluations(self) -> int:
+        """Evaluations of the wrench on the tool per tick."""
+        return self.method.laws(self.substeps)
 
     @property
-    def laws(self) -> int:
-        """How often per tick the wrench on the tool is computed."""
-        return self.method.laws(self._substeps)
+    def coupling_limits(self) -> CouplingLimits:
+        """Couplings that may be selected during the run."""
+        scale, force_scale = self.workspace.scales
+        return CouplingLimits(
+            info=self.info,
+            method=self.method,
+            start=self.attainable,
+            period=self.period,
+            scale=scale,
+            force_scale=force_scale,
+            substeps=self.substeps,
+            limits=self.limits,
+        )
+
+    def parameters(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
+        """Returns the parameters of a run that starts now.
+
+        Args:
+            start: The device's first sample, ``SAMPLE_DTYPE``, shape (1,).
+            effective: Result of ``rendering.prepare``; the handle starts at the scene's grip.
+
+        Raises:
+            HapticBridgeError: A value is out of range.
+        """
+        pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
+        damping, rotational_damping = self.info.burning_damping
+        scale, force_scale = self.workspace.scales
+        is_absolute = self.workspace.absolute
+        return RunParameters(
+            grip=self.scene.grip,
+            period=self.period,
+            substeps=self.substeps,
+            coupling=self.law,
+            scale=scale,
+            force_scale=force_scale,
+            axes=self.workspace.rotation,
+            force_limit=self.limits.force,
+            torque_limit=self.limits.torque,
+            ramp_ticks=self.limits.ramp_ticks(self.period),
+            device_origin=IDENTITY_POSE if is_absolute else pose,
+            handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
+            device_start=pose,
+            scheme=self.method.scheme,
+            felt=effective,
+            contact_stiffness=self.contact_stiffness,
+            device_damping=damping,
+            device_rotational_damping=rotational_damping,
+            guarding=self.guard,
+        )

@@ -1,340 +1,446 @@
-"""What is open while a bridge is: device, ring, recording, kernel; and how it is left again."""
+"""Resources of an open run, and their orderly release.
+
+``Session`` owns them. ``TickKernel`` is the arithmetic of a tick around MuJoCo's step,
+``RecordOutput`` the destinations of the records, ``StopRequest`` a wish to end the run.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Any, Self
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hapticbridge.certificate import condition_sentences
-from hapticbridge.clock import RealClock
-from hapticbridge.commands import Command, CommandExecutor, EventApplier, Repeat
-from hapticbridge.commands.command import Stop
-from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, DeviceError, HapticBridgeError, SceneError
+from hapticbridge.clock import Clock, RealClock, slept_ns
+from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
+from hapticbridge.device import Device
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import refuse_stretched_start, wait_until_still
-from hapticbridge.inputs import Write, apply_writes, input_writes
+from hapticbridge.inputs import Write, apply_writes
 from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK, RING_FULL
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
 from hapticbridge.kernel.tick import (
     answer_step,
     before_step,
+    can_split,
     finish_tick,
     publish,
     publish_positions,
 )
-from hapticbridge.options import Arrangement, run_parameters
-from hapticbridge.realtime import Grant, check_pace, memory_at_rest
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.recording.recorder import RecordStream
+from hapticbridge.options import RunSetup
+from hapticbridge.realtime import Grant, check_pace, memory_at_rest, warn_of_refusals
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare
 from hapticbridge.run_description import attachments, describe_run, start_state
-from hapticbridge.summary import Ledger, Summary
+from hapticbridge.summary import RunOutcome, Summary
+
+SUSPENDED_NS = 50_000_000
+"""Longest sleep of the machine in ns that a run survives. After a longer one the state of hand and
+power is unknown. A smaller value could end a run without a sleep, because the two clocks are read
+microseconds apart."""
+
+CHECK_PERIOD, PICTURE_PERIOD = 0.1, 1 / 30
+"""Time in s between two checks of the recorder, and between two pictures for an observer, which
+include a check. A recorded run ends with its recorder; a longer period finds its end later. An eye
+sees no more pictures. Check and picture cost the loop 4 µs each after the wrench was sent."""
 
 _NO_FORCE = np.zeros(6)
 
+MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
-class Opened(Arrangement):
-    """An arrangement that can be entered and left, with the ways into a run and what it says.
 
-    Entering prepares everything and compiles what must be compiled; leaving commands zero force,
-    closes the recording with a reason, and closes the device.
+class StopRequest:
+    """Requests to end a run, from any thread or from a signal handler.
 
     Attributes:
-        parameters: All that decides what the run computes; once entered.
+        waiting: Origin of each request, and the signal's name or an empty text. The loop tests only
+            if it is empty, which needs neither a lock nor a call.
     """
 
-    _tick = _overruns = _skipped = 0
-    _stopped_by = _signal = ""
-    _is_open = False
-    _grants: tuple[Grant, ...] = ()
+    def __init__(self) -> None:
+        self.waiting: deque[tuple[str, str]] = deque()
 
-    def __enter__(self) -> Self:
-        # released in reverse order, whatever one of them does: force, recording, ring, device
-        with ExitStack() as resources:
-            resources.callback(self.device.close)
-            self._prepare(resources)
-            resources.callback(self._silence)
-            self._resources = resources.pop_all()
-        self._is_open = True
-        return self
+    def request(self, by: str, signal: str = "") -> None:
+        """Ends the present run after its present tick, or the next run before its first tick."""
+        self.waiting.append((by or "caller", signal))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._is_open = False
-        reason = self._stopped_by if error is None else f"{type(error).__name__}: {error}"
-        self._event(
-            "stop",
-            reason=reason,
-            **self._named_signal(),
-            overruns=self._overruns,
-            skipped=self._skipped,
-            dropped=self._stream.dropped,
+    def take(self) -> tuple[str, str]:
+        """Removes all requests; returns origin and signal of the last one, both empty if none."""
+        last = "", ""
+        while self.waiting:
+            last = self.waiting.popleft()
+        return last
+
+
+@dataclass(frozen=True, slots=True)
+class RecordOutput:
+    """Destinations of a run's records.
+
+    Attributes:
+        path: File of the recording; None records nothing.
+        observer: Second reader of the records, such as ``view.Window``; None without one.
+        live: True shows the state of the run on standard error.
+    """
+
+    path: Path | None = None
+    observer: RingObserver | None = None
+    live: bool = False
+
+    def open_stream(
+        self, period: float, snapshot: Snapshot | None, *, is_lossless: bool
+    ) -> RecordStream:
+        """Returns the ring of the records; the files are opened when the stream is started.
+
+        Args:
+            period: T in s.
+            snapshot: Shared memory with the scene's positions, for the observer.
+            is_lossless: True if the loop may wait for the recorder.
+
+        Raises:
+            RecordingError: There is no memory for the ring.
+        """
+        return RecordStream(
+            self.path,
+            period,
+            live=self.live,
+            is_lossless=is_lossless,
+            observer=self.observer,
+            snapshot=str(snapshot and snapshot.name),
         )
-        self._resources.__exit__(kind, error, traceback)
 
-    def _prepare(self, resources: ExitStack) -> None:
-        """Compiles the kernel, puts the scene to its start, and opens the recording."""
-        if self._tick or self._is_open:
-            raise HapticBridgeError("a bridge is entered once; make a new one for another run")
-        self.scene.claim()
-        resources.callback(self.scene.release)
-        scene, clock, method = self.scene, self.clock, self.method
-        felt = prepare(scene, self.coupling, self.period, self._substeps, method)
-        self._snapshot = None if self._onlooker is None else Snapshot.shared(scene.model)
+
+class MarkButton:
+    """Button that writes an event for each press; one held from the start marks nothing.
+
+    Args:
+        mask: Bit of the button.
+        sample: The loop's sample, ``SAMPLE_DTYPE``, shape (1,).
+        note: Called for each press.
+    """
+
+    def __init__(self, mask: int, sample: NDArray[np.void], note: Callable[[], None]) -> None:
+        self._mask, self._buttons, self._note = mask, sample["buttons"], note
+        self._was_held = True
+
+    def look(self) -> None:
+        """Compares the button with its last state."""
+        is_held = bool(self._buttons[0] & self._mask)
+        if is_held and not self._was_held:
+            self._note()
+        self._was_held = is_held
+
+
+class TickKernel:
+    """Compiled arithmetic of a tick, bound to a scene, and the arrays that it works on.
+
+    MuJoCo's steps are called through Python, because an error inside the C functions would end the
+    process with the last force on the motors.
+
+    Args:
+        sample: The loop's sample, ``SAMPLE_DTYPE``, shape (1,).
+        stream: Receives the records.
+
+    Attributes:
+        before, answer, finish: Machine code of ``before_step``, ``answer_step`` and
+            ``finish_tick`` of ``kernel.tick``.
+        sample: The device's newest sample.
+        rows, cursors: Records and cursors of the ring.
+        bound: Kernel state that belongs to the scene; its ``state`` and ``row``.
+        step, first_half, second_half: MuJoCo's step for the method, and its two parts around
+            the sample in a tick that was computed ahead.
+        wrench: Wrench on the device, shape (6,), in N and N m.
+        external_flags: Flags of the sample, shape (1,), for the kernel.
+        is_ahead: True if a tick computes the first half of the next one.
+    """
+
+    first_half: MujocoStep = staticmethod(mujoco.mj_fwdPosition)
+    second_half: MujocoStep = staticmethod(mujoco.mj_step2)
+
+    def __init__(self, sample: NDArray[np.void], stream: RecordStream) -> None:
+        self.sample, self.rows, self.cursors = sample, stream.rows, stream.cursors
+        state, row = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE)
+        rows, cursors = self.rows, self.cursors
+        head, numbers = np.zeros(1, np.int64), np.zeros(1)
+        self.before = direct(before_step, state, sample, row, 0, 0.0)
+        self.answer = direct(answer_step, state, row, 0)
+        self.finish = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
+        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
+        self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
+
+    def bind(self, bound: BoundKernel, setup: RunSetup) -> None:
+        """Attaches the arrays of a scene and the steps of a method."""
+        method = setup.method
+        self.bound, self.step, self.substeps = bound, method.step, range(setup.substeps)
+        self.is_ahead = setup.is_pipelined and can_split(setup.scene.model, method.scheme)
+        self.external_flags = bound.external_flags
+        self.wrench = bound.wrench_on_device
+
+    def publish_again(self, deadline: int, wake: int, read: int, write: int, flags: int) -> int:
+        """Publishes a record that a full ring refused; returns ``OK`` or ``RING_FULL``.
+
+        The times are those of the record, in ns of running.
+        """
+        times = deadline, wake, read, write
+        is_taken = self._publish(self.bound.row, self.rows, self.cursors, *times, flags)
+        return OK if is_taken else RING_FULL
+
+    def publish_positions(self, snapshot: Snapshot) -> None:
+        """Copies the scene's positions for an observer."""
+        self._publish_positions(self.bound.state, self.cursors, snapshot.head, snapshot.numbers)
+
+
+class Session:
+    """Resources of an open run: device, bound kernel, records, commands and counters.
+
+    Constructing it opens everything; the scene is prepared, the kernel compiled and the device
+    started last, because from then on it is held. ``close`` releases in reverse order.
+
+    Args:
+        setup: The resolved setup.
+        device: The device, open but not started.
+        clock: Clock of the run.
+        output: Destinations of the records.
+        stop: Requests to end the run.
+
+    Attributes:
+        parameters: All that decides the run's numbers, beside scene and device motion.
+        kernel: Arithmetic of a tick.
+        stream: Records and events on their way out.
+        commands: Queue of commands.
+        executor: Execution of the queue's commands.
+        inputs: Waiting changes of the scene's inputs.
+        mark: The mark button; None without one.
+        tick: Number of the next tick.
+        end: Tick before which the run ends; −1 for none.
+        is_open: False after ``close``.
+
+    Raises:
+        HapticBridgeError: The scene is in use, a method cannot render it, or the device cannot
+            start. Everything opened until then is released.
+    """
+
+    def __init__(
+        self,
+        setup: RunSetup,
+        device: Device,
+        clock: Clock,
+        output: RecordOutput,
+        stop: StopRequest,
+    ) -> None:
+        self.setup, self.device, self.clock, self.output = setup, device, clock, output
+        self.stop = stop
+        self.tick = self.overruns = self.skipped = 0
+        self.end, self._is_timed, self._slept = -1, False, 0
+        self.stopped_by = self._signal = ""
+        self._grants: tuple[Grant, ...] = ()
+        self.inputs: deque[list[Write]] = deque()
+        self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
+        with ExitStack() as resources:
+            resources.callback(device.close)
+            self._open(resources)
+            resources.callback(self.command_zero_force)
+            self._resources = resources.pop_all()
+        self.is_open = True
+
+    def _open(self, resources: ExitStack) -> None:
+        setup, scene, clock = self.setup, self.setup.scene, self.clock
+        scene.claim()
+        resources.callback(scene.release)
+        effective = prepare(scene, setup.coupling, setup.period, setup.substeps, setup.method)
+        self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
         if self._snapshot is not None:
             resources.callback(self._snapshot.close)
-        self._stream = RecordStream(
-            self._path,
-            self.period,
-            live=self._is_live,
-            is_lossless=clock.is_lossless,
-            onlooker=self._onlooker,
-            snapshot=str(self._snapshot and self._snapshot.name),
+        self.stream = self.output.open_stream(
+            setup.period, self._snapshot, is_lossless=clock.is_lossless
         )
-        resources.callback(self._stream.close)
-        self._compile()
+        resources.callback(self.stream.close)
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
             is_real = self.device.info.is_real
-            check_pace(scene, method, self.period, self._substeps, is_real=is_real)
-        if self._is_realtime:
+            check_pace(scene, setup.method, setup.period, setup.substeps, is_real=is_real)
+        if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
-        # last, because from here on the device is held, and its pose counts
-        self._sample[:] = self.device.start(self.period)
-        self._bind(felt)
-        refuse_stretched_start(self._binding.state, self._sample, self._limits)
-        if self._stream.is_read:
-            self._stream.start(self._description(), attachments(scene))
-            self._event("start")
-
-    def _bind(self, felt: Coupling | None) -> None:
-        """Binds the kernel to the scene, whose present state is where the run starts."""
-        scene = self.scene
+        sample[:] = self.device.start(setup.period)
+        self.parameters = setup.parameters(sample, effective)
         start = start_state(scene.model, scene.data).tobytes()
-        self.parameters = parameters = run_parameters(
-            scene,
-            self.coupling,
-            self.method,
-            self._sample,
-            period=self.period,
-            felt=felt,
-            substeps=self._substeps,
-            info=self.device.info,
-            limits=self._limits,
-            workspace=self._workspace,
-            contact_stiffness=self._contact_stiffness,
-            guarding=self._guarding,
-        )
-        self._binding = binding = BoundKernel(scene.model, scene.data, parameters)
-        self._repeater = EventApplier(
-            binding, scene.model, scene.data, self.method, parameters, start
-        )
+        bound = BoundKernel(scene.model, scene.data, self.parameters)
+        self.kernel.bind(bound, setup)
+        refuse_stretched_start(bound.state, sample, setup.limits)
+        if self.stream.is_read:
+            self.stream.start(self._description(), attachments(scene))
+            self.event("start")
+        if self.output.observer is not None:
+            self.commands.warm_up()
+        applier = EventApplier(bound, scene.model, scene.data, setup.method, self.parameters, start)
+        self.executor = CommandExecutor(self.commands, applier, setup.guard.fade_ticks, self.event)
+        self.mark: MarkButton | None = None
+        if setup.mark:
+            self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
+        period = CHECK_PERIOD if self._snapshot is None else PICTURE_PERIOD
+        self._chore_ticks = max(round(period / setup.period), 1)
 
     def _description(self) -> dict[str, str]:
         return describe_run(
-            self.scene,
+            self.setup.scene,
             self.parameters,
-            self._binding,
-            method=self.method.name,
+            self.kernel.bound,
+            method=self.setup.method.name,
             device=self.device.info,
             clock=self.clock.name,
         )
 
-    def _come_to_rest(self) -> None:
-        """Waits until a real device is still, before force is enabled.
+    def close(self, error: BaseException | None) -> None:
+        """Records the end, commands zero force, and closes recording, scene and device.
+
+        ``error`` is the exception that ended the run; None without one.
+        """
+        self.is_open = False
+        reason = self.stopped_by if error is None else f"{type(error).__name__}: {error}"
+        self.event(
+            "stop",
+            reason=reason,
+            **self._signal_detail(),
+            overruns=self.overruns,
+            skipped=self.skipped,
+            dropped=self.stream.dropped,
+        )
+        self._resources.close()
+
+    def begin(self, duration: float | None) -> None:
+        """Sets the end of a run and its event; a later run starts with a ramp of the force.
 
         Raises:
-            DeviceError: It moves on, or a hand has meanwhile moved an absolute one too far.
+            HapticBridgeError: The duration is not finite and > 0.
         """
-        stops = self._stops
-        wait_until_still(self.device, self._sample, self.period, self.clock, lambda: stops)
-        if not self._tick and not stops and self._workspace.is_absolute:
-            refuse_stretched_start(self._binding.state, self._sample, self._limits)
+        period = self.setup.period
+        if duration is not None and (not np.isfinite(duration) or duration <= 0):
+            raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
+        self._is_timed = duration is not None
+        length = self.device.info.duration
+        if duration is not None:
+            self.end = self.tick + max(round(duration / period), 1)
+        elif length is not None:
+            self.end = max(self.tick, round(length / period) + 1)
+        else:
+            self.end = -1
+        if self.tick:  # the device may have moved meanwhile, under zero force
+            self.kernel.bound.resume()
+            self.event("resume", reason=self.stopped_by, **self._signal_detail())
+        self.stopped_by = self._signal = ""
 
-    def _compile(self) -> None:
-        """Gets the machine code of the tick ready, so that the first one is not late."""
-        state, row, sample = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE), self._sample
-        rows, cursors = self._stream.rows, self._stream.cursors
-        self._before_step = direct(before_step, state, sample, row, 0, 0.0)
-        self._answer_step = direct(answer_step, state, row, 0)
-        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
-        head, numbers = np.zeros(1, np.int64), np.zeros(1)
-        self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
-        self._finish_tick = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
+    def note_grants(self, grants: tuple[Grant, ...]) -> None:
+        """Records the answers of the system to the real-time requests; warns once of refusals."""
+        if not self.tick:
+            warn_of_refusals(self._grants + grants)
+        answers = {grant.name: grant.sentence for grant in self._grants + grants}
+        self.event("real_time", **answers)
 
-    def _silence(self) -> str:
-        """Commands zero force; returns why that failed, or nothing."""
+    def start_clock(self) -> None:
+        """Waits until a real device is still, then starts the time of the run.
+
+        Raises:
+            DeviceError: The device keeps moving, or a hand moved one with absolute poses too far.
+        """
+        setup, waiting, sample = self.setup, self.stop.waiting, self.kernel.sample
+        wait_until_still(self.device, sample, setup.period, self.clock, lambda: waiting)
+        if not self.tick and not waiting and setup.workspace.absolute:
+            refuse_stretched_start(self.kernel.bound.state, sample, setup.limits)
+        self.clock.start(round(setup.period * 1e9))
+        self._slept = slept_ns()
+
+    def take_changes(self) -> None:
+        """Applies waiting inputs and one command before a tick, and records them."""
+        while self.inputs:
+            writes = self.inputs.popleft()
+            apply_writes(self.setup.scene.data, writes)
+            self.event("input", writes=writes)
+        if self.commands.waiting or self.executor.later:
+            self.executor.act(self.tick)
+
+    def do_chores(self) -> int:
+        """Publishes the scene's positions and checks the recorder; returns the next due tick.
+
+        Raises:
+            RecordingError: The recorder ended, or its disk is full.
+        """
+        if self._snapshot is not None:
+            self.kernel.publish_positions(self._snapshot)
+        self.stream.look()
+        return self.tick + self._chore_ticks
+
+    def count_losses(self, skipped: int) -> int:
+        """Counts skipped deadlines; returns the record's flags for them and for lost records.
+
+        A run with a duration has fewer ticks by the skipped ones. If the machine slept meanwhile,
+        the run ends.
+        """
+        lost, self.stream.lost = self.stream.lost, 0
+        if not skipped:
+            return lost
+        self.overruns += 1
+        self.skipped += skipped
+        if self._is_timed:
+            self.end = max(self.end - skipped, self.tick + 1)
+        asleep = slept_ns() - self._slept
+        if asleep > SUSPENDED_NS:
+            self._slept += asleep
+            self.event("suspended", seconds=1e-9 * asleep)
+            self.stop.request("suspend of the machine")
+        return lost | int(TickFlag.OVERRUN)
+
+    def note_stop(self) -> None:
+        """Takes the requests that ended the run; later ones end the next run."""
+        by, signal = self.stop.take()
+        if by:
+            self.stopped_by, self._signal = by, signal
+
+    def command_zero_force(self) -> str:
+        """Commands zero force; returns the reason if that failed, or an empty text."""
         try:
             self.device.write(_NO_FORCE)
         except DeviceError as error:
             return f"zero force could not be sent: {error}"
         return ""
 
-    def _named_signal(self) -> dict[str, str]:
-        """What an event says of the signal that ended the run, if one did."""
+    def trip(self, reason: str) -> SafetyTrip:
+        """Records a trip; returns its exception, which carries the records of the last second."""
+        self.stopped_by = "trip"
+        self.event("trip", reason=reason)
+        return SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
+
+    def event(self, event: str, **details: Any) -> None:
+        """Records an event before the present tick."""
+        self.stream.event(event, self.tick, self.clock.now(), **details)
+
+    def _signal_detail(self) -> dict[str, str]:
         return {"signal": self._signal} if self._signal else {}
 
-    def _event(self, event: str, **details: object) -> None:
-        self._stream.event(event, self._tick, self.clock.now(), **details)
-
-    @property
-    def ledger(self) -> Ledger:
-        """Energies so far, per port."""
-        return Ledger.of(self._binding.state)
-
-    def latest_records(self, count: int) -> NDArray[np.void]:
-        """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
-        return self._stream.latest(count)
-
-    def conditions(self) -> tuple[str, ...]:
-        """Returns what is to be said of device and method, one sentence each; known once open."""
-        return condition_sentences(self.device.info, self.parameters, self.method)
-
     def summary(self) -> Summary:
-        """Returns what the run was so far."""
+        """Returns the summary of all ticks so far."""
+        outcome = RunOutcome(
+            ticks=self.tick,
+            overruns=self.overruns,
+            skipped=self.skipped,
+            dropped=self.stream.dropped,
+            stopped_by=self.stopped_by,
+            recording=self.output.path,
+        )
+        setup = self.setup
         return Summary.of(
-            self._binding.state,
+            self.kernel.bound.state,
             self.parameters,
-            self.device.info,
-            self.method,
-            self.coupling,
-            ticks=self._tick,
-            overruns=self._overruns,
-            skipped=self._skipped,
-            dropped=self._stream.dropped,
-            stopped_by=self._stopped_by,
-            recording=self._path,
+            setup.info,
+            setup.method,
+            setup.coupling,
+            outcome,
         )
-
-
-# Inputs and commands that a run takes while it goes on.
-
-
-class Commanded(Opened):
-    """A bridge that takes inputs and commands between two ticks, and notes each with its tick."""
-
-    _end = -1
-
-    def __enter__(self) -> Self:
-        super().__enter__()
-        if self._onlooker is not None:
-            self._commands.warm_up()
-        self._operator = CommandExecutor(self._commands, self._event)
-        self._operator.begin(self._repeater, self._guarding.fade_ticks)
-        return self
-
-    def set_input(
-        self,
-        *,
-        ctrl: Mapping[str, ArrayLike] | None = None,
-        mocap: Mapping[str, ArrayLike] | None = None,
-        joint_force: Mapping[str, ArrayLike] | None = None,
-        body_wrench: Mapping[str, ArrayLike] | None = None,
-    ) -> None:
-        """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
-
-        Move mocap bodies slowly: MuJoCo damps their welds and contacts against rest, so a fast
-        move can create energy, and the environment is then called active.
-
-        Args:
-            ctrl: Control per actuator of the scene.
-            mocap: Pose (x, y, z[, qw, qx, qy, qz]) in m per mocap body of the scene.
-            joint_force: Generalised force per joint, in N or N m per degree of freedom.
-            body_wrench: (force, torque) in N and N m per body, world frame, at its centre of mass.
-
-        Raises:
-            SceneError: A name does not exist or has the wrong count of numbers.
-        """
-        self.repeat_input(
-            input_writes(
-                self.scene.model,
-                ctrl=ctrl,
-                mocap=mocap,
-                joint_force=joint_force,
-                body_wrench=body_wrench,
-            )
-        )
-
-    def repeat_input(self, writes: list[Write]) -> None:
-        """As ``set_input``, with the writes that a recording's event ``input`` holds.
-
-        Raises:
-            SceneError: The method cannot meter the work of inputs.
-        """
-        if not self.method.meters_inputs:
-            raise SceneError(
-                f"method '{self.method.name}' cannot meter the work of inputs; use 'implicit'"
-            )
-        self._inputs.append(writes)
-
-    def command(self, command: Command, by: str = "caller") -> None:
-        """Asks for something while the run goes on; from any thread, or from ``on_tick``.
-
-        It is done between two ticks and recorded with its tick, so that the run can be repeated.
-
-        Args:
-            command: A coupling, a switch, a reset, a mark in the recording, an end.
-            by: Who asks, for the recording.
-
-        Raises:
-            CommandError: The device does not allow it, the last command is too recent, or this run
-                cannot do it; nothing changes then.
-        """
-        if isinstance(command, Stop):
-            self.stop(by)
-            return
-        if not self._is_open:
-            raise CommandError("the bridge is not open; nobody would do what is asked for")
-        self._commands.offer(command, by)
-
-    def repeat_commands(self, events: Sequence[Mapping[str, Any]]) -> None:
-        """Does before the next tick what commands did in another run; for ``on_tick``.
-
-        Nothing is asked of the device, and nothing waits for a force to fade: the other run did.
-
-        Args:
-            events: As its recording holds them (``commands.CHANGES``), in their order.
-        """
-        self._commands.waiting.append((Repeat(tuple(events)), ""))
-
-    def stop(self, by: str = "caller") -> None:
-        """Ends the run after the present tick; may be called from ``on_tick`` or a thread.
-
-        Where none is running it ends the next one before its first tick: whoever wants the force
-        off need not know whether it is on yet.
-
-        Args:
-            by: Who wants it, for the summary and the recording's event ``stop``; not empty.
-        """
-        self._stops.append((by or "caller", ""))
-
-    def stop_on_signal(self, name: str) -> None:
-        """As ``stop``, for a signal: what a program does with those that come before ``run``.
-
-        Args:
-            name: The signal's, for the recording.
-        """
-        self._stops.append(("signal", name))
-
-    def _heed_stops(self) -> None:
-        """Notes at the end of a run who ended it; what comes later is for the next one."""
-        while self._stops:
-            self._stopped_by, self._signal = self._stops.popleft()
-
-    def _take_changes(self) -> None:
-        """Takes in what others want changed: between two ticks, and noted with its tick."""
-        while self._inputs:
-            writes = self._inputs.popleft()
-            apply_writes(self.scene.data, writes)
-            self._event("input", writes=writes)
-        if self._commands.waiting or self._operator.later:
-            self._operator.act(self._tick)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -45,7 +45,7 @@ def was_never_lossless(count: int, flags: int) -> bool:
 
 
 def coupling_sentences(
-    used: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
+    law: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
 ) -> tuple[str, ...]:
     """Describes effective and law coupling: translation, then rotation if it has a spring.
 
@@ -55,7 +55,7 @@ def coupling_sentences(
     the device condition b >= K T/2 + B' counts B'.
 
     Args:
-        used: K and B' of the law.
+        law: K and B' of the law.
         method: The rendering method; without a coupling law there are no sentences.
         period: T in s.
         substeps: MuJoCo steps per tick.
@@ -64,36 +64,37 @@ def coupling_sentences(
     """
     if not method.has_law:
         return ()
-    kinds = [("K", "B", used.stiffness, used.damping, "N/m", "N s/m")]
-    if used.rotational_stiffness > 0:
-        rotation = used.rotational_stiffness, used.rotational_damping
-        kinds.append(("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
+    kinds = [_AxisGains("K", "B", law.stiffness, law.damping, "N/m", "N s/m")]
+    if law.rotational_stiffness > 0:
+        rotation = law.rotational_stiffness, law.rotational_damping
+        kinds.append(_AxisGains("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
     name, adds = method.name, method.adds
     if is_always_held and method.scheme == Scheme.MIDPOINT:
         name, adds = f"{name}, here always implicit,", IMPLICIT_LAG
-    return tuple(_sentence(name, adds, period / substeps, substeps, *kind) for kind in kinds)
+    return tuple(_sentence(name, adds, period / substeps, substeps, kind) for kind in kinds)
 
 
-def _sentence(
-    name: str,
-    adds: float | None,
-    step: float,
-    substeps: int,
-    spring: str,
-    damper: str,
-    stiffness: float,
-    damping: float,
-    spring_unit: str,
-    damper_unit: str,
-) -> str:
+class _AxisGains(NamedTuple):
+    """Gains of the law along one kind of axis, with their symbols and units."""
+
+    spring: str
+    damper: str
+    stiffness: float
+    damping: float
+    spring_unit: str
+    damper_unit: str
+
+
+def _sentence(name: str, adds: float | None, step: float, substeps: int, gains: _AxisGains) -> str:
+    spring, damper, stiffness, damping, spring_unit, damper_unit = gains
     start = f"{spring} = {stiffness:.4g} {spring_unit}, {damper} ="
     if adds is None:
         return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as asked)"
-    felt = effective_damping(stiffness, damping, step, adds)
+    effective = effective_damping(stiffness, damping, step, adds)
     parts = substeps / adds
     added = ("KT" if spring == "K" else f"{spring} T") + (f"/{parts:g}" if parts != 1 else "")
     return (
-        f"{start} {felt:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
+        f"{start} {effective:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
         f"{damping:.4g})"
     )
 
@@ -117,7 +118,7 @@ class Ledger:
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
-        tuning_work: Work on the coupling's spring by commands that changed it (``kernel.coupling``).
+        tuning_work: Work on the coupling's spring by commands (``kernel.coupling``).
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.
@@ -186,6 +187,28 @@ _ENERGIES = (
 _TICKS = ("first_unstrict", "first_active", "first_kick")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOutcome:
+    """Counters of the loop, and the end of a run.
+
+    Attributes:
+        ticks: Ticks since the bridge was opened.
+        overruns: Ticks that started a period or more after their deadline.
+        skipped: Skipped deadlines.
+        dropped: Records lost because the recorder was too far behind.
+        stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
+            ``Bridge.stop``.
+        recording: The recording, or None.
+    """
+
+    ticks: int
+    overruns: int
+    skipped: int
+    dropped: int
+    stopped_by: str
+    recording: Path | None
+
+
 @dataclass(frozen=True, slots=True)
 class Summary:
     """Summary of a run.
@@ -205,12 +228,12 @@ class Summary:
         about: Description of the method in a sentence.
         hazard: Hazard on a real device beyond the device condition, in a sentence; empty without
             one.
-        coupling: Requested coupling: K and B to be felt.
-        used: Coupling of the law, with the damping B' of the device condition.
+        requested: Requested coupling: K and B to be felt.
+        law: Coupling of the law, with the damping B' of the device condition.
         rendered: Sentences on effective and law coupling. They hold away from contact, or
             everywhere if the tool was never released.
-        felt: Effective coupling of a weld (its stiffest axis, measured at the start); None with a
-            coupling law.
+        effective: Effective coupling of a weld (its stiffest axis, measured at the start); None
+            with a coupling law.
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
             coupling law the device port is not metered during the run. A certified device needs no
             metering; for any other the audit of the recording decides.
@@ -237,10 +260,10 @@ class Summary:
     method: str
     about: str
     hazard: str
-    coupling: Coupling
-    used: Coupling
+    requested: Coupling
+    law: Coupling
     rendered: tuple[str, ...]
-    felt: Coupling | None
+    effective: Coupling | None
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
     is_certified: bool | None
@@ -260,24 +283,18 @@ class Summary:
         parameters: RunParameters,
         info: DeviceInfo,
         method: Method,
-        asked: Coupling,
-        *,
-        ticks: int,
-        overruns: int,
-        skipped: int,
-        dropped: int,
-        stopped_by: str,
-        recording: Path | None,
+        requested: Coupling,
+        outcome: RunOutcome,
     ) -> Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
         return cls(
-            ticks=ticks,
-            duration=(ticks + skipped) * parameters.period,
-            overruns=overruns,
-            skipped=skipped,
-            dropped=dropped,
+            ticks=outcome.ticks,
+            duration=(outcome.ticks + outcome.skipped) * parameters.period,
+            overruns=outcome.overruns,
+            skipped=outcome.skipped,
+            dropped=outcome.dropped,
             peak_force=float(state["loop"]["peak_force"][0]),
             peak_torque=float(state["loop"]["peak_torque"][0]),
             energies=ledger.energies(),
@@ -286,20 +303,20 @@ class Summary:
             method=method.name,
             about=method.about,
             hazard=method.hazard,
-            coupling=asked,
-            used=parameters.coupling,
+            requested=requested,
+            law=parameters.coupling,
             rendered=coupling_sentences(
                 parameters.coupling,
                 method,
                 parameters.period,
                 parameters.substeps,
-                is_always_held=ticks > 0 and not state["lossless"]["ticks"][0],
+                is_always_held=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
             ),
-            felt=parameters.felt,
+            effective=parameters.felt,
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
             is_certified=is_run_certified(conditions, method),
-            stopped_by=stopped_by,
-            recording=recording,
+            stopped_by=outcome.stopped_by,
+            recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
         )

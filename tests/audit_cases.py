@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def recorded(
     is_guarded = options.pop("is_guarded", True)
     bridge = Bridge(scene, device, coupling, recording=path, **options)
     if not is_guarded:  # what happens where nobody stops it
-        bridge._guarding = UNGUARDED
+        bridge.setup = replace(bridge.setup, guard=UNGUARDED)
     with bridge:
         return bridge.run(duration, on_tick and (lambda tick: on_tick(bridge, tick)))
 

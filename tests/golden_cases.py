@@ -14,7 +14,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -449,10 +449,11 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
             name = f"inputs, {method}" + (", pipelined" if is_ahead else "")
             options = {"method": method, "pipelined": is_ahead}
             yield name, Run(WORKSHOP, Scripted, options, act=inputs)
-    yield "scaled up", Run(PEG, Scripted, {"scale": 2.0})
-    yield "force scaled down", Run(PEG, Scripted, {"scale": 1.5, "force_scale": 0.5})
-    yield "turned axes", Run(PEG, Scripted, {"axes": TURNED})
-    yield "absolute poses", Run(MASS, Scripted, {"absolute": True})
+    yield "scaled up", Run(PEG, Scripted, {"workspace": hb.Workspace(scale=2.0)})
+    workspace = hb.Workspace(scale=1.5, force_scale=0.5)
+    yield "force scaled down", Run(PEG, Scripted, {"workspace": workspace})
+    yield "turned axes", Run(PEG, Scripted, {"workspace": hb.Workspace(axes=TURNED)})
+    yield "absolute poses", Run(MASS, Scripted, {"workspace": hb.Workspace(absolute=True)})
     yield "500 Hz", Run(MASS, Scripted, {"rate": 500.0})
     yield "4 kHz", Run(PEG, Scripted, {"rate": 4000.0})
     yield "three runs of one bridge", Run(PEG, Scripted, seconds=0.45, parts=3)
@@ -679,3 +680,69 @@ def help_text(name: str) -> str:
     with patch.dict(os.environ, plain), redirect_stdout(words), suppress(SystemExit):
         main([name, "--help"] if name else ["--help"])
     return "\n".join(line.rstrip() for line in words.getvalue().splitlines()) + "\n"
+
+
+_SHORT = "run point_mass --fast --duration 0.1"
+_ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5"
+SESSIONS = {
+    "run": (
+        f"{_SHORT} --record FOLDER/run.mcap",
+        f"{_SHORT} --stiffness 2000 --damping 1.5",
+        f"{_SHORT} --damping 0.5",
+        f"{_SHORT} --damping 3",
+        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
+        f"{_SHORT} --substeps 2",
+        f"{_SHORT} --method compensated",
+        f"{_SHORT} --method implicit",
+        f"{_SHORT} --method explicit",
+        f"{_SHORT} --method weld --stiffness 1000",
+        "run peg_in_hole --fast --duration 0.1 --method direct --contact-stiffness 5000",
+        "run drawer --fast --duration 0.1",
+        "run hammer --fast --duration 0.1",
+    ),
+    "audit": (
+        "run virtual_wall --fast --duration 0.2 --record FOLDER/wall.mcap",
+        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
+        "audit FOLDER/wall.mcap",
+        "audit FOLDER/stiff.mcap",
+        "audit FOLDER/wall.mcap FOLDER/stiff.mcap FOLDER/missing.mcap",
+        "compare FOLDER/wall.mcap FOLDER/wall.mcap",
+        "export FOLDER/wall.mcap --format csv --out FOLDER/wall.csv",
+    ),
+    "zwidth": (
+        _ZWIDTH,
+        "zwidth --damping 2 --mass 1e9",
+        "zwidth --damping 2 --friction 0 --resolution 1e-5 --delay 1",
+        "zwidth --damping 2 --filter-time 0.001",
+    ),
+    "bound": (
+        "bound --stiffness 2000",
+        "bound --stiffness 2000 --damping 1",
+        "bound --stiffness 2000 --damping 0.5 --device-damping 2",
+        "bound --stiffness 2000 --damping 1.5 --device-damping 2",
+        "bound --stiffness 2400 --damping 3 --device-damping 2",
+        "bound --stiffness 5000 --damping 1 --device-damping 2",
+        "bound --stiffness 5000 --damping 3 --device-damping 2",
+    ),
+    "scenes": ("scenes", "scenes planar_peg", "scenes virtual_wall"),
+}
+"""Commands of each golden session, in order; FOLDER is a folder of its own."""
+
+
+def session_file(name: str) -> Path:
+    """Returns the file of a session's words."""
+    return GOLDEN / "sessions" / f"{name}.txt"
+
+
+def session_text(name: str, folder: Path) -> str:
+    """Returns a session as a terminal of 100 columns shows it, with exit codes, paths masked."""
+    shown, plain = [], {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    models = str(Path(hb.__file__).parents[1])
+    for command in SESSIONS[name]:
+        out, err = io.StringIO(), io.StringIO()
+        with patch.dict(os.environ, plain), redirect_stdout(out), redirect_stderr(err):
+            code = main(command.replace("FOLDER", str(folder)).split())
+        words = err.getvalue() + out.getvalue()
+        words = words.replace(str(folder), "FOLDER").replace(models, "HOME")
+        shown += [f"$ hapticbridge {command}", *map(str.rstrip, words.splitlines()), f"({code})"]
+    return "\n".join(shown) + "\n"

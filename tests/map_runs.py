@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +63,9 @@ def recorded_and_audited(
         limits=Limits(force=info.force_limit, torque=info.torque_limit, ramp=0.0),
         recording=path,
     )
-    bridge._guarding = UNGUARDED  # maps show what happens where nobody stops it
+    bridge.setup = replace(
+        bridge.setup, guard=UNGUARDED
+    )  # maps show what happens where nobody stops it
     # where the guard trips, the file holds what was before
     with bridge, suppress(hb.SafetyTrip):
         bridge.run(ticks * period, displace)

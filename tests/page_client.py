@@ -24,11 +24,13 @@ class Hand:
     Attributes:
         socket: The connection.
         elements: Of the page, by their labels: uuid and what they were made with.
+        values: To which the page has set its elements since, by uuid.
     """
 
     def __init__(self, socket: Connection) -> None:
         self.socket = socket
         self.elements: dict[str, dict[str, Any]] = {}
+        self.values: dict[str, Any] = {}
 
     def read(self, seconds: float) -> list[dict[str, Any]]:
         """Returns what the page sends within a time, and notes its elements."""
@@ -47,7 +49,14 @@ class Hand:
             label = message.get("props", {}).get("label")
             if label:
                 self.elements[label] = message
+            if message["type"] == "GuiUpdateMessage" and "value" in message["updates"]:
+                self.values[message["uuid"]] = message["updates"]["value"]
         return found
+
+    def shows(self, label: str, value: Any) -> bool:
+        """Tells whether the page has set an element to a value since it was made."""
+        self.read(0.02)
+        return bool(self.values.get(self.find(label)["uuid"]) == value)
 
     def find(self, label: str) -> dict[str, Any]:
         """Returns an element once the page has told of it."""

@@ -20,6 +20,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run_description import parameters_of
@@ -211,9 +212,18 @@ def test_scales_enter_the_device_condition(tmp_path: Path) -> None:
     coupling = Coupling(
         stiffness=2000, damping=1.5, rotational_stiffness=2, rotational_damping=1.5e-3
     )
-    recorded(path, "point_mass", "simulated", coupling, duration=0.05, scale=1.2)
+    recorded(
+        path, "point_mass", "simulated", coupling, duration=0.05, workspace=Workspace(scale=1.2)
+    )
     assert audit(path).certified is False  # 1.44 · 1.5 N s/m > 2
-    recorded(path, "point_mass", "simulated", coupling, duration=0.05, scale=1.2, force_scale=1.0)
+    recorded(
+        path,
+        "point_mass",
+        "simulated",
+        coupling,
+        duration=0.05,
+        workspace=Workspace(scale=1.2, force_scale=1.0),
+    )
     assert audit(path).certified is True  # 1.2 · 1.5 N s/m < 2
 
 

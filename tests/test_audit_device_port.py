@@ -17,6 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
 from hapticbridge.run_description import parameters_of
 
@@ -137,7 +138,14 @@ def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
         path = tmp_path / f"{force_scale}.mcap"
         device = ScriptedDevice(lambda k: (1e-5 * k, 0, 1e-5 * k, 1, 0, 0, 0))
         coupling = Coupling(1000.0, 0.5, 1.0, 5e-4)
-        recorded(path, "point_mass", device, coupling, duration=0.2, force_scale=force_scale)
+        recorded(
+            path,
+            "point_mass",
+            device,
+            coupling,
+            duration=0.2,
+            workspace=Workspace(force_scale=force_scale),
+        )
         lost.append(kicked(path, 0.0, 0.0))
     assert np.abs(lost[0]).max() > 1e-6
     np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
@@ -162,8 +170,8 @@ def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) ->
     [
         (1, 10.0, {}),
         (2, 0.3, {}),  # the force is limited most of the time
-        (3, 10.0, {"scale": 2.0}),
-        (4, 10.0, {"force_scale": 0.5}),
+        (3, 10.0, {"workspace": Workspace(scale=2.0)}),
+        (4, 10.0, {"workspace": Workspace(force_scale=0.5)}),
     ],
 )
 def test_a_device_that_bears_the_coupling_is_never_kicked(

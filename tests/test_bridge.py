@@ -17,6 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import open_device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
@@ -168,16 +169,16 @@ def test_default_coupling_is_that_of_the_rule() -> None:
     felt = replace(used, damping=0.5 + 1.2, rotational_damping=5e-4 + 1.2e-3)  # and K T/2
     for device in ("simulated", ScriptedDevice(still)):
         bridge = fast("point_mass", device)
-        for found, expected in ((bridge.used, used), (bridge.coupling, felt)):
+        for found, expected in ((bridge.setup.law, used), (bridge.setup.coupling, felt)):
             for name in ("stiffness", "damping", "rotational_stiffness", "rotational_damping"):
                 assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-12)
-        assert bridge.rendered == bridge.coupling  # nothing is clipped
+        assert bridge.setup.attainable == bridge.setup.coupling  # nothing is clipped
 
 
 def test_method_by_itself_is_lossless_or_implicit_with_substeps() -> None:
-    assert fast("point_mass").method.name == "lossless"
+    assert fast("point_mass").setup.method.name == "lossless"
     halved = fast("point_mass", substeps=2)
-    assert halved.method.name == "implicit"
+    assert halved.setup.method.name == "implicit"
     with halved as bridge:
         assert bridge.run(0.01).is_certified is True
 
@@ -185,10 +186,10 @@ def test_method_by_itself_is_lossless_or_implicit_with_substeps() -> None:
 def test_default_coupling_follows_damping_rate_and_scales() -> None:
     # 80 % of 2 (b − b/4) / T = 1.2 b / T
     bridge = fast("point_mass", "simulated:damping=5", rate=500)
-    assert bridge.coupling.stiffness == pytest.approx(3000)
-    assert bridge.used.damping == pytest.approx(1.25)
-    scaled = fast("point_mass", "simulated", scale=2.0)
-    assert scaled.coupling.stiffness == pytest.approx(600)
+    assert bridge.setup.coupling.stiffness == pytest.approx(3000)
+    assert bridge.setup.law.damping == pytest.approx(1.25)
+    scaled = fast("point_mass", "simulated", workspace=Workspace(scale=2.0))
+    assert scaled.setup.coupling.stiffness == pytest.approx(600)
     with scaled as bridge:
         assert bridge.run(0.01).is_certified is True
 
@@ -198,11 +199,6 @@ def test_default_coupling_follows_damping_rate_and_scales() -> None:
     [
         ({"rate": 0.0}, "rate"),
         ({"rate": float("nan")}, "rate"),
-        ({"scale": 0.0}, "scale"),
-        ({"scale": -1.0}, "scale"),
-        ({"force_scale": float("inf")}, "force_scale"),
-        ({"axes": np.diag([1, 1, -1])}, "axes"),
-        ({"axes": np.ones(3)}, "axes"),
         ({"substeps": 0}, "substeps"),
         ({"method": "explicit_or_so"}, "method"),
     ],
@@ -212,6 +208,21 @@ def test_options_out_of_range_are_refused_by_name(options: dict[str, Any], messa
     with pytest.raises(HapticBridgeError, match=message), fast("point_mass", device, **options):
         pass
     assert not [wrench for wrench in device.writes if wrench.any()]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"scale": 0.0}, "scale is 0.0; it must be finite and > 0"),
+        ({"scale": -1.0}, "scale is -1.0"),
+        ({"force_scale": float("inf")}, "force_scale is inf"),
+        ({"axes": np.diag([1, 1, -1])}, "axes"),
+        ({"axes": np.ones(3)}, "axes"),
+    ],
+)
+def test_a_workspace_out_of_range_is_refused_by_name(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(HapticBridgeError, match=message):
+        Workspace(**values)
 
 
 def test_substeps_keep_the_wrench_law_and_pass_the_audit(tmp_path: Path, motion: str) -> None:
@@ -288,7 +299,7 @@ def test_bridge_that_is_not_open_does_not_run_and_none_opens_twice() -> None:
         bridge.run(0.01)
     with pytest.raises(HapticBridgeError, match="not open"):
         bridge.run(0.1)
-    with pytest.raises(HapticBridgeError, match="entered once"), bridge:
+    with pytest.raises(HapticBridgeError, match="opened once"), bridge:
         pass
 
 

@@ -53,10 +53,10 @@ class Script:
         self.bound: list[float] = []
 
     def __call__(self, bridge: Bridge, _: int) -> None:
-        bridge._commands._now = lambda: self.done * T
+        bridge.session.commands.now = lambda: self.done * T
         if self.done in self.commands:
             bridge.command(self.commands[self.done], by="test")
-        coupling = bridge._binding.state["coupling"][0]
+        coupling = bridge.session.kernel.bound.state["coupling"][0]
         self.stiffness.append(float(coupling["stiffness"]))
         self.bound.append(float(coupling["stiffness"] * T / 2 + coupling["damping"]))
         self.done += 1
@@ -310,7 +310,7 @@ def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> N
 
     def on_tick(bridge: Bridge, tick: int) -> None:
         script(bridge, tick)
-        given.append(float(bridge._binding.state["observer"]["energy_to_device"][0]))
+        given.append(float(bridge.session.kernel.bound.state["observer"]["energy_to_device"][0]))
 
     run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
     # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated

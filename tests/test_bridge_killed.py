@@ -26,7 +26,7 @@ import hapticbridge as hb
 
 def tell(tick):
     if tick == 600:  # two chunks of the recording are full
-        print(bridge._stream.recorder._process.pid, flush=True)
+        print(bridge.session.stream.recorder.pid, flush=True)
 
 with hb.Bridge("virtual_wall", recording=sys.argv[1]) as bridge:
     summary = bridge.run(60.0, tell)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.audit import audit
 from hapticbridge.errors import DeviceError, HapticBridgeError
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
 
 
@@ -28,7 +29,7 @@ def test_relative_poses_start_at_the_grip_and_absolute_ones_are_the_handle() -> 
         relative["handle_position"], relative["device_position"] - shift + [0, 0, 0.04], atol=1e-16
     )
     device = ScriptedDevice(lambda k: (*(np.array([0, 0, 0.04]) + sway(k)[:3]), *sway(k)[3:]))
-    with fast("peg_in_hole", device, absolute=True) as bridge:
+    with fast("peg_in_hole", device, workspace=Workspace(absolute=True)) as bridge:
         bridge.run(0.1)
         absolute = bridge.latest_records(100)
     assert (absolute["handle_position"] == absolute["device_position"]).all()
@@ -44,9 +45,7 @@ def test_scales_and_axes_map_motion_in_and_wrench_out() -> None:
     with fast(
         "point_mass",
         ScriptedDevice(sway, strength=1e3),
-        scale=scale,
-        force_scale=force_scale,
-        axes=turn.as_matrix(),
+        workspace=Workspace(scale=scale, force_scale=force_scale, axes=turn.as_matrix()),
         limits=limits,
     ) as bridge:
         bridge.run(0.2)
@@ -69,7 +68,12 @@ def test_scales_and_axes_map_motion_in_and_wrench_out() -> None:
 
 def test_equal_scales_keep_power_equal_on_both_sides() -> None:
     limits = Limits(force=1e3, torque=50, ramp=0.0)
-    with fast("point_mass", ScriptedDevice(sway, strength=1e3), scale=3.0, limits=limits) as bridge:
+    with fast(
+        "point_mass",
+        ScriptedDevice(sway, strength=1e3),
+        workspace=Workspace(scale=3.0),
+        limits=limits,
+    ) as bridge:
         bridge.run(0.2)
         rows = bridge.latest_records(200)
     sent, held = rows["wrench_on_device"], rows["wrench_on_tool"]
@@ -84,7 +88,9 @@ def test_equal_scales_keep_power_equal_on_both_sides() -> None:
 def test_axes_written_with_six_digits_are_a_rotation_to_the_last_one(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     c = 0.707107
-    summary = recorded(path, "point_mass", axes=[c, -c, 0, c, c, 0, 0, 0, 1], duration=2.0)
+    summary = recorded(
+        path, "point_mass", workspace=Workspace(axes=[c, -c, 0, c, c, 0, 0, 0, 1]), duration=2.0
+    )
     assert summary.environment == "strict"
     assert audit(path).verdict == "passive"
     axes = np.array(json.loads(read_recording(path).meta["axes"])).reshape(3, 3)
@@ -98,7 +104,7 @@ def test_axes_written_with_six_digits_are_a_rotation_to_the_last_one(tmp_path: P
 )
 def test_axes_that_are_no_rotation_are_refused(axes: Any) -> None:
     with pytest.raises(HapticBridgeError, match="right-handed rotation"):
-        fast(axes=axes)
+        Workspace(axes=axes)
 
 
 @pytest.mark.parametrize(("distance", "is_refused"), [(0.0041, False), (0.0042, True)])
@@ -107,7 +113,7 @@ def test_absolute_start_that_would_pull_beyond_the_limit_is_refused(
 ) -> None:
     """At 2400 N/m the device's 10 N are reached 4.17 mm from the grip."""
     device = ScriptedDevice(lambda _tick: (distance, 0, 0, 1, 0, 0, 0))
-    bridge = fast("point_mass", device, absolute=True)
+    bridge = fast("point_mass", device, workspace=Workspace(absolute=True))
     if not is_refused:
         with bridge:
             bridge.run(0.01)

@@ -149,9 +149,9 @@ def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
     monkeypatch.setattr(Ring, "shared", kept)
     device = ScriptedDevice(sway)
     with Bridge("point_mass", device, recording=path, clock=SlowClock({})) as bridge:
-        recorder = bridge._stream.recorder
+        recorder = bridge.session.stream.recorder
         assert isinstance(recorder, Recorder)
-        pid = recorder._process.pid
+        pid = recorder.pid
         os.kill(pid, signal.SIGSTOP)
 
         def resume(tick: int) -> None:
@@ -251,9 +251,9 @@ def test_recording_is_closed_although_the_device_cannot_be(tmp_path: Path) -> No
 
 def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
     with fast("point_mass", recording=tmp_path / "run.mcap") as bridge:
-        recorder = bridge._stream.recorder
+        recorder = bridge.session.stream.recorder
         assert isinstance(recorder, Recorder)
-        pid = recorder._process.pid
+        pid = recorder.pid
         os.kill(pid, signal.SIGSTOP)
         timer = threading.Timer(1.0, bridge.stop)
         timer.start()

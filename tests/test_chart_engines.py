@@ -33,11 +33,11 @@ from hapticbridge.lab.chart.output import (
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import PeerWork, Score, Workload
 from hapticbridge.lab.engines.base import (
+    ENGINES,
     Engine,
     Simulation,
     Task,
     composed,
-    engine_names,
     open_engine,
 )
 from hapticbridge.lab.engines.base import Setting as EngineSetting
@@ -87,7 +87,7 @@ def test_engine_with_a_wrong_mass_shows_as_a_worse_point() -> None:
     assert score(Altered(0.8), "point_mass", FINE) > 1
 
 
-@pytest.mark.parametrize("name", [name for name in engine_names() if name != "mujoco"])
+@pytest.mark.parametrize("name", [name for name in ENGINES if name != "mujoco"])
 def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: str) -> None:
     engine = engine_or_skip(name)
     work = workload("peg_in_hole").peer_work()

@@ -16,7 +16,7 @@ from cli_cases import Called
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.recording import read_recording
-from hapticbridge.session import Opened
+from hapticbridge.rendering import prepare
 
 SIGNALS = pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 
@@ -60,7 +60,7 @@ def test_a_signal_while_a_run_is_prepared_is_one_word_and_the_device_is_closed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Opened, "_compile", signalled(name, Opened._compile))
+    monkeypatch.setattr("hapticbridge.session.prepare", signalled(name, prepare))
     code, out, err = call(*command(tmp_path / "run.mcap"))
     assert (code, out, err.splitlines()[-1]) == (130, "", "interrupted")
     assert device.is_closed and not np.any(device.writes)
@@ -97,7 +97,7 @@ def test_a_second_signal_does_not_cut_short_how_a_run_is_closed(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Opened, "__exit__", signalled(name, Opened.__exit__))
+    monkeypatch.setattr(Bridge, "__exit__", signalled(name, Bridge.__exit__))
     code, out, _ = call(*command(tmp_path / "run.mcap"))
     assert code == 0
     assert "10 ticks (duration)" in out

@@ -7,8 +7,8 @@ import time
 import pytest
 
 from hapticbridge import clock as clock_module
-from hapticbridge.bridge import SUSPENDED_NS
 from hapticbridge.clock import RealClock, SimulatedClock, running_ns, slept_ns
+from hapticbridge.session import SUSPENDED_NS
 
 PERIOD = 1_000_000
 

@@ -64,6 +64,12 @@ def test_a_command_prints_the_help_that_was_frozen(name: str) -> None:
     hold(text.splitlines(), golden.help_text(name).splitlines(), is_text=True)
 
 
+@pytest.mark.parametrize("name", golden.SESSIONS)
+def test_commands_print_what_was_frozen(name: str, tmp_path: Path) -> None:
+    text = golden.session_file(name).read_text(encoding="utf-8")
+    hold(text.splitlines(), golden.session_text(name, tmp_path).splitlines())
+
+
 def test_every_command_has_its_help_frozen() -> None:
     files = {path.name for path in (golden.GOLDEN / "help").iterdir()}
     assert files == {golden.help_file(name).name for name in golden.COMMANDS}

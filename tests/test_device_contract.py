@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import math
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rawhid_cases import paddle
 
+import hapticbridge as hb
 from hapticbridge.device import (
     AXES,
     Device,
@@ -330,3 +333,16 @@ def test_bad_specifications_are_refused(spec: str, options: dict[str, Any], word
     with pytest.raises(DeviceError) as error:
         open_device(spec, **options)
     assert words in str(error.value)
+
+
+def test_the_device_in_the_protocols_description_is_a_whole_one(tmp_path: Path) -> None:
+    description = inspect.getdoc(Device) or ""
+    example = description.partition("::\n")[2].partition("\nAttributes:")[0]
+    names: dict[str, Any] = {}
+    exec(textwrap.dedent(example), names)
+    assert (names["summary"].ticks, names["summary"].verdict) == (1000, "passive")
+    path = tmp_path / "run.mcap"
+    with hb.Bridge("point_mass", names["Rail"](), clock=hb.SimulatedClock(), recording=path) as run:
+        summary = run.run(0.5)
+    assert summary.is_certified is True
+    assert hb.audit(path).verdict == "passive"

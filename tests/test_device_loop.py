@@ -35,6 +35,7 @@ from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
 from hapticbridge.identify import identify
 from hapticbridge.identify.profile import measured_profile
+from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.scene import load_scene, scene_path
 
@@ -95,7 +96,7 @@ def stick(name: str = "usual", model: PidStick | None = None) -> Rig:
     device, model, seam = opened_stick(model, damping=4.0, mass=0.25, travel=WIDE)
     # the scene lies in x and z, the stick in x and y
     axes = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    scene = {"scene": "planar_peg", "axes": axes}
+    scene = {"scene": "planar_peg", "workspace": Workspace(axes=axes)}
     later = lambda s: model.advance(seam.now + s)  # noqa: E731
     return Rig(device, DrivingClock(seam), model, seam, model.force, later, scene)
 

@@ -18,7 +18,7 @@ import pytest
 from engine_tasks import FLOOR, GRAVITY, RESTING
 
 from hapticbridge.lab.engines.base import (
-    _MODULES,
+    ENGINES,
     Body,
     Engine,
     Pose,
@@ -64,7 +64,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, MagicMock]]
     pybullet.CONSTRAINT_SOLVER_LCP_SI, pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG = 1, 3
     pybullet.connect.return_value = 0
     monkeypatch.setattr(metadata_module, "version", lambda name: f"{name} 0")
-    kept = {PACKAGE + name: sys.modules.get(PACKAGE + name) for name in set(_MODULES.values())}
+    kept = {PACKAGE + name: sys.modules.get(PACKAGE + name) for name in set(ENGINES.values())}
     for name in kept:
         sys.modules.pop(name, None)
     yield mocks
@@ -85,10 +85,10 @@ def engines_of(module: ModuleType) -> tuple[Engine, ...]:
 @pytest.mark.usefixtures("libraries")
 def test_every_engine_tells_each_setting_with_the_page_of_its_manual() -> None:
     told: dict[str, Engine] = {}
-    for name in set(_MODULES.values()):
+    for name in set(ENGINES.values()):
         found = engines_of(import_module(PACKAGE + name))
         told |= {engine.name: engine for engine in found}
-    assert set(told) == set(_MODULES)
+    assert set(told) == set(ENGINES)
     for name, engine in told.items():
         assert len(engine.settings) >= 5, name
         is_spring = engine.settings["coupling"].value.startswith("implicit spring")

@@ -18,6 +18,7 @@ from hapticbridge.lab.engines import (
     ode,
 )
 from hapticbridge.lab.engines.base import (
+    ENGINES,
     Body,
     Pose,
     Shape,
@@ -25,7 +26,6 @@ from hapticbridge.lab.engines.base import (
     Velocity,
     available_engines,
     composed,
-    engine_names,
     open_engine,
 )
 from hapticbridge.lab.engines.from_scene import task_from_scene
@@ -262,7 +262,7 @@ def test_a_handle_without_motion_rests_at_the_grip() -> None:
 def test_every_engine_is_available_or_says_in_a_sentence_why_not() -> None:
     found = available_engines()
     assert "mujoco" in found.available
-    assert {*found.available, *found.missing} == set(engine_names())
+    assert {*found.available, *found.missing} == set(ENGINES)
     assert all(engine.name == name for name, engine in found.available.items())
     assert all("not installed" in sentence for sentence in found.missing.values())
 

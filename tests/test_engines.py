@@ -26,6 +26,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.engines.base import (
+    ENGINES,
     Body,
     Contacts,
     Engine,
@@ -34,7 +35,6 @@ from hapticbridge.lab.engines.base import (
     Task,
     Velocity,
     composed,
-    engine_names,
 )
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.theory.rigid_body import CoupledScheme, drive_mass, integrate_rotation
@@ -45,7 +45,7 @@ SPRINGS = {"ode_spring", "physx_spring"}
 """Engines whose coupling is a spring of their own, solved with the contacts."""
 
 
-@pytest.fixture(params=engine_names())
+@pytest.fixture(params=ENGINES)
 def engine(request: pytest.FixtureRequest) -> Engine:
     return engine_or_skip(request.param)
 
@@ -265,7 +265,7 @@ def test_a_pull_off_the_centre_turns_the_tool(engine: Engine) -> None:
     assert np.linalg.norm(velocity.angular - spin) < share * np.linalg.norm(spin)
 
 
-def test_an_engine_names_a_source_for_every_setting(engine: Engine) -> None:
+def test_every_engine_has_a_source_for_every_setting(engine: Engine) -> None:
     assert engine.version
     law = "implicit spring" if engine.name in SPRINGS else "held force"
     assert engine.settings["coupling"].value.startswith(law)

@@ -219,7 +219,7 @@ def test_a_device_that_does_not_turn_is_not_damped_for_the_rounding_of_its_turn(
         return (0, 0, 0, turn[3], *turn[:3])
 
     def owing(bridge: Bridge, _: int) -> None:
-        observer = bridge._binding.state["observer"]
+        observer = bridge.session.kernel.bound.state["observer"]
         observer["observed_energy"] = observer["axis_energy"] = 1e-3
 
     path, device = tmp_path / "run.mcap", ScriptedDevice(tilted, damping=0.5)

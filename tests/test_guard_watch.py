@@ -32,6 +32,7 @@ from hapticbridge.device.watchdog import ForceOffGuardian
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import UNLIMITED, Limits, guard_parameters_for, wait_until_still
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters
+from hapticbridge.options import BridgeOptions, Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 
@@ -310,7 +311,7 @@ def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
     monkeypatch.setattr(start_module, "STILL_TIME", 0.005)
     device = ScriptedDevice(lambda tick: (strays_to if tick else 0.0, 0, 0, 1, 0, 0, 0))
     device.info = replace(device.info, is_real=True)
-    with Bridge("point_mass", device, absolute=True, realtime=False) as bridge:
+    with Bridge("point_mass", device, workspace=Workspace(absolute=True), realtime=False) as bridge:
         if not is_refused:
             bridge.run(0.01)
             return
@@ -329,7 +330,7 @@ def test_a_run_that_is_told_to_end_while_an_absolute_device_strays_is_no_trip() 
 
     device = ScriptedDevice(stray)
     device.info = replace(device.info, is_real=True)
-    with Bridge("point_mass", device, absolute=True, realtime=False) as bridge:
+    with Bridge("point_mass", device, workspace=Workspace(absolute=True), realtime=False) as bridge:
         summary = bridge.run(0.01)
     assert (summary.stopped_by, summary.ticks) == ("signal", 0)
     assert not np.any(device.writes)
@@ -345,9 +346,8 @@ def test_a_run_that_is_told_to_end_while_an_absolute_device_strays_is_no_trip() 
     ],
 )
 def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str) -> None:
-    info = ScriptedDevice(lambda _k: (0,) * 7).info
     with pytest.raises(DeviceError, match=message):
-        guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, **options)
+        BridgeOptions(**options)
 
 
 @pytest.mark.parametrize(
@@ -361,7 +361,7 @@ def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
 
 def test_a_guard_reads_back_as_it_was_written() -> None:
     info = ScriptedDevice(lambda _k: (0,) * 7).info
-    guarding = guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=2)
+    guarding = guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=0b100)
     assert GuardParameters.from_json(guarding.to_json()) == guarding
     assert GuardParameters.from_json(UNGUARDED.to_json()) == UNGUARDED
     older = {k: v for k, v in json.loads(guarding.to_json()).items() if k != "reach"}
@@ -374,8 +374,8 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
 
 KILLED = """
 import os, sys, time
-from hapticbridge.device.last_word import LastWord
-word = LastWord(sys.argv[1], b"\\0zero", b"\\1off")
+from hapticbridge.device.watchdog import ForceOffGuardian
+word = ForceOffGuardian(sys.argv[1], b"\\0zero", b"\\1off")
 if sys.argv[2:] and (holder := os.fork()) == 0:
     time.sleep(60)  # as a worker of multiprocessing: it holds all that the bridge had open
     os._exit(0)

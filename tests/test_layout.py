@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
@@ -133,3 +136,89 @@ INTERFACES = {
     "hapticbridge.device.discovery",  # devices that are plugged in, for every driver
 }
 """Modules that are small on purpose."""
+
+
+WRITERS = {
+    "mj": "state",
+    "run": "state",
+    "coupling": "coupling",
+    "pose": "handle",
+    "loop": "tick",
+    "energy": "ledger",
+    "guard": "guard",
+    "observer": "passivity_controller",
+    "lossless": "lossless",
+}
+"""Sub-records of the kernel's state, and the module of the kernel that writes each."""
+
+
+def part_of(node: ast.expr, parts: dict[str, str]) -> str | None:
+    """Returns the sub-record that an expression belongs to: ``s.energy.slack``, ``energy["x"]``."""
+    found = None
+    while isinstance(node, ast.Attribute | ast.Subscript):
+        name = node.attr if isinstance(node, ast.Attribute) else ast.unparse(node.slice).strip("'")
+        found = name if name in WRITERS else found
+        node = node.value
+    return parts.get(node.id, found) if isinstance(node, ast.Name) else None
+
+
+def flat(targets: list[ast.expr]) -> Iterator[ast.expr]:
+    for target in targets:
+        yield from target.elts if isinstance(target, ast.Tuple) else [target]
+
+
+def written_parts(source: str) -> set[str]:
+    """Returns the sub-records that a module writes to, directly or by a local name."""
+    written = set()
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        arguments = [a.arg for a in function.args.args if ast.unparse(a.annotation or a) == "Part"]
+        parts = {name: name for name in arguments}
+        for node in ast.walk(function):
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name | ast.Tuple):
+                values = node.value.elts if isinstance(node.value, ast.Tuple) else [node.value]
+                for name, value in zip(flat(node.targets), values, strict=False):
+                    part = part_of(value, parts)
+                    if isinstance(name, ast.Name) and part is not None:
+                        parts[name.id] = part
+        for node in ast.walk(function):
+            targets: list[ast.expr] = []
+            if isinstance(node, ast.Assign):
+                targets = list(flat(node.targets))
+            elif isinstance(node, ast.AugAssign):
+                targets = [node.target]
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).startswith("store_"):
+                written.add(part_of(node.args[0], parts))
+            written |= {part_of(t, parts) for t in targets if not isinstance(t, ast.Name)}
+    return {part for part in written if part is not None}
+
+
+def test_each_part_of_the_kernels_state_has_one_writer() -> None:
+    writers: dict[str, set[str]] = {}
+    for path in (PACKAGE / "kernel").glob("*.py"):
+        for part in written_parts(path.read_text(encoding="utf-8")):
+            writers.setdefault(part, set()).add(path.stem)
+    assert writers == {part: {module} for part, module in WRITERS.items()}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "s.energy.slack = 0.0",
+        "s.energy.slack += 1.0",
+        "force, s.energy.slack = 0.0, 0.0",
+        "s.energy.works[2] = 0.0",
+        's["energy"]["slack"] = 0.0',
+        "store_vector(s.energy.works[0:3], v)",
+        "e = s.energy; e.slack = 0.0",
+        "works = s.energy.works; works[0] = 0.0",
+        "m, e = s.mj, s.energy; e.works[0] += 1.0",
+    ],
+)
+def test_a_write_to_a_part_of_the_state_is_found(line: str) -> None:
+    assert written_parts(f"def f(s: State) -> None:\n    {line}") == {"energy"}
+    assert written_parts("def f(energy: Part) -> None:\n    energy.slack = 0.0") == {"energy"}
+    assert not written_parts(
+        "def f(s: State) -> None:\n    slack = s.energy.slack\n    slack = 1.0"
+    )

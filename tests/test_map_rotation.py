@@ -14,7 +14,6 @@ from map_tables import Row, written
 from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.lab.maps.base import Point, run_map
 from hapticbridge.lab.maps.rotation import (
-    HIGHEST,
     INERTIA,
     MIDDLE,
     OBLIQUE,
@@ -215,20 +214,6 @@ def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
 
 def test_the_grid_has_about_as_many_points_as_asked() -> None:
     assert 1200 < len(points(ROTATION.default_points)) < 1800
-
-
-def test_a_jump_beyond_the_axes_is_marked_and_its_size_told() -> None:
-    jumps = {20.0: 0.5, 100.0: 7e4, 150.0: 9e4}
-    rows = [row("cut", "weld", SOFT, v, GOOD | {"torque_jump": j}) for v, j in jumps.items()]
-    finding = ROTATION.read(written(rows))
-    assert finding.boundary["cut"]["largest_torque_jump"]["weld"] == 9e4
-    axes = next(a for a in finding.figure.axes if "sudden" in a.get_xlabel())
-    (marks,) = [line for line in axes.lines if line.get_marker() == "^"]
-    assert list(np.asarray(marks.get_xdata())) == [100.0, 150.0]
-    assert np.all(np.asarray(marks.get_ydata()) < HIGHEST)
-    (line,) = [line for line in axes.lines if "weld" in str(line.get_label())]
-    assert "to 9e+04" in str(line.get_label())
-    np.testing.assert_array_equal(line.get_ydata(), [0.5, np.nan, np.nan])
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_wall_stands_where_it_was_set(distance: float) -> None:
 # --- drawer ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("friction", [0.0, 2.94, 6.0])
+@pytest.mark.parametrize("friction", [0.0, 6.0])
 def test_drawer_slides_against_the_friction_that_was_set(friction: float) -> None:
     model, data = scene_set_to("drawer", friction=friction)
     run = moved_through(model, data, [(2.0, (0.1, 0, 0), STILL)])
@@ -157,7 +157,7 @@ def test_nail_goes_in_by_the_work_of_a_blow_over_its_friction() -> None:
 
 def test_heavier_head_drives_the_nail_further() -> None:
     depths = []
-    for mass in (0.15, 0.2, 0.3):
+    for mass in (0.15, 0.3):
         speed, depth = first_blow("head_mass", mass)
         hammer, driven = mass + 0.04, 0.051
         left = 0.5 * hammer * speed**2 * hammer / (hammer + driven)
@@ -165,13 +165,13 @@ def test_heavier_head_drives_the_nail_further() -> None:
         # a blow that lasts a few ms
         assert 0.5 * left < 16.6 * depth < 0.85 * left
         depths.append(depth)
-    assert depths[0] < depths[1] < depths[2]
+    assert depths[0] < depths[1]
 
 
 # --- ratchet --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("torque", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("torque", [0.05, 0.4])
 def test_ratchet_drives_against_the_bolt_that_was_set(torque: float) -> None:
     run = own_path_with("ratchet", "bolt_torque", torque)
     gear = run.joints[:, 0]
@@ -184,21 +184,17 @@ def free_way(parameter: str, value: float) -> float:
     return float(moment_about_axis(own_path_with("ratchet", parameter, value))[700:1600].mean())
 
 
-def test_pawl_resists_the_free_way_as_its_spring_presses() -> None:
-    light, usual, strong = (free_way("pawl_force", force) for force in (0.25, 0.75, 3.0))
-    assert usual / light == pytest.approx(3.0, rel=0.15)
-    assert strong / usual == pytest.approx(4.0, rel=0.15)
-
-
-def test_pawl_resists_the_free_way_more_where_it_rubs_more() -> None:
-    slippery, usual, dry = (free_way("friction", value) for value in (0.05, 0.15, 0.4))
-    assert slippery < 0.9 * usual < 0.75 * dry
+def test_pawl_resists_the_free_way_as_its_spring_presses_and_as_it_rubs() -> None:
+    light, strong = (free_way("pawl_force", force) for force in (0.25, 3.0))
+    assert strong / light == pytest.approx(12.0, rel=0.15)
+    slippery, dry = (free_way("friction", value) for value in (0.05, 0.4))
+    assert slippery < 0.675 * dry
 
 
 # --- open wrench ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("torque", [0.12, 0.2, 0.4, 0.5])
+@pytest.mark.parametrize("torque", [0.12, 0.5])
 def test_nut_breaks_away_at_the_torque_that_was_set(torque: float) -> None:
     run = own_path_with("open_wrench", "breakaway", torque)
     nut, moment = run.joints[:, 0], moment_about_axis(run)
@@ -220,7 +216,7 @@ def test_slackened_nut_runs_with_the_torque_that_was_set_and_breaks_away_as_befo
     assert moment[tick - 20 : tick + 20].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
 
 
-@pytest.mark.parametrize("clearance", [0.025e-3, 0.1e-3, 0.5e-3])
+@pytest.mark.parametrize("clearance", [0.025e-3, 0.5e-3])
 def test_play_of_the_wrench_is_that_of_a_hexagon_between_two_flats(clearance: float) -> None:
     model, data = scene_set_to("open_wrench", clearance=clearance)
     # a rounded corner, 0.4 mm, on a circle of 8.776 mm, 30 degrees beside the flat's middle

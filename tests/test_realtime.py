@@ -314,7 +314,7 @@ def test_ticks_allocate_none(
         watchers["recording"] = tmp_path / "run.mcap"
     if "viewer" in watched:
         pytest.importorskip("viser", reason="needs the extra 'view'")
-        watchers["onlooker"] = Window(Address(0))
+        watchers["observer"] = Window(Address(0))
     blocks, held = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
     read_heap = heap_reader()
 
@@ -356,7 +356,7 @@ def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
     """No step fits into a microsecond, every one of a point mass into a second."""
     scene, method = load_scene("point_mass"), METHODS["implicit"]
     with fast(scene, method="implicit") as bridge:
-        coupling = bridge.coupling
+        coupling = bridge.setup.coupling
     prepare(scene, coupling, 1e-3, 1, method)
     state = ("qpos", "time", "qacc_warmstart")
     start = [np.copy(getattr(scene.data, name)) for name in state]

@@ -7,10 +7,10 @@ import math
 import shlex
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 from rich.markup import escape
@@ -19,41 +19,33 @@ from rich.table import Table
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions
 from hapticbridge.cli.terminal import err, out, tell
-from hapticbridge.cli.view import tell_address
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits, refuse_simulated_time
-from hapticbridge.kernel.parameters import checked_substeps
-from hapticbridge.rendering import Method, default_method, method_named
+from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.rendering import default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.summary import Summary, coupling_sentences, is_always_held
-from hapticbridge.units import format_si
-from hapticbridge.view import Address, Window
-from hapticbridge.view.window import BY
+from hapticbridge.units import format_energy, format_si
 
-# How ``hapticbridge run`` says what it will do, and what it did.
+if TYPE_CHECKING:
+    from hapticbridge.view import Window
 
 
-def announce(
-    bridge: Bridge, scales: tuple[float, float], substeps: int, *, is_method_asked: bool
-) -> None:
-    """Says what will be rendered, and whether the device bears it, before any force is on.
+def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
+    """Prints the rendered coupling and the device conditions that do not hold.
 
-    Args:
-        bridge: Not yet open.
-        scales: Handle motion per device motion, force on the device per force on the tool.
-        substeps: MuJoCo steps per tick.
-        is_method_asked: Whether the user chose the method.
+    ``is_method_chosen`` is true if the user named the method.
     """
-    coupling, method = bridge.coupling, bridge.method
-    scene, device = escape(bridge.scene.name), escape(bridge.device.info.name)
-    err.print(f"[bold]{scene}[/bold] on {device}, {1 / bridge.period:g} Hz, method {method.name}")
-    held = is_always_held(bridge.scene.model, bridge.scene.grip)
+    coupling, method, substeps = setup.coupling, setup.method, setup.substeps
+    scene, device = escape(setup.scene.name), escape(setup.info.name)
+    err.print(f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}")
+    held = is_always_held(setup.scene.model, setup.scene.grip)
     for sentence in coupling_sentences(
-        bridge.used, method, bridge.period, substeps, is_always_held=held
+        setup.law, method, setup.period, substeps, is_always_held=held
     ):
         err.print(f"  {sentence}")
     if not method.has_law:
@@ -63,7 +55,7 @@ def announce(
             f"B_r = {coupling.rotational_damping:g} N m s/rad"
         )
     usual = default_method()
-    if is_method_asked and method != usual:
+    if is_method_chosen and method != usual:
         err.print(f"  {method.name}: {escape(method.about)}")
     elif method != usual:
         err.print(
@@ -72,25 +64,27 @@ def announce(
         )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
-    least = bridge.rendered
+    attainable = setup.attainable
     if not (
-        math.isclose(least.damping, coupling.damping)
-        and math.isclose(least.rotational_damping, coupling.rotational_damping)
+        math.isclose(attainable.damping, coupling.damping)
+        and math.isclose(attainable.rotational_damping, coupling.rotational_damping)
     ):
         err.print(
             f"[yellow]warning:[/yellow] asked for B = {coupling.damping:g} N s/m, B_r = "
             f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
             "at this stiffness and rate; lower the stiffness or raise the rate"
         )
-    if bridge.reach < math.inf:
+    reach = setup.guard.reach
+    if reach < math.inf:
         err.print(
-            f"  {format_si(bridge.reach, 'm')} from its middle the device is at the end of its "
+            f"  {format_si(reach, 'm')} from its middle the device is at the end of its "
             "reach: beyond, it moves without the handle and without force"
         )
     if not method.has_law:
-        return  # told when the scene is prepared and the weld measured: ``announce_measured``
+        return  # printed once the weld is measured: ``announce_measured``
+    scales = setup.workspace.scales
     conditions = device_conditions(
-        bridge.device.info, bridge.used, bridge.period, *scales, bridge.laws, method
+        setup.info, setup.law, setup.period, *scales, setup.law_evaluations, method
     )
     for condition in conditions:
         if not condition.holds:
@@ -98,22 +92,22 @@ def announce(
 
 
 def announce_measured(bridge: Bridge) -> None:
-    """Says what the device must bear where no coupling law tells it, before any force is on."""
-    if bridge.method.has_law:
+    """Prints the device conditions of a method without a coupling law, known once it is open."""
+    if bridge.setup.method.has_law:
         return
-    felt = bridge.parameters.felt
-    if felt is not None:
-        err.print(_true_weld(felt, bridge.coupling))
+    effective = bridge.session.parameters.felt
+    if effective is not None:
+        err.print(_true_weld(effective, bridge.setup.coupling))
     for sentence in bridge.conditions():
         err.print(f"[yellow]warning:[/yellow] {escape(sentence)}")
 
 
-def _true_weld(felt: Coupling, asked: Coupling) -> str:
+def _true_weld(effective: Coupling, requested: Coupling) -> str:
+    k, b, kr, br = astuple(effective)
+    wanted = ", ".join(f"{value:.4g}" for value in astuple(requested))
     return (
-        f"the weld is {felt.stiffness:.4g} N/m, {felt.damping:.4g} N s/m, "
-        f"{felt.rotational_stiffness:.4g} N m/rad, {felt.rotational_damping:.4g} N m s/rad in its "
-        f"stiffest directions at the start; asked for: {asked.stiffness:.4g}, {asked.damping:.4g}, "
-        f"{asked.rotational_stiffness:.4g}, {asked.rotational_damping:.4g}"
+        f"the weld is {k:.4g} N/m, {b:.4g} N s/m, {kr:.4g} N m/rad, {br:.4g} N m s/rad in its "
+        f"stiffest directions at the start; asked for: {wanted}"
     )
 
 
@@ -135,8 +129,8 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
-        if joules:  # a scene without motors or springs has no news of them
-            table.add_row(name.replace("_", " "), format_si(joules, "J"))
+        if joules:  # exactly 0 without motors or springs
+            table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
@@ -145,8 +139,8 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
         out.print(f"from tick {tick} on, at port {port}")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
-    if summary.felt is not None:
-        out.print(_true_weld(summary.felt, summary.coupling))
+    if summary.effective is not None:
+        out.print(_true_weld(summary.effective, summary.requested))
     if summary.is_certified is None and summary.conditions:
         for sentence in summary.conditions:
             out.print(escape(sentence))
@@ -214,7 +208,7 @@ class Run:
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
     method: str | None = None
-    """How the tool is rendered: 'lossless' (half of the coupling inside MuJoCo's implicit step,
+    """Rendering method: 'lossless' (half of the coupling inside MuJoCo's implicit step,
     half carried over: second order away from contact; the default), 'implicit' (all of it inside
     the step, which adds K T to the damping that is felt; the default with substeps, which
     'lossless' does not take), 'compensated' (the same, with that K T taken off the coupling's
@@ -244,7 +238,7 @@ class Run:
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
-    """Rotational coupling damping in N m s/rad, likewise."""
+    """Rotational coupling damping in N m s/rad that is to be felt."""
     scale: float = 1.0
     """Handle motion per device motion."""
     force_scale: float | None = None
@@ -300,11 +294,10 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
-        refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
+        refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
-        address = Address() if self.port is None else Address(self.port)
-        window = Window(address) if self.view else None
+        window = self._window() if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
             told = stack.enter_context(interrupting_on_signals())
@@ -322,22 +315,18 @@ class Run:
         told: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
-        scales = self.scale, self.scale if self.force_scale is None else self.force_scale
-        bridge = Bridge(
-            scene,
-            device,
-            self._coupling(device.info, scales),
+        options = BridgeOptions(
             rate=self.rate,
             substeps=self.substeps,
             method=self.method,
             contact_stiffness=self.contact_stiffness,
             i_know=self.i_know,
-            recording=self.record,
-            clock=clock,
-            scale=scales[0],
-            force_scale=scales[1],
-            axes=self.axes,
-            absolute=self.absolute,
+            workspace=Workspace(
+                scale=self.scale,
+                force_scale=self.force_scale,
+                axes=SAME_FRAME.axes if self.axes is None else self.axes,
+                absolute=self.absolute,
+            ),
             limits=Limits(
                 force=device.info.force_limit if self.force_limit is None else self.force_limit,
                 torque=(
@@ -353,18 +342,21 @@ class Run:
             dead_man=self.dead_man,
             mark=self.mark,
             live=not self.as_json and (err.is_terminal or not self.fast),
-            onlooker=window,
             realtime=self.realtime or None,
         )
+        coupling = self._coupling(device.info, options)
+        bridge = Bridge(
+            scene, device, coupling, options, clock=clock, recording=self.record, observer=window
+        )
         if window is not None:
-            window.on_command = partial(bridge.command, by=BY)
+            window.on_command = partial(bridge.command, by="view")
         if not self.as_json:
-            announce(bridge, scales, self.substeps, is_method_asked=self.method is not None)
+            announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
         told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
-            tell_address(window.url)
+            tell(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
@@ -373,20 +365,21 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
-            print_summary(summary, bridge.laws, is_felt=not device.info.is_prescribed)
+            print_summary(
+                summary, bridge.setup.law_evaluations, is_felt=not device.info.is_prescribed
+            )
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
-    def _method(self) -> Method:
-        if self.method is None:
-            return default_method(checked_substeps(self.substeps))
-        return method_named(self.method)
+    def _window(self) -> Window:
+        from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
 
-    def _coupling(self, info: DeviceInfo, scales: tuple[float, float]) -> Coupling:
-        """Returns the default coupling with what the user asked for put in its place."""
-        asked = {field.name: getattr(self, field.name) for field in fields(Coupling)}
-        given = {name: value for name, value in asked.items() if value is not None}
-        method = self._method()
-        laws = method.laws(self.substeps)
-        default = default_coupling(info, period_of(self.rate), *scales, laws, method)
-        return replace(default, **given)
+        return Window(Address() if self.port is None else Address(self.port))
+
+    def _coupling(self, info: DeviceInfo, options: BridgeOptions) -> Coupling:
+        """Returns the default coupling with the user's gains."""
+        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
+        chosen = {name: value for name, value in gains.items() if value is not None}
+        method, period = options.rendering_method, period_of(options.rate)
+        laws, scales = method.laws(options.substeps), options.workspace.scales
+        return replace(default_coupling(info, period, *scales, laws, method), **chosen)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from hapticbridge.cli.terminal import err, plain, progress
+from hapticbridge.cli.terminal import progress, tell
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
 
@@ -41,13 +41,8 @@ class View:
         with progress("simulating again") as show:
             replay = Replay(self.file, show)
         theatre = Theatre(replay, address)
-        tell_address(theatre.url)
+        tell(f"view: {theatre.url}")
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()
         return 0
-
-
-def tell_address(url: str) -> None:
-    """Prints the address to open in a browser."""
-    err.print(f"view: {plain(url)}", soft_wrap=True)

@@ -250,17 +250,17 @@ class CouplingLimits:
         """Limits of the available kinds of axis."""
         return (self.translation, *(() if self.rotation is None else (self.rotation,)))
 
-    def felt(self, command: Couple, now: Coupling) -> Coupling:
+    def requested(self, command: Couple, now: Coupling) -> Coupling:
         """Returns the requested coupling after a command; omitted gains keep their values."""
-        felt = self.translation.put(now, command.stiffness, command.damping)
+        requested = self.translation.put(now, command.stiffness, command.damping)
         stiffness, damping = command.rotational_stiffness, command.rotational_damping
         if self.rotation is None or stiffness is None or damping is None:
-            return felt
-        return self.rotation.put(felt, stiffness, damping)
+            return requested
+        return self.rotation.put(requested, stiffness, damping)
 
-    def used(self, felt: Coupling) -> Coupling:
+    def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""
-        return self.method.used(felt, self.period / self.substeps)
+        return self.method.used(requested, self.period / self.substeps)
 
     def reason(self) -> str:
         """Returns the reason of the slider limits, in a sentence."""

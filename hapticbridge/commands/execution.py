@@ -135,31 +135,33 @@ class CommandQueue:
     atomically. The queue holds at most ``MOST_WAITING`` commands.
 
     Args:
-        allowance: Limits of the coupling on the device.
+        limits: Limits of the coupling on the device.
         is_recorded: True for a recorded run, which can be marked.
         now: Returns the time in s; it never runs backwards.
 
     Attributes:
+        limits: Limits of the coupling on the device.
+        now: Returns the time in s; a test may replace it.
         waiting: Commands in order, each with its origin.
     """
 
     def __init__(
         self,
-        allowance: CouplingLimits,
+        limits: CouplingLimits,
         *,
         is_recorded: bool = True,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.allowance = allowance
+        self.limits, self.now = limits, now
         self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
-        self._is_recorded, self._now = is_recorded, now
+        self._is_recorded = is_recorded
         self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
 
     def warm_up(self) -> None:
         """Computes the tables of limits in advance, so that the first command is not slow."""
-        if self.allowance.method.has_law:
-            for span in self.allowance.spans:
+        if self.limits.method.has_law:
+            for span in self.limits.spans:
                 span.needed(span.least_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
@@ -174,7 +176,7 @@ class CommandQueue:
         self._check(command)
         is_reset = isinstance(command, Reset)
         with self._offering:
-            now = self._now()
+            now = self.now()
             early = max(
                 self._last + INTERVAL - now,
                 self._last_reset + RESET_INTERVAL - now if is_reset else 0.0,
@@ -190,8 +192,8 @@ class CommandQueue:
 
     def _check(self, command: Command) -> None:
         if isinstance(command, Couple):
-            self.allowance.check(command)
-        elif isinstance(command, Reset) and not self.allowance.method.has_coupling:
+            self.limits.check(command)
+        elif isinstance(command, Reset) and not self.limits.method.has_coupling:
             raise CommandError("a massless tool follows the hand, so there is nothing to reset")
         elif isinstance(command, Mark) and not self._is_recorded:
             raise CommandError("this run is not recorded; start it with a recording to mark it")
@@ -199,41 +201,30 @@ class CommandQueue:
 
 # Execution of waiting commands, in order and at their ticks.
 
-Tell = Callable[..., None]
+NoteEvent = Callable[..., None]
 
 
 class CommandExecutor:
     """Executes one command per tick; commands that need zero force wait until it has faded.
 
-    ``tell`` records an event of the present tick: its name, then its details.
+    Args:
+        queue: The waiting commands.
+        applier: Applies the events that the commands cause.
+        fade_ticks: Ticks in which the force fades to zero.
+        note: Records an event of the present tick: its name, then its details.
 
     Attributes:
-        felt: Requested coupling at the end of its present change.
-        later: Postponed commands: tick, command, origin.
+        requested: Requested coupling at the end of its present change.
+        later: Postponed resets: tick and origin.
     """
 
-    def __init__(self, queue: CommandQueue, tell: Tell) -> None:
-        self.felt: Coupling = queue.allowance.start
+    def __init__(
+        self, queue: CommandQueue, applier: EventApplier, fade_ticks: int, note: NoteEvent
+    ) -> None:
+        self.requested: Coupling = queue.limits.start
         self.later: deque[tuple[int, str]] = deque()
-        self._queue, self._tell = queue, tell
+        self._queue, self._applier, self._fade_ticks, self._note = queue, applier, fade_ticks, note
         self._has_force, self._is_clutched = True, False
-        self._repeater: EventApplier | None = None
-        self._fade_ticks = 1
-
-    @property
-    def used(self) -> Coupling:
-        """Law's coupling at the end of its present change."""
-        return self._queue.allowance.used(self.felt)
-
-    def begin(self, repeater: EventApplier, fade_ticks: int) -> None:
-        """Starts a run at its first tick.
-
-        The force fades within ``fade_ticks``.
-        """
-        self._repeater, self._fade_ticks = repeater, fade_ticks
-        self.later.clear()
-        if not self._has_force or self._is_clutched:
-            self._switch("run")
 
     def act(self, tick: int) -> None:
         """Executes the command that is due before a tick."""
@@ -242,15 +233,16 @@ class CommandExecutor:
             if tick < due:
                 return  # commands keep their order
             self.later.popleft()
-            self._do({"event": "reset", "by": by})
+            self._apply({"event": "reset", "by": by})
             self._switch(by)
             return
         command, by = self._queue.waiting.popleft()
         if isinstance(command, Couple):
-            self.felt = self._queue.allowance.felt(command, self.felt)
-            law = asdict(self.used)
-            ticks = tuning_ticks(self._queue.allowance.period)
-            self._do({"event": "coupling", **law, "ticks": ticks, "by": by})
+            limits = self._queue.limits
+            self.requested = limits.requested(command, self.requested)
+            law = asdict(limits.law(self.requested))
+            ticks = tuning_ticks(limits.period)
+            self._apply({"event": "coupling", **law, "ticks": ticks, "by": by})
         elif isinstance(command, Switch):
             if command.force is not None:
                 self._has_force = command.force
@@ -261,19 +253,18 @@ class CommandExecutor:
             self.later.append((tick + self._fade_ticks + 1, by))
             self._switch(by, is_fading=True)
         elif isinstance(command, Mark):
-            self._tell("mark", by=by)
+            self._note("mark", by=by)
         elif isinstance(command, Repeat):
             for event in command.events:
-                self._do({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
+                self._apply({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
 
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
         force = self._has_force and not is_fading
         event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
         # a force that fades for a moment only was not switched off by a command
-        self._do(event | ({"fading": True} if is_fading else {}))
+        self._apply(event | ({"fading": True} if is_fading else {}))
 
-    def _do(self, event: dict[str, Any]) -> None:
-        if self._repeater is not None:
-            self._repeater.apply(event)
+    def _apply(self, event: dict[str, Any]) -> None:
+        self._applier.apply(event)
         details = dict(event)
-        self._tell(details.pop("event"), **details)
+        self._note(details.pop("event"), **details)

@@ -65,6 +65,9 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
+_LATER = {"serial", "reach"}
+"""Fields that the first recordings lack."""
+
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
 
@@ -98,13 +101,15 @@ class DeviceInfo:
         friction: Coulomb friction per axis in N, >= 0; None if unknown.
         resolution: Step of the reported position in m, >= 0 (0: none); None if unknown.
         force_limit: Largest norm of a commanded force in N, >= 0.
-        torque_limit: Largest norm of a commanded torque in N m, >= 0.
-        speed_limit: Largest possible speed in m/s, >= 0.
+        torque_limit: Largest norm of a commanded torque in N m, >= 0; by default 0.5.
+        speed_limit: Largest possible speed in m/s, >= 0; by default 5. A pose that moves faster
+            than twice this speed stops the run.
         rate: The device's own rate in Hz, > 0; None if it follows the bridge.
         delay: Age of a sample when the loop reads it, plus the time until a written wrench acts, in
             s, >= 0; None if unknown.
         is_prescribed: True if the motion does not react to force.
-        is_real: True if motors act on a person's hand.
+        is_real: True if motors act on a person's hand. The default is the safe one: such a device
+            runs on a real clock only, and waits for the hand to be still.
         duration: Time in s after which the motion ends by itself, >= 0; None if it does not.
         serial: The unit's serial number; empty if it has none.
         reach: Largest possible distance in m from the origin of its frame, > 0; beyond it are only
@@ -116,20 +121,20 @@ class DeviceInfo:
 
     name: str
     axes: tuple[str, ...]
-    mass: float | None
-    damping: float | None
-    rotational_inertia: float | None
-    rotational_damping: float | None
-    friction: float | None
-    resolution: float | None
+    mass: float | None = None
+    damping: float | None = None
+    rotational_inertia: float | None = None
+    rotational_damping: float | None = None
+    friction: float | None = None
+    resolution: float | None = None
     force_limit: float
-    torque_limit: float
-    speed_limit: float
-    rate: float | None
-    delay: float | None
-    is_prescribed: bool
-    is_real: bool
-    duration: float | None
+    torque_limit: float = USUAL_TORQUE_LIMIT
+    speed_limit: float = USUAL_SPEED_LIMIT
+    rate: float | None = None
+    delay: float | None = None
+    is_prescribed: bool = False
+    is_real: bool = True
+    duration: float | None = None
     serial: str = ""
     reach: float | None = None
 
@@ -205,8 +210,7 @@ class DeviceInfo:
             raise DeviceError(
                 f"device data holds unknown keys {choices(unknown)}; valid keys: {choices(names)}"
             )
-        needed = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
-        if missing := needed - values.keys():
+        if missing := names - _LATER - values.keys():
             raise DeviceError(f"device data lacks the keys {choices(missing)}")
         return cls(**values)
 
@@ -217,6 +221,40 @@ class Device(Protocol):
     The loop calls ``start`` once, then ``read`` and later ``write`` in each tick, and finally
     ``close``. The sample of tick k is the state at time k · period. A wrench written in tick k acts
     until the next write.
+
+    A whole device, a handle on a rail in a hand that swings it::
+
+        import math
+
+        import hapticbridge as hb
+        import numpy as np
+
+        class Rail:
+            info = hb.DeviceInfo(
+                name="rail", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
+            )
+
+            def start(self, period):
+                self.period, self.time, self.velocity, self.force = period, 0.0, 0.0, 0.0
+                sample = np.zeros(1, hb.SAMPLE_DTYPE)
+                sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+                return sample
+
+            def read(self, sample):
+                self.time += self.period
+                pull = 0.3 * math.cos(6.0 * self.time) + self.force
+                self.velocity += self.period * (pull - 2.0 * self.velocity) / 0.6
+                sample["position"][0, 0] += self.period * self.velocity
+                return 0
+
+            def write(self, wrench):
+                self.force = wrench[0]
+
+            def close(self):
+                self.force = 0.0
+
+        with hb.Bridge("point_mass", Rail(), clock=hb.SimulatedClock()) as bridge:
+            summary = bridge.run(duration=1.0)
 
     Attributes:
         info: The device's data sheet, complete before ``start``.

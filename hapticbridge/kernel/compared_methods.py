@@ -100,8 +100,9 @@ def weld_wrench(s: State) -> tuple[Vector, Vector]:
     """Returns force and torque of the weld on the tool, about the grip, in the world frame.
 
     A weld of two sites has six constraint rows. Three are the grip's position minus the handle's;
-    their forces λ act at the grip. Three are the vector part of q̄_h ⊗ q_x, which a rotation ω of the
-    tool changes by ½ vec(q̄_h ⊗ (0, ω) ⊗ q_x); their torque is the transpose of that map times λ.
+    their forces λ act at the grip. Three are the vector part of q̄_h ⊗ q_x, which a rotation ω of
+    the tool changes by ½ vec(q̄_h ⊗ (0, ω) ⊗ q_x); their torque is the transpose of that map times
+    λ.
 
     Must run before the kinematics are refreshed, because the step used the poses of its start.
     """

@@ -1,15 +1,15 @@
 """The guard inside a tick: refusal of a sample, re-anchoring of the handle, limits of the wrench.
 
-After a start or a re-anchoring, the guard lets only a share r of the wrench through, and r grows from
-tick to tick. A coupling that is stretched meanwhile grows with r. From the identity behind BC97 (6),
-with the wrench r_k f_k in the place of f_k, the device receives
+After a start or a re-anchoring, the guard lets only a share r of the wrench through, and r grows
+from tick to tick. A coupling that is stretched meanwhile grows with r. From the identity behind
+BC97 (6), with the wrench r_k f_k in the place of f_k, the device receives
 
     W = Σ (r_k − r_{k−1}) V(e_k),    V(e) = ∫ min(K e, F) de
 
 that no port has supplied: the spring is compressed while r is small and released when r is 1. F is
 the force limit in N, V an energy in J. A hand that moves 40 mm into a wall with F = 10 N during the
-ramp so receives 0.2 J, and the guard's energy limit rightly ends the run. Therefore r rises in equal
-steps only while V is below V_0 (``ramp_energy``), and more slowly above:
+ramp thus receives 0.2 J, and the guard's energy limit rightly ends the run. Therefore r rises in
+equal steps only while V is below V_0 (``ramp_energy``), and more slowly above:
 
     r_k − r_{k−1} = min(1, V_0/V(e_k)) / (n + 1)
 
@@ -166,14 +166,15 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
 def follow(
     s: State, position: Vector, moved: Vector, turned: Vector, buttons: int, elapsed: float
 ) -> bool:
-    """Decides if the handle follows the device, and if the wrench fades or the handle is re-anchored.
+    """Decides if the handle follows the device, is re-anchored, and if the wrench fades.
 
     The handle stays while a clutch is held (by a button or by command), while a dead-man button is
-    not held, and while the device is beyond ``reach``, at the edge of its workspace. The wrench then
-    fades. It also fades after ``stale_ticks`` ticks without a new sample, and while the force is off
-    by command. Afterwards, and after a stall, the handle is re-anchored (flag ``RESEATED``): it is
-    placed at the tool, the device's pose belongs to it from then on, and the wrench rises within
-    ``fade_ticks``. A coupling that stayed stretched would release energy that no hand supplied.
+    not held, and while the device is beyond ``reach``, at the edge of its workspace. The wrench
+    then fades. It also fades after ``stale_ticks`` ticks without a new sample, and while the force
+    is off by command. Afterwards, and after a stall, the handle is re-anchored (flag ``RESEATED``):
+    it is placed at the tool, the device's pose belongs to it from then on, and the wrench rises
+    within ``fade_ticks``. A coupling that stayed stretched would release energy that no hand
+    supplied.
 
     Args:
         s: The bound state.

@@ -3,7 +3,8 @@
     E_k = S_k − S_{k−1} − (f_k·δx_k + τ_k·δφ_k) − W_actuators − W_external
 
 S is the energy that the scene stores, f and τ the coupling's wrench on the tool, δx and δφ the
-tool's motion in tick k; all in J. Σ E_k <= 0 means that the simulation created no energy, BC97 (14).
+tool's motion in tick k; energies and works in J, wrenches in N and N m, motions in m and rad.
+Σ E_k <= 0 means that the simulation created no energy, BC97 (14).
 """
 
 from __future__ import annotations

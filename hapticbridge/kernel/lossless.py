@@ -1,8 +1,8 @@
 """The lossless coupling: half of the wrench solved implicitly, half carried over.
 
-MuJoCo's implicit step applies K/2 and B'/2; the other half of the last wrench is applied as a force.
-Away from contact the tool then keeps the energy balance of the midpoint rule to rounding, and the
-scheme is of second order. MuJoCo's velocity u lags by half a wrench; the balanced velocity is
+MuJoCo's implicit step applies K/2 and B'/2; the other half of the last wrench is applied as a
+force. Away from contact the tool then keeps the energy balance of the midpoint rule to rounding,
+and the scheme is of second order. MuJoCo's velocity u lags by half a wrench. The balanced one is
 
     v_k = u_k + (T/2) M⁻¹ [2 J_kᵀ r_k − c(q_k, u_k) + p_k],      S_k = ½ v_kᵀ M v_k + potential
 
@@ -113,14 +113,15 @@ LOSSLESS_DTYPE = np.dtype(
 
 Addresses of vectors over the degrees of freedom come first. ``is_midpoint`` and ``was_midpoint``
 are the form of the next and of the last step; ``holdoff`` counts the ticks until the tool may be
-lossless again; ``energy_debt`` in J is generated energy that is still to be taken back; ``twist`` in
-rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
+lossless again; ``energy_debt`` in J is generated energy that is still to be taken back; ``twist``
+in rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
 
 # The velocity v at which a lossless step's energy is balanced, and the force carried over
 
 MAX_SHARE_BACK = 1e-3
 """Largest share of the tool's kinetic energy that a tick takes back; no unit. It changes the speed
-by 0.05 %, hundreds of times the need of free motion. A larger share would be felt in slow motion."""
+by 0.05 %, hundreds of times the need of free motion. A larger share would be felt in slow
+motion."""
 
 
 @compiled
@@ -589,8 +590,8 @@ def apply_carried(s: State) -> None:
 
     The user writes to the array that this method also writes to; a value that differs from the
     method's last one is the user's. If the user's force changes from p to p', a lossless step takes
-    ½ (p + p'). Then v gains T M⁻¹ p', and the work h p'·u of the external port is exact. With all of
-    p', a varying force would generate energy.
+    ½ (p + p'). Then v gains T M⁻¹ p', and the work h p'·u of the external port is exact. With all
+    of p', a varying force would generate energy.
     """
     mj, lossless = s.mj, s.lossless
     applied, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)

@@ -180,7 +180,7 @@ def field_address(data: mujoco.MjData, name: str) -> int:
 
 
 def contact_layout() -> dict[str, int]:
-    """Returns the size of ``mjContact`` and the offsets of the fields that a tick reads, in bytes."""
+    """Returns the size of ``mjContact`` and the offsets that a tick reads, in bytes."""
     contact = _struct("mjContact")
     fields = {
         "distance": "dist",
@@ -296,15 +296,15 @@ MJ_DTYPE = np.dtype(
     [
         (name, "<i8")
         for name in (
-            ("model", "data", "warnings", "gainprm", "biasprm")
-            + _DATA_ARRAYS
-            + _DATA_FIELDS
-            + _OWNED
-            + _MASSLESS
-            + _SIZES
-            + tuple(f"contact_{name}" for name in _CONTACT)
-            + _IDS
-            + _FACTS
+            *("model", "data", "warnings", "gainprm", "biasprm"),
+            *_DATA_ARRAYS,
+            *_DATA_FIELDS,
+            *_OWNED,
+            *_MASSLESS,
+            *_SIZES,
+            *(f"contact_{name}" for name in _CONTACT),
+            *_IDS,
+            *_FACTS,
         )
     ]
 )

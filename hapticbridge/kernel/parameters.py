@@ -174,7 +174,7 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
     Raises:
         HapticBridgeError: The message gives the reason.
     """
-    reasons = {
+    reasons: dict[int, str] = {
         Scheme.MASSLESS: "a tool without mass has no motion to divide",
         Scheme.MIDPOINT: "a lossless coupling carries half of a tick's wrench over to the next",
     }
@@ -205,10 +205,10 @@ class RunParameters:
         felt: Effective coupling as measured, for a weld; None if it follows from ``coupling``. The
             device condition uses it.
         contact_stiffness: K_c in N/m per contact of a tool without mass; 0 for other methods.
-        device_damping: b of the device in N s/m; None if it or the rotational damping is unknown, or
-            if the motion is prescribed. Its dissipation is compared with the energy delivered.
-        device_rotational_damping: Rotational damping in N m s/rad; None if ``device_damping`` is, or
-            without rotation.
+        device_damping: b of the device in N s/m; None for a prescribed motion, or if a damping is
+            unknown. Its dissipation is compared with the energy delivered.
+        device_rotational_damping: Rotational damping in N m s/rad; None without rotation, or if
+            ``device_damping`` is.
         guarding: Limits and thresholds of the guard.
 
     Raises:
@@ -284,10 +284,10 @@ class RunParameters:
         """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
 
         g = K + B/T with one evaluation of the law per tick, and half of K/n + B/T with n > 1. Zero
-        without a coupling law (a weld, a tool without mass), because the proof of a slack needs one.
-        With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device damping
-        at B = 0; half of it does not (``certificate.required_damping``). The records hold the sum of
-        the motions δx_i alone, and uniform motion gives the least slack for a sum.
+        without a coupling law (a weld, a tool without mass), because the proof of a slack needs
+        one. With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device
+        damping at B = 0; half of it does not (``certificate.required_damping``). The records hold
+        the sum of the motions δx_i alone, and uniform motion gives the least slack for a sum.
         """
         if not self.has_law:
             return 0.0, 0.0

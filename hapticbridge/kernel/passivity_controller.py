@@ -16,21 +16,22 @@ from hapticbridge.pose import Vector, scaled
 
 THRESHOLD = 1e-5
 """Energy debt in J above which the controller acts. Rounding and the first-order error of turning
-tools stay below it. A limit cycle that a hand can feel (0.1 mm at 2400 N/m) reaches it in one swing."""
+tools stay below it. A limit cycle that a hand can feel (0.1 mm at 2400 N/m) reaches it in one
+swing."""
 
 TANK_START = 5e-3
 """Energy in J that the tank holds at first. It lends what a spring returns before the observer has
-seen it: 5 N at 2400 N/m store 5 mJ. A larger value lets a larger impulse pass; a smaller one softens
-contacts."""
+seen it: 5 N at 2400 N/m store 5 mJ. A larger value lets a larger impulse pass; a smaller one
+softens contacts."""
 
 SWINGS, WINDOW = 4, 8
 """Reversals of the motion, and the ticks within which they count as swinging from sample to sample.
 A mass of 0.1 kg on 40 000 N/m reverses once in five ticks, a worst-case hand in every tick."""
 
 BOUND = 1.6
-"""Largest change of the force per device motion, as a multiple of b/T; no unit. At 2, a damper alone
-held by the worst-case hand swings forever; at 1.6 a swing loses 40 % per tick. A smaller value makes
-walls soft for longer."""
+"""Largest change of the force per device motion, as a multiple of b/T; no unit. At 2, a damper
+alone held by the worst-case hand swings forever; at 1.6 a swing loses 40 % per tick. A smaller
+value makes walls soft for longer."""
 
 OBSERVER_DTYPE = np.dtype(
     [
@@ -56,7 +57,8 @@ OBSERVER_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
-N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``reversals`` holds one bit per tick."""
+N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``reversals`` holds one bit per
+tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -74,12 +76,12 @@ def cap_dissipation(s: State) -> None:
 
         G ← max(G, −(A_max + r V + r max(S − S_0 − U, 0))),    r = force_scale / scale
 
-    G is ``energy_to_device``, A_max ``energy_credit_limit``, V the energy that the coupling's springs
-    can release, S − S_0 the energy that the scene has taken up; all in J. Both V and S − S_0 may
-    return to the hand. U is the energy that the scene took up while the force was off by command; it
-    may not return, and neither may V then, because the handle is re-anchored before force is on
-    again. Without the cap, a hand that has dissipated 1 J by rubbing could receive 1 J by a slider
-    that is moved, or a force that is switched, at the right moments.
+    G is ``energy_to_device``, A_max ``energy_credit_limit``, V the energy that the coupling's
+    springs can release, S − S_0 the energy that the scene has taken up; all in J. Both V and S −
+    S_0 may return to the hand. U is the energy that the scene took up while the force was off by
+    command; it may not return, and neither may V then, because the handle is re-anchored before
+    force is on again. Without the cap, a hand that has dissipated 1 J by rubbing could receive 1 J
+    by a slider that is moved, or a force that is switched, at the right moments.
 
     Args:
         s: The bound state, between two ticks.
@@ -133,17 +135,17 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
 
     A > 0 means that device and scene together have delivered more energy than they received.
 
-    Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the previous
-    tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new sample (s);
-    r = force_scale / scale; c share of the wrench that the guard let through; ΔS change of the stored
-    energy (J); W work of the scene's motors and of user forces (J). A_max (J) caps the credit, so
-    that long dissipation cannot hide a short active phase.
+    Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the
+    previous tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new
+    sample (s); r = force_scale / scale; c share of the wrench that the guard let through; ΔS change
+    of the stored energy (J); W work of the scene's motors and of user forces (J). A_max (J) caps
+    the credit, so that long dissipation cannot hide a short active phase.
 
     Also updated, each in J:
-        ``generated_energy``: Σ E_k − slack of the environment's port, with the credit capped by A_max.
-        ``excess_energy_to_device``: see the function; motors of the scene pay for nothing in it.
-        ``stored_while_force_off``: energy that the scene took up while the force was off by command
-        and still stores. No hand supplied it (``cap_dissipation``).
+        ``generated_energy``: Σ E_k − slack of the environment's port; A_max caps its credit.
+        ``excess_energy_to_device``: as the function computes it; motors of the scene pay for none.
+        ``stored_while_force_off``: energy that the scene took up while the force was off by
+        command and still stores. No hand supplied it (``cap_dissipation``).
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -242,19 +244,19 @@ def control(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
         f ← f − α v,    α = min(debt/(T v²), b, m/T),    then    |f_k − f_{k−1}| <= 1.6 (b/T) |δp_k|
 
     f in N, v in m/s, debt in J, T period in s, b the device's damping in N s/m, m its mass in kg.
-    Without the clip, α grows without bound as v goes to zero and is itself active. The second bound,
-    from energy-bounding control, applies if the hand makes the loop swing from sample to sample.
-    There v is one sample late and damping adds to the swing; the bound lowers the effective
+    Without the clip, α grows without bound as v goes to zero and is itself active. The second
+    bound, from energy-bounding control, applies if the hand makes the loop swing from sample to
+    sample. There v is one sample late and damping adds to the swing; the bound lowers the effective
     stiffness until the device's damper bears it.
 
     Controller ``DAMPER`` takes ``observed_energy`` as the debt, ``ENVIRONMENT`` the previous tick's
     ``generated_energy``. Up to the slack a device that bears its coupling stays passive; beyond it
-    each axis is damped until it has dissipated or returned its energy. A damper on the tool would be
-    nearer to the cause, but contacts then generate more.
+    each axis is damped until it has dissipated or returned its energy. A damper on the tool would
+    be nearer to the cause, but contacts then generate more.
 
-    Behind the damper, a tank scales the wrench to the work that its level allows in the next tick, at
-    the velocity of the last one. It covers the debt that the clipped α cannot. It does not act in a
-    swing, because the last velocity does not predict the next one.
+    Behind the damper, a tank scales the wrench to the work that its level allows in the next tick,
+    at the velocity of the last one. It covers the debt that the clipped α cannot. It does not act
+    in a swing, because the last velocity does not predict the next one.
 
     References:
         Hannaford & Ryu 2002 (damper); Kim & Ryu 2010 (bound); Franken et al. 2011 (tank).

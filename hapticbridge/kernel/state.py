@@ -1,4 +1,4 @@
-"""The kernel's state, in nine sub-records of one writing module each, bound to a model and its data.
+"""The kernel's state, bound to a model and its data: nine sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records

@@ -225,8 +225,8 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
     """Returns True if the position stage may run ahead of the sample.
 
     It may not with a weld to the handle, whose constraint rows change with its pose; with a tool
-    that is placed at the handle; under RK4, which evaluates all stages four times; and with a plugin
-    or a callback for the controls, which may read any number.
+    that is placed at the handle; under RK4, which evaluates all stages four times; and with a
+    plugin or a callback for the controls, which may read any number.
 
     Args:
         model: The prepared scene.

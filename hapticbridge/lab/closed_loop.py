@@ -25,9 +25,9 @@ from hapticbridge.jit import compiled_for_threads, direct
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
 from hapticbridge.kernel.tick import advance, after_step, before_step
-from hapticbridge.options import run_parameters
+from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import Method, prepare
+from hapticbridge.rendering import Method, prepare, resolve_contact_stiffness
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
 from hapticbridge.theory.sampled_loop import decays
@@ -181,21 +181,20 @@ class ClosedLoop:
             if knock.shape != (6,):
                 raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
-        felt = prepare(scene, coupling, period, substeps, method, warns=False)
+        effective = prepare(scene, coupling, period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
         sample[:] = device.start(period, 1 if is_even else PARTS)
-        parameters = run_parameters(
-            scene,
-            coupling,
-            method,
-            sample,
+        setup = RunSetup(
+            scene=scene,
+            coupling=coupling,
+            method=method,
             period=period,
-            felt=felt,
-            substeps=substeps,
             info=device.info,
+            substeps=substeps,
+            contact_stiffness=resolve_contact_stiffness(method, coupling, None),
         )
-        binding = BoundKernel(scene.model, scene.data, parameters)
+        binding = BoundKernel(scene.model, scene.data, setup.parameters(sample, effective))
         if knock is not None:
             device.displace(knock)
         intervals = (

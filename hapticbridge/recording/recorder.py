@@ -203,6 +203,11 @@ class Recorder:
         self._outbox += layout.event_payload(event, time_ns) + b"\n"
         self._send()
 
+    @property
+    def pid(self) -> int:
+        """Number of the recorder's process."""
+        return self._process.pid
+
     def is_alive(self) -> bool:
         """Returns True if the process runs; otherwise ``close`` raises the reason."""
         self._send()
@@ -335,7 +340,7 @@ _FULL = "the disk is full; the recording ends here and is whole"
 class RecordStream:
     """Records leave through a ring, events through a pipe; the loop never waits in real time.
 
-    ``kernel.publish.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
+    ``kernel.tick.publish`` writes to ``rows`` and ``cursors``. With a file or a status line the
     recorder's process reads them; otherwise the ring keeps the newest records. Close it after the
     loop in any case.
 
@@ -345,12 +350,12 @@ class RecordStream:
         live: True shows the state of the run on standard error.
         is_lossless: True if the loop may wait for the recorder (simulated time) instead of losing
             records.
-        onlooker: Optional second reader of the ring, such as the live view. The loop never waits
+        observer: Optional second reader of the ring, such as the live view. The loop never waits
             for it.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
-        cursors: The ring's cursors, ``kernel.publish.HEAD`` and ``TAIL``.
+        cursors: The ring's cursors, ``kernel.tick.HEAD`` and ``TAIL``.
         recorder: The recorder's process once started; None without one.
         lost: Flag of the next record: ``DROPPED_BEFORE`` if the one before it was lost, else 0.
         dropped: Number of lost records.
@@ -366,14 +371,14 @@ class RecordStream:
         *,
         live: bool,
         is_lossless: bool,
-        onlooker: RingObserver | None = None,
+        observer: RingObserver | None = None,
         snapshot: str = "",
     ) -> None:
         self._path, self._is_live, self._is_lossless = path, live, is_lossless
         self._is_read = path is not None or live
         capacity = min(round(RING_SECONDS / period), MOST_RECORDS)
-        self._onlooker, self._snapshot = onlooker, snapshot
-        is_shared = self._is_read or onlooker is not None
+        self._observer, self._snapshot = observer, snapshot
+        is_shared = self._is_read or observer is not None
         self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)
         self.rows, self.cursors = self._ring.rows, self._ring.cursors
         if not self._is_read:
@@ -385,7 +390,7 @@ class RecordStream:
     @property
     def is_read(self) -> bool:
         """True if there is a reader, so that ``start`` must be called."""
-        return self._is_read or self._onlooker is not None
+        return self._is_read or self._observer is not None
 
     def start(self, metadata: Mapping[str, str], attachments: Sequence[Attachment]) -> None:
         """Starts the recorder's process and waits until the file is open.
@@ -398,14 +403,14 @@ class RecordStream:
                 self._ring, self._path, metadata, attachments, live=self._is_live
             )
             self.recorder.wait_until_ready()
-        if self._onlooker is not None:
-            self._onlooker.start(str(self._ring.name), self._snapshot, metadata, attachments)
+        if self._observer is not None:
+            self._observer.start(str(self._ring.name), self._snapshot, metadata, attachments)
         self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
 
     def tell(self, news: Mapping[str, object]) -> None:
-        """Sends news to the onlooker only; never blocks and never raises."""
-        if self._onlooker is not None:
-            self._onlooker.event(news)
+        """Sends news to the observer only; never blocks and never raises."""
+        if self._observer is not None:
+            self._observer.event(news)
 
     def makes_room(self, *, may_wait: bool) -> bool:
         """Handles a record refused by a full ring.
@@ -437,8 +442,8 @@ class RecordStream:
         if self.recorder is not None:
             self._events.append(payload | {"time_ns": time_ns})
             self.recorder.event(payload, time_ns)
-        if self._onlooker is not None:
-            self._onlooker.event(payload)
+        if self._observer is not None:
+            self._observer.event(payload)
 
     def look(self) -> None:
         """Checks that the recorder lives and its disk has space; takes some microseconds.
@@ -465,8 +470,8 @@ class RecordStream:
             if self.recorder is not None:
                 self._close_recorder(self.recorder)
         finally:
-            if self._onlooker is not None:
-                self._onlooker.close()
+            if self._observer is not None:
+                self._observer.close()
             self._ring.close()
 
     def _close_recorder(self, recorder: Recorder) -> None:

@@ -85,7 +85,7 @@ _GUARD = {
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",
 }
-"""Guard settings on a page, with units; see ``kernel.guarding.GuardParameters``."""
+"""Guard settings on a page, with units; see ``kernel.parameters.GuardParameters``."""
 
 
 def json_object(text: str) -> dict[str, Any]:

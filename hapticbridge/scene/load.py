@@ -92,17 +92,25 @@ class SceneSource:
     concerns: tuple[str, ...] = ()
 
 
-def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float) -> Scene:
-    """Loads an MJCF file, or a shipped scene by name, and adds a handle and a coupling.
+def load_scene(
+    source: str | Path | mujoco.MjSpec, grip: str = "grip", **parameters: float
+) -> Scene:
+    """Loads an MJCF file, a shipped scene or an ``MjSpec``, and adds a handle and a coupling.
 
     The user's own actuators, equality constraints, keyframes and assets are kept. The grip may be
     on a free body, on a body at the end of joints, or on a body with a single slide joint.
 
     Args:
-        path_or_name: An MJCF file, or one of ``scene_names()``.
+        source: An MJCF file, one of ``scene_names()``, or a specification built in memory, which
+            is not modified. A run of a specification computes with its exact numbers. A recording
+            keeps it as MuJoCo writes it: numbers with 6 digits, without comments and includes, and
+            with the assets that are in ``MjSpec.assets`` or in a file. The exact compiled model is
+            in the recording too, so the audit simulates it again bit for bit. A what-if loads the
+            written form.
         grip: Name of the site on the tool.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
-            ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them.
+            ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
+            has none.
 
     Raises:
         SceneError: The scene cannot be read, compiled or put behind a device, a parameter is
@@ -111,7 +119,14 @@ def load_scene(path_or_name: str | Path, grip: str = "grip", **parameters: float
     Warns:
         UserWarning: The run deviates from the file in a detail.
     """
-    return compile_scene(read_scene(path_or_name, **parameters), grip, stacklevel=3)
+    if not isinstance(source, mujoco.MjSpec):
+        return compile_scene(read_scene(source, **parameters), grip, stacklevel=3)
+    if parameters:
+        raise SceneError(
+            f"a specification has no parameters, and {choices(parameters)} cannot be set; change "
+            "the specification itself"
+        )
+    return compile_scene(spec_source(source), grip, stacklevel=3)
 
 
 def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
@@ -135,6 +150,27 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     check_numbers(sources)
     values = apply_parameters(spec, path, parameters)
     return SceneSource(path, spec, sources, values, tuple(concerns))
+
+
+def spec_source(spec: mujoco.MjSpec) -> SceneSource:
+    """Returns a specification as a scene for ``compile_scene``.
+
+    Its path is that of ``MODELNAME.xml`` in ``MjSpec.modelfiledir``; no file needs to exist there.
+
+    Raises:
+        SceneError: MuJoCo cannot write the specification, or it has an incompatible option.
+    """
+    path = Path(spec.modelfiledir) / f"{spec.modelname or 'scene'}.xml"
+    spec = spec.copy()
+    with _refused(path):
+        sources = collect_sources(path, spec.to_xml().encode())
+    known = {source.name for source in sources}
+    held = {
+        name: data.encode() if isinstance(data, str) else data for name, data in spec.assets.items()
+    }
+    sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
+    check_numbers(sources)
+    return SceneSource(path, spec, sources, {}, tuple(check_options(spec)))
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:

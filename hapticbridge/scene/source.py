@@ -62,24 +62,28 @@ class Element:
     line: int
 
 
-def collect_sources(path: Path) -> tuple[SourceFile, ...]:
+def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, ...]:
     """Returns the main file, first, and all existing files that it refers to.
 
     A parameter file beside the main file is included. MuJoCo has read the scene before, so a file
     that is not found here (in a search path of MuJoCo's own) is left out without an error. Written
     into an empty folder under their names, the files compile to an identical model.
+
+    Args:
+        path: The main file.
+        main: Content of the main file if none exists at ``path``; it has no parameter file then.
     """
     found: dict[Path, Path] = {}
-    _find_files(path, found)
+    _find_files(path, found, main)
     parameters = parameters_file(path)
-    if parameters.is_file():
+    if main is None and parameters.is_file():
         found.setdefault(_key(parameters), parameters)
     root = path.absolute().parent
     while not all(file.is_relative_to(root) for file in found) and root != root.parent:
         root = root.parent
     names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in found)
     return tuple(
-        SourceFile(name.as_posix(), file.read_bytes())
+        SourceFile(name.as_posix(), main if main and file is path else file.read_bytes())
         for name, file in zip(names, found.values(), strict=True)
     )
 
@@ -98,12 +102,12 @@ def read_elements(data: bytes) -> Iterator[Element]:
         yield Element(match[1], attributes, line)
 
 
-def _find_files(path: Path, found: dict[Path, Path]) -> None:
+def _find_files(path: Path, found: dict[Path, Path], content: bytes | None = None) -> None:
     """Adds a model's file, its includes, its assets and the models that it attaches."""
     if _key(path) in found:
         return
     found[_key(path)] = path
-    elements = list(_expanded(path, path.parent, {path}))
+    elements = list(_expanded(path, path.parent, {path}, content))
     folders = _asset_folders([element for element, _ in elements])
     for element, namer in elements:
         for attribute in _FILE_ATTRIBUTES:
@@ -131,9 +135,11 @@ def _key(path: Path) -> Path:
     return Path(*parts)
 
 
-def _expanded(path: Path, folder: Path, seen: set[Path]) -> Iterator[tuple[Element, Path]]:
+def _expanded(
+    path: Path, folder: Path, seen: set[Path], content: bytes | None = None
+) -> Iterator[tuple[Element, Path]]:
     """Yields the elements of an MJCF file and of its includes, each with its own file."""
-    for element in read_elements(path.read_bytes()):
+    for element in read_elements(content or path.read_bytes()):
         yield element, path
         if element.tag == "include" and "file" in element.attributes:
             included = _existing(_beside(element.attributes["file"], (folder, path.parent)))

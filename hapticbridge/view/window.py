@@ -26,9 +26,6 @@ from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
 
-BY = "view"
-"""Source of the page's commands in the recording."""
-
 HOST = "127.0.0.1"
 """Address on which pages are served. Other machines reach it through an SSH tunnel alone."""
 

@@ -26,6 +26,7 @@ from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import trip_reason
 from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
+from hapticbridge.options import Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.settings import GAINS, Settings
@@ -339,10 +340,12 @@ class Repetition:
             contact_stiffness=settings.contact_stiffness,
             recording=path,
             clock=clock,
-            scale=settings.scale,
-            force_scale=settings.force_scale,
-            axes=np.array(run.parameters.axes),
-            absolute=run.is_absolute,
+            workspace=Workspace(
+                scale=settings.scale,
+                force_scale=settings.force_scale,
+                axes=run.parameters.axes,
+                absolute=run.is_absolute,
+            ),
             limits=run.limits,
             controller=settings.controller,
             clutch=run.clutch,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,12 @@ import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast, sway
 
-from faults.catalogue import FAULTS, PUSHED, RING_FULL, Fault
-from faults.rig import CAUSE, Outcome, Rig
+from faults.catalogue import FAULTS, PUSHED, RING_FULL, Fault, passing
+from faults.rig import CAUSE, PERIOD, PRESS, Outcome, Rig
 from hapticbridge.audit import audit
-from hapticbridge.guard import USUAL_ENERGY
+from hapticbridge.bridge import Bridge
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.guard import USUAL_ENERGY, Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 
@@ -96,11 +100,11 @@ def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None
     generator = np.random.default_rng(11)
     device = ScriptedDevice(sway)
     signals = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-    ticks = []
+    ticks: list[int] = []
     with fast("point_mass", device, recording=tmp_path / "run.mcap") as bridge:
-        for count in range(50):
+        for count in range(24):
             number = signals[count % 3]
-            begun, wanted = bridge._tick, int(generator.integers(1, 40))
+            begun, wanted = ticks[-1] if ticks else 0, int(generator.integers(1, 40))
             writes = len(device.writes)
 
             def act(k: int, at: int = begun + wanted, number: int = number) -> None:
@@ -116,7 +120,7 @@ def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None
     recording = read_recording(tmp_path / "run.mcap")
     ends = [event for event in recording.events if event["event"] in ("resume", "stop")]
     assert [event["tick"] for event in ends] == ticks
-    assert [event["signal"] for event in ends] == [signals[k % 3].name for k in range(50)]
+    assert [event["signal"] for event in ends] == [signals[k % 3].name for k in range(24)]
     assert recording.ticks["tick"].tolist() == list(range(ticks[-1]))
     assert audit(tmp_path / "run.mcap").verdict == "passive"
 
@@ -157,3 +161,60 @@ def test_a_killed_recorders_last_records_are_written_by_the_bridge(tmp_path: Pat
     assert "recorder_died" in outcome.events
     assert not list(tmp_path.glob("*.salvaged"))
     assert audit(tmp_path / "run.mcap").verdict == "passive"
+
+
+START = CAUSE * PERIOD
+
+AWAY = ((*PRESS[:3], (START - 0.1, 0.0804), (START + 0.4, -0.0696), (9.0, -0.0696))), 0.2
+"""A hand that had pressed on the wall takes itself away at 0.3 m/s; a stall of 0.2 s."""
+
+INTO = (
+    ((0.0, 0.0), (START - 0.1, 0.005), (START + 0.08, 0.023), (START + 0.31, 0.0), (9.0, 0.0)),
+    0.06,
+)
+"""A hand goes into the wall at 0.1 m/s during a stall of 60 ms, and back again."""
+
+Case = tuple[tuple[tuple[float, float], ...], float]
+
+
+def given(folder: Path, case: Case, *, is_guarded: bool) -> tuple[float, float, bool]:
+    """Returns what the hand was given in the stall, what after it, in J, and whether it tripped."""
+    rig, has_tripped = Rig(folder), False
+    rig.points, stall = case
+    rig.device.corrupt = passing(rig, CAUSE, stall)
+    limits = Limits(force=10.0, torque=0.5, ramp=0.2)
+    bridge = Bridge("virtual_wall", rig.device, clock=rig.clock, limits=limits)
+    if not is_guarded:
+        guard = replace(bridge.setup.guard, longest_stall=math.inf, energy=math.inf)
+        bridge.setup = replace(bridge.setup, guard=guard)
+    with bridge:
+        try:
+            bridge.run(START + 0.4)
+        except SafetyTrip:
+            has_tripped = True
+    energy = rig.device.to_the_hand
+    begin, end = CAUSE + 1, CAUSE + 1 + round(stall / PERIOD)
+    return energy[end] - energy[begin], max(energy[end:]) - energy[end], has_tripped
+
+
+def test_a_hand_that_leaves_in_a_stall_is_given_all_of_it_before_the_loop_wakes(
+    tmp_path: Path,
+) -> None:
+    during, after, has_tripped = given(tmp_path, AWAY, is_guarded=True)
+    assert during > 3 * USUAL_ENERGY  # 4 N held over 40 mm: only the device could end it
+    assert after == pytest.approx(0.0, abs=1e-6)
+    assert has_tripped
+    same, more, _ = given(tmp_path, AWAY, is_guarded=False)
+    assert same == during
+    assert more > 0.01
+
+
+def test_a_hand_that_enters_a_wall_in_a_stall_is_not_given_what_it_never_put_in(
+    tmp_path: Path,
+) -> None:
+    during, after, has_tripped = given(tmp_path, INTO, is_guarded=True)
+    assert during < 0.0
+    assert after < 2e-3  # of its own: it goes on by a millimetre, and comes back
+    assert not has_tripped
+    _, more, _ = given(tmp_path, INTO, is_guarded=False)
+    assert more > 0.03

@@ -35,12 +35,13 @@ from hapticbridge.lab.chart.workload import (
     score_of,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import run_parameters
+from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import (
     IMPLICIT,
     Method,
     prepare,
+    resolve_contact_stiffness,
 )
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Ledger
@@ -144,7 +145,7 @@ class Stage:
         """
         scene, period, method = self._scene, setting.period, setting.method
         self._shipped.apply(scene, setting)
-        felt = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
+        effective = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
         # an error inside the C symbol would end the process, so the first step is Python's
         mujoco.mj_step(scene.model, scene.data)
         scene.reset()
@@ -152,10 +153,15 @@ class Stage:
             start(scene)
         first = np.zeros(1, SAMPLE_DTYPE)
         first["quaternion"][0, 0] = 1.0
-        parameters = run_parameters(
-            scene, self.coupling, method, first, period=period, felt=felt, substeps=setting.substeps
+        setup = RunSetup(
+            scene=scene,
+            coupling=self.coupling,
+            method=method,
+            period=period,
+            substeps=setting.substeps,
+            contact_stiffness=resolve_contact_stiffness(method, self.coupling, None),
         )
-        return BoundKernel(scene.model, scene.data, parameters)
+        return BoundKernel(scene.model, scene.data, setup.parameters(first, effective))
 
     def _take(
         self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int

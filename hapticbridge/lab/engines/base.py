@@ -375,7 +375,7 @@ class Engine(Protocol):
 
 _PACKAGE = "hapticbridge.lab.engines"
 
-_MODULES = {
+ENGINES = {
     "mujoco": "mujoco",
     "ode": "ode",
     "ode_spring": "ode",
@@ -402,16 +402,11 @@ class Engines(NamedTuple):
     missing: Mapping[str, str]
 
 
-def engine_names() -> tuple[str, ...]:
-    """Returns the names of all engines, installed or not."""
-    return tuple(_MODULES)
-
-
 def available_engines() -> Engines:
     """Imports every engine and says which are there."""
     available: dict[str, Engine] = {}
     missing: dict[str, str] = {}
-    for name in _MODULES:
+    for name in ENGINES:
         try:
             available[name] = open_engine(name)
         except StudyError as error:
@@ -425,10 +420,10 @@ def open_engine(name: str) -> Engine:
     Raises:
         StudyError: There is none of that name, or its library is not installed; says how to get it.
     """
-    if name not in _MODULES:
-        raise StudyError(f"no engine '{name}'; engines: {choices(_MODULES)}")
+    if name not in ENGINES:
+        raise StudyError(f"no engine '{name}'; engines: {choices(ENGINES)}")
     try:
-        module = import_module(f"{_PACKAGE}.{_MODULES[name]}")
+        module = import_module(f"{_PACKAGE}.{ENGINES[name]}")
     except ImportError as error:
         # what a library needs of the system (as libGL) may be missing where it is installed
         raise StudyError(

@@ -18,29 +18,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.lab.maps import base
+from hapticbridge.lab.maps import base, contact_rigs
 from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
-from hapticbridge.lab.maps.contact_rigs import (
-    PEG_ROTATION,
-    PERIOD,
-    SHIPPED,
-    SHIPPED_SOLIMP,
-    TREATMENTS,
-    ContactRun,
-    Treatment,
-    deepest,
-    firm_device,
-    peg_runs,
-    random_push,
-    random_taps,
-    recorded,
-    run_once,
-    set_mass,
-    summary,
-    ticks_of,
-    until_active,
-    wall_runs,
-)
+from hapticbridge.lab.maps.contact_rigs import PERIOD, TREATMENTS, ContactRun, Treatment, peg_runs
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene.contacts import (
@@ -81,7 +61,7 @@ def agreement(table: Table) -> dict[str, Any]:
     """Counts, on the peg's grid, what the rule says against what was measured."""
     mine = table.select(table["rig"] == "peg")
     numbers = [
-        contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD)
+        contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD)
         for s, d in zip(mine["steps"], mine["dampratio"], strict=True)
     ]
     measured = verdicts(mine)
@@ -145,25 +125,30 @@ def search(name: str, mass: float) -> dict[str, float | int]:
     """Runs a peg of a mass in kg in one treatment, by K, friction and hand."""
     cases = list(itertools.product([mass], FRICTION, SEARCH_HANDS))
     treatment = TREATMENTS[name]
-    return summary([run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)])
+    return contact_rigs.summary(
+        [run for k in SEARCH_STIFFNESS for run in peg_runs(treatment, k, cases)]
+    )
+
+
+def totals(mine: Table) -> dict[str, Any]:
+    """Adds up runs by verdict; takes the largest of what else was measured, and median depth."""
+    counts = ("runs", "strict", "within_slack", "active")
+    worst = ("created", "slack_share", "peak_force", "largest_depth")
+    return {
+        **{name: int(mine[name].sum()) for name in counts},
+        **{name: float(mine[name].max()) for name in worst},
+        "median_depth": float(np.median(mine["median_depth"])),
+    }
 
 
 def searched(table: Table, name: str) -> dict[str, Any]:
-    """Returns what one treatment came to in a table of the map, over all tools."""
-    mine = table.select(table["treatment"] == name)
+    """Returns the totals of one treatment over all tools."""
     treatment = TREATMENTS[name]
     return {
         "treatment": name,
         "relaxation": treatment.relaxation,
         "static_depth": treatment.static_depth,
-        "runs": int(mine["runs"].sum()),
-        "strict": int(mine["strict"].sum()),
-        "within_slack": int(mine["within_slack"].sum()),
-        "active": int(mine["active"].sum()),
-        "created": float(mine["created"].max()),
-        "slack_share": float(mine["slack_share"].max()),
-        "median_depth": float(np.median(mine["median_depth"])),
-        "largest_depth": float(mine["largest_depth"].max()),
+        **totals(table.select(table["treatment"] == name)),
     }
 
 
@@ -200,7 +185,7 @@ def cases_of(rig: str, mass: float) -> list[Case]:
 
 def compared(rig: str, method: str, mass: float) -> dict[str, float | int]:
     """Runs a tool of a mass in kg on a rig by a method, by K, friction and hand."""
-    return summary(list(method_runs(rig, method, cases_of(rig, mass))))
+    return contact_rigs.summary(list(method_runs(rig, method, cases_of(rig, mass))))
 
 
 def method_runs(
@@ -217,7 +202,10 @@ def method_runs(
     """
     treatment = Treatment(method=method)
     for stiffness, mass, friction, hand in cases:
-        damping, turning = FELT_DAMPING * stiffness * PERIOD, PEG_ROTATION[0] * stiffness
+        damping, turning = (
+            FELT_DAMPING * stiffness * PERIOD,
+            contact_rigs.PEG_ROTATION[0] * stiffness,
+        )
         felt = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
         coupling = felt
         if same_law:
@@ -225,15 +213,19 @@ def method_runs(
             coupling = METHODS[method].rendered(law, PERIOD)
         if rig == "taps":
             loop = base.loop_in("virtual_wall", "contact")
-            path, holder = random_taps(hand)
+            path, holder = contact_rigs.random_taps(hand)
         else:
             loop = base.loop_in("peg_in_hole", "mouth", _start_at_mouth)
-            path, holder = recorded() if hand == 0 else random_push(hand)
+            path, holder = contact_rigs.recorded() if hand == 0 else contact_rigs.random_push(hand)
         treatment.apply(loop.scene.model, friction)
-        set_mass(loop, "tool" if rig == "taps" else "peg", mass)
-        device = firm_device(felt, path, holder)
-        records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
-        yield replace(run, depth=deepest(loop, records) if rig == "mouth" else _behind(records))
+        contact_rigs.set_mass(loop, "tool" if rig == "taps" else "peg", mass)
+        device = contact_rigs.firm_device(felt, path, holder)
+        records, run = contact_rigs.run_once(
+            loop, device, coupling, treatment, contact_rigs.ticks_of(device)
+        )
+        yield replace(
+            run, depth=contact_rigs.deepest(loop, records) if rig == "mouth" else _behind(records)
+        )
 
 
 def _start_at_mouth(model: mujoco.MjModel) -> None:
@@ -246,22 +238,12 @@ def _behind(records: NDArray[np.void]) -> float:
 
 
 def methods_found(table: Table) -> list[dict[str, Any]]:
-    """Returns what each method came to on each rig in a table of the map, over all tools."""
+    """Returns the totals of each method on each rig over all tools."""
     found = []
     for rig, method in itertools.product(RIGS, COMPARED):
         mine = table.select((table["rig"] == rig) & (table["method"] == method))
         if len(mine):
-            counts = ("runs", "strict", "within_slack", "active")
-            worst = ("created", "slack_share", "peak_force", "largest_depth")
-            found.append(
-                {
-                    "rig": rig,
-                    "method": method,
-                    **{name: int(mine[name].sum()) for name in counts},
-                    **{name: float(mine[name].max()) for name in worst},
-                    "median_depth": float(np.median(mine["median_depth"])),
-                }
-            )
+            found.append({"rig": rig, "method": method, **totals(mine)})
     return found
 
 
@@ -364,7 +346,8 @@ def _rule() -> tuple[Array, Array, list[Array]]:
     """
     steps, ratio = (np.geomspace(*ends, CONTOUR) for ends in (STEPS, DAMPING_RATIO))
     numbers = [
-        [contact_numbers((s * PERIOD, d), SHIPPED_SOLIMP, PERIOD) for s in steps] for d in ratio
+        [contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD) for s in steps]
+        for d in ratio
     ]
     regions = [
         np.array([[is_in(name, one) for one in row] for row in numbers], dtype=np.float64)
@@ -408,8 +391,10 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
         return compared(str(point["rig"]), str(point["method"]), float(point["mass"]))
     solref = float(point["steps"]) * PERIOD, float(point["dampratio"])
     treatment = Treatment(solref, method=str(point["method"]))
-    runs = wall_runs if point["rig"] == "wall" else peg_runs
-    return summary(until_active(runs(treatment, float(point["stiffness"]))))
+    runs = contact_rigs.wall_runs if point["rig"] == "wall" else peg_runs
+    return contact_rigs.summary(
+        contact_rigs.until_active(runs(treatment, float(point["stiffness"])))
+    )
 
 
 def summarize(table: Table) -> dict[str, Any]:
@@ -453,7 +438,7 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     yield (
         "The setting as shipped is strict in {strict} of {runs} runs and uses up to "
         "{slack_share:.2f} of the slack",
-        next((one for one in search if one["treatment"] == SHIPPED), {}),
+        next((one for one in search if one["treatment"] == contact_rigs.SHIPPED), {}),
     )
     for one in boundary["methods"]:
         yield (

@@ -574,7 +574,6 @@ def tustin() -> Section:
     )
 
 
-HAND_COUPLING = Coupling(1000.0, 2.0, 0.0, 0.0)
 PERIODS = (5e-4, 1e-3, 2e-3)
 DELAYS = (0, 1)
 FILTER_TIMES = (0.0, 2e-3)
@@ -585,9 +584,9 @@ TICKS = 3000
 
 
 def _in_mujoco(share: float) -> NDArray[np.float64]:
-    bound = HAND_COUPLING.stiffness * PERIOD / 2 + HAND_COUPLING.damping
+    bound = COUPLING.stiffness * PERIOD / 2 + COUPLING.damping
     hand = WorstHand(share * bound, np.pi / PERIOD, PERIOD)
-    return hold(ImplicitMass(HAND_COUPLING, PERIOD, HEAVY).force, hand, TICKS)
+    return hold(ImplicitMass(COUPLING, PERIOD, HEAVY).force, hand, TICKS)
 
 
 def worst_hand_section() -> Section:
@@ -602,7 +601,7 @@ def worst_hand_section() -> Section:
     device's damper alone is the worst hand.
     """
     figure, (delayed, simulated) = panels(1, height=4.0, columns=2)
-    loop = SampledLoop(HAND_COUPLING, PERIOD, delay=1)
+    loop = SampledLoop(COUPLING, PERIOD, delay=1)
     frequency = loop.worst_frequency()
     response = complex(loop.response(frequency))
     bound = float(loop.damping_spectrum(frequency))
@@ -617,10 +616,8 @@ def worst_hand_section() -> Section:
 
     checks = []
     for period, delay, filter_time in product(PERIODS, DELAYS, FILTER_TIMES):
-        case = SampledLoop(HAND_COUPLING, period, delay=delay, filter_time=filter_time)
-        expected = float(
-            minimum_damping(HAND_COUPLING, period, delay=delay, filter_time=filter_time)
-        )
+        case = SampledLoop(COUPLING, period, delay=delay, filter_time=filter_time)
+        expected = float(minimum_damping(COUPLING, period, delay=delay, filter_time=filter_time))
         checks.append(
             Check(
                 equation="worst hand",

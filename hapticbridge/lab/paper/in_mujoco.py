@@ -13,7 +13,7 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.options import run_parameters
+from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import IMPLICIT, prepare
 from hapticbridge.scene import load_scene
@@ -64,10 +64,9 @@ class ImplicitMass:
         prepare(scene, coupling, period, 1)
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"][:, 0] = 1.0
-        parameters = run_parameters(
-            scene, coupling, IMPLICIT, self._sample, period=period, felt=None
-        )
+        setup = RunSetup(scene=scene, coupling=coupling, method=IMPLICIT, period=period)
         self._scene, self._period = scene, period
+        parameters = setup.parameters(self._sample, None)
         self._binding = BoundKernel(scene.model, scene.data, parameters)
 
     def tick(self, handle: float) -> NDArray[np.void]:

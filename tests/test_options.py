@@ -1,0 +1,110 @@
+"""Options of a bridge, and the setup that they resolve to without any device being started."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from typing import Any
+
+import pytest
+
+from hapticbridge.cli.run import Run
+from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import AXES, DeviceInfo
+from hapticbridge.errors import CouplingError, HapticBridgeError
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.parameters import ENVIRONMENT
+from hapticbridge.options import BridgeOptions, OptionChanges, RunSetup, Workspace
+from hapticbridge.scene import Scene, load_scene
+
+REAL = DeviceInfo(
+    name="arm", axes=AXES, force_limit=10.0, mass=0.1, damping=2.0, rotational_damping=2e-3
+)
+SIMULATED = DeviceInfo(name="model", axes=AXES, force_limit=10.0, damping=2.0, is_real=False)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene("point_mass")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rate": 0.5}, "rate is 0.5 Hz; it must be 1 to 1e+06"),
+        ({"substeps": 0}, "substeps"),
+        ({"substeps": 2, "method": "lossless"}, "so it must be 1"),
+        ({"method": "magic"}, "no method is called 'magic'; methods: "),
+        ({"controller": "magic"}, "choices: 'damper', 'environment', 'off'"),
+        ({"clutch": -1}, "clutch button is -1; it must be 0 to 31"),
+        ({"dead_man": 99}, "dead-man button is 99"),
+        ({"mark": True}, "mark button is True"),
+        ({"clutch": 1, "dead_man": 1}, "both button 1; they exclude each other"),
+    ],
+)
+def test_an_impossible_option_is_refused_when_it_is_made(
+    values: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(HapticBridgeError, match=re.escape(message)):
+        BridgeOptions(**values)
+
+
+@pytest.mark.parametrize(
+    ("info", "options", "clock", "message"),
+    [
+        (REAL, BridgeOptions(), SimulatedClock(), "moves in real time"),
+        (REAL, BridgeOptions(method="explicit"), RealClock(), "on a real device"),
+        (SIMULATED, BridgeOptions(mark=0), RealClock(), "button 0 is to mark"),
+        (SIMULATED, BridgeOptions(realtime=True), SimulatedClock(), "exclude each other"),
+        (
+            SIMULATED,
+            BridgeOptions(limits=Limits(force=11.0, torque=0.1)),
+            RealClock(),
+            "force limit is 11 N; the device 'model' bears 10 N",
+        ),
+        (SIMULATED, BridgeOptions(contact_stiffness=1e3), RealClock(), "only 'direct' takes it"),
+    ],
+)
+def test_what_device_clock_and_options_cannot_do_together_is_refused(
+    scene: Scene, info: DeviceInfo, options: BridgeOptions, clock: RealClock, message: str
+) -> None:
+    with pytest.raises(HapticBridgeError, match=re.escape(message)):
+        RunSetup.resolve(scene, info, None, options, clock, is_recorded=False)
+
+
+def test_a_setup_holds_the_choices_that_were_left_open(scene: Scene) -> None:
+    setup = RunSetup.resolve(scene, REAL, None, BridgeOptions(), RealClock())
+    assert (setup.method.name, setup.period) == ("lossless", 1e-3)
+    assert setup.coupling.stiffness == pytest.approx(2400.0)  # 80 % of 2 (b - b/4) / T
+    assert setup.law.damping == pytest.approx(0.5)
+    assert setup.attainable == setup.coupling
+    assert (setup.limits.force, setup.guard.controller) == (10.0, ENVIRONMENT)
+    assert (setup.is_realtime, setup.is_pipelined) == (True, True)
+    simulated = RunSetup.resolve(scene, SIMULATED, None, BridgeOptions(), SimulatedClock())
+    assert (simulated.is_realtime, simulated.is_pipelined) == (False, False)
+
+
+def test_the_force_scale_is_by_default_that_of_the_motion() -> None:
+    assert Workspace(scale=2.0).scales == (2.0, 2.0)
+    assert Workspace(scale=2.0, force_scale=0.5).scales == (2.0, 0.5)
+    assert Workspace(axes=[[0, -1, 0], [1, 0, 0], [0, 0, 1]]).rotation[:3] == (0.0, -1.0, 0.0)
+
+
+def test_keywords_of_a_bridge_are_the_fields_of_its_options() -> None:
+    assert list(OptionChanges.__annotations__) == [field.name for field in fields(BridgeOptions)]
+
+
+def test_flags_of_the_command_have_the_names_of_the_options() -> None:
+    options = {field.name for field in (*fields(BridgeOptions), *fields(Workspace))}
+    flags = {field.name for field in fields(Run)}
+    # a limit's flag says what it limits; the status line and the pipeline follow the terminal
+    assert options - flags == {"workspace", "limits", "pipelined", "live"}
+
+
+def test_a_coupling_without_rotational_gains_is_one_around_the_grip() -> None:
+    assert Coupling(2400.0, 0.5) == Coupling(2400.0, 0.5, 2.4, 5e-4)
+    assert Coupling(2400.0, 0.5, 0.0, 0.0).rotational_stiffness == 0.0
+    for missing in (None, float("nan")):
+        with pytest.raises(CouplingError, match="must be a finite number"):
+            Coupling(2400.0, 0.5, missing, 0.0)  # type: ignore[arg-type] # on purpose
