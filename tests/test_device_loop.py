@@ -144,12 +144,13 @@ def rows(recording: Path) -> NDArray[np.void]:
 def test_the_peg_goes_in_behind_it_and_is_audited_passive(name: str, tmp_path: Path) -> None:
     make, condition = RIGS[name]
     rig, recording = make(), tmp_path / "run.mcap"
-    summary = rig.run(recording, 4.0)
+    seconds = 2.5 if name == "falcon" else 4.0  # emulated bit by bit, it is the slowest
+    summary = rig.run(recording, seconds)
     report, ticks = hb.audit(recording), rows(recording)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.certified is None
     assert condition in report.conditions[0]
-    assert summary.ticks == len(ticks) == 4000
+    assert summary.ticks == len(ticks) == 1000 * seconds
     assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
     assert summary.peak_force > 0.05
     assert name not in {"haply", "omega.3", "sigma.7"} or ticks["tool_position"][-1, 2] < 0.0
