@@ -130,7 +130,6 @@ def test_about_an_axis_too(tmp_path: Path) -> None:
 def test_a_coupling_that_is_changed_meanwhile_counts_as_it_is(tmp_path: Path) -> None:
     def act(bridge: Bridge, tick: int) -> None:
         if tick == 100:
-            bridge._commands._last = -math.inf
             bridge.command(Couple(1000.0, 0.9))
 
     recording, *_ = run(tmp_path, pressed(9.0 / K), energy=math.inf, act=act)
