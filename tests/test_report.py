@@ -1,4 +1,4 @@
-"""The page of a run: its verdict and cause, its size, and how a browser takes it."""
+"""The report of a run: its page, and why a run became active."""
 
 from __future__ import annotations
 
