@@ -1,4 +1,4 @@
-"""The lossless coupling: second order and balanced in free space, implicit in contact."""
+"""The lossless coupling: balanced in free space, beside other forces, and where it changes over."""
 
 from __future__ import annotations
 

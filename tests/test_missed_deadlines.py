@@ -1,4 +1,9 @@
-"""A run of S seconds lasts S seconds of its clock, whatever was missed on the way."""
+"""Missed deadlines: how long a run lasts, what its device bears, and the one clock of all pictures.
+
+A device is pushed into a spring and comes out again in equal steps δ. The force that is held from
+one sample to the next gives it ½Kδ² a step more than the spring's energy, and its damper burns
+bδ²/t in the time t of a step: it is kicked where K/2 > b/t, the bound b > Kt/2 with the true t.
+"""
 
 from __future__ import annotations
 

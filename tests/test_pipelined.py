@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from audit_cases import TAP, ScriptedDevice
 from bridge_runs import REST, fast, sway
+from kernel_runs import FREE_BALL, at_rest
+from kernel_runs import fast as fast_run
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SafetyTrip
@@ -200,22 +202,22 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 
 
 def test_what_mujoco_cannot_split_or_would_reset_is_a_whole_step() -> None:
-    with fast("point_mass", method="implicit") as bridge:
-        model, data = bridge.scene.model, bridge.scene.data
-        state = bridge.session.kernel.bound.state[0]
-        assert [
-            can_split(model, scheme) for scheme in (Scheme.IMPLICIT, Scheme.WELD, Scheme.MASSLESS)
-        ] == [True] + 2 * [False]
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-        assert not can_split(model, Scheme.IMPLICIT)
-        for value in (1e10, -1e11, np.inf, np.nan):
-            for numbers in (data.qvel, data.qpos):
-                assert is_sound(state)
-                numbers[1], before = value, numbers[1]
-                assert not is_sound(state)
-                numbers[1] = before
-        data.qvel[1] = 0.99e10
-        assert is_sound(state)
+    rig = fast_run(FREE_BALL, at_rest(1))
+    model, data, state = rig.scene.model, rig.scene.data, rig.binding.state[0]
+    splits = [
+        can_split(model, scheme) for scheme in (Scheme.IMPLICIT, Scheme.WELD, Scheme.MASSLESS)
+    ]
+    assert splits == [True, False, False]
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    assert not can_split(model, Scheme.IMPLICIT)
+    for value in (1e10, -1e11, np.inf, np.nan):
+        for numbers in (data.qvel, data.qpos):
+            assert is_sound(state)
+            before, numbers[1] = numbers[1], value
+            assert not is_sound(state)
+            numbers[1] = before
+    data.qvel[1] = 0.99e10
+    assert is_sound(state)
 
 
 def test_a_control_callback_is_called_once_a_tick(calls: list[str]) -> None:

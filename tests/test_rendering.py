@@ -1,4 +1,4 @@
-"""Every method goes through one interface, one record and one audit."""
+"""Rendering methods: one interface, what each creates, what each needs, and what each refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a run: its verdict and cause, its size, and how a browser takes it."""
+"""The report of a run: its page, and why a run became active."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     run_file: Path, made: Made, tmp_path: Path
 ) -> None:
     passive, page = audit(run_file), tmp_path / "page.html"
-    told = {
+    sentences = {
         True: "The device bears this coupling, in any hand.",
         False: "The device does not bear this coupling",
         None: "It is not known if the device bears this coupling in any hand.",
     }
-    for certified, words in told.items():
+    for certified, words in sentences.items():
         judged = replace(passive, certified=certified)
         assert words in notes(judged)[-1]
         assert is_warned(judged) is (certified is False)

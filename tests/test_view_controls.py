@@ -130,8 +130,8 @@ def test_nothing_that_is_sent_by_hand_exceeds_a_limit(tmp_path: Path) -> None:
         until(lambda: stiffness(bridge) == pytest.approx(1500.0))
         page.send(KR, value=1e3)
         assert "needs a device of 0.5 N m s/rad, and this one has 0.002" in said(page, "0.5 N m")
-        for value in (float("nan"), -1.0, None, [1.0], "x"):
-            page.send(BR, value=value)
+        for turning in (float("nan"), -1.0, None, [1.0], "x"):
+            page.send(BR, value=turning)
         time.sleep(0.3)
         page.send(KR, value=3.0)
         coupling = bridge.session.kernel.bound.state["coupling"]

@@ -114,11 +114,12 @@ def commanded(bridge: Bridge, tick: int) -> None:
         150: Reset(),
     }
     if tick in asked:
-        bridge.session.commands.now = lambda: float(tick)  # a second per tick
         bridge.command(asked[tick])
 
 
-def test_commands_are_done_again(tmp_path: Path) -> None:
+def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("INTERVAL", "RESET_INTERVAL"):  # no time passes between them
+        monkeypatch.setattr(f"hapticbridge.commands.execution.{name}", 0.0)
     path, motion = tmp_path / "run.mcap", tmp_path / "tap.csv"
     motion.write_text(TAP)
     device = f"simulated:path={motion}"

@@ -177,6 +177,11 @@ INTO = (
 Case = tuple[tuple[tuple[float, float], ...], float]
 
 
+# While a machine stands still nothing in this program can act; the device holds its last force. So
+# the claim is about what comes after: with the guard nothing is added, without it energy that no
+# hand had put in.
+
+
 def given(folder: Path, case: Case, *, is_guarded: bool) -> tuple[float, float, bool]:
     """Returns what the hand was given in the stall, what after it, in J, and whether it tripped."""
     rig, has_tripped = Rig(folder), False
