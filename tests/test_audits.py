@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import json
-import os
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from shutil import copyfile
@@ -21,7 +19,6 @@ from sweep_runs import is_same
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.batch import (
     audit_all,
-    audit_point,
     check_table_name,
     find_recordings,
     reports_of,
@@ -33,7 +30,6 @@ from hapticbridge.recording import read_recording
 
 # their packages hold functions of these names
 batch = importlib.import_module("hapticbridge.audit.batch")
-sweep = importlib.import_module("hapticbridge.sweep.sweep")
 WEAK = Coupling(stiffness=1000, damping=0.9, rotational_stiffness=1, rotational_damping=9e-4)
 STIFF = Coupling(stiffness=6000, damping=0.5, rotational_stiffness=1, rotational_damping=9e-4)
 
@@ -106,25 +102,6 @@ def test_links_lead_to_files_and_in_no_circle(runs: Path, tmp_path: Path) -> Non
     assert "gone.mcap: No such file" in table.texts("reason")[0]
 
 
-def test_a_folder_that_cannot_be_read_is_named(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    copyfile(runs / "stiff.mcap", tmp_path / "a.mcap")
-    (tmp_path / "locked").mkdir()
-    found, walk, access = find_recordings([tmp_path]), os.walk, os.access
-
-    def refused(folder: Path, onerror: Callable[[OSError], None]) -> Iterator[Any]:
-        yield from walk(folder)
-        onerror(PermissionError(13, "Permission denied", str(tmp_path / "locked")))
-
-    monkeypatch.setattr(os, "walk", refused)
-    monkeypatch.setattr(os, "access", lambda p, mode: "locked" not in str(p) and access(p, mode))
-    assert find_recordings([tmp_path]) == [*found, tmp_path / "locked"]
-    table = audit_all(find_recordings([tmp_path]), jobs=1)
-    assert "locked: it is a folder that cannot be read" in table.texts("reason")[0]
-    assert worst_exit_code(table) == 2
-
-
 def test_the_margin_is_the_least_share_left() -> None:
     report = AuditReport(Path("a"), "passive", "within slack", True, "", slack_share=0.25)
     assert report.margin == 0.75
@@ -142,17 +119,6 @@ def test_the_margin_is_the_least_share_left() -> None:
 
 def vars_of(report: AuditReport) -> dict[str, Any]:
     return {name: getattr(report, name) for name in AuditReport.__dataclass_fields__}
-
-
-def test_the_words_of_a_verdict_name_no_more_than_it_says() -> None:
-    for verdict, environment, port, words in (
-        ("passive", "within slack", "", "passive (within slack)"),
-        ("active", "active", "environment", "active (environment)"),
-        ("active", "strict", "device", "active (device)"),  # strict is what the other port was
-        ("invalid", None, "tool_position", "invalid"),
-    ):
-        values: dict[str, Any] = {"verdict": verdict, "environment": environment, "port": port}
-        assert AuditReport(Path("a"), certified=None, reason="", **values).words == words
 
 
 def test_the_damping_margin_is_that_of_the_condition(runs: Path) -> None:
@@ -185,29 +151,6 @@ def test_any_executor_gives_the_same_table(runs: Path) -> None:
         assert is_same(audit_all(files, executor=pool), audit_all(files, jobs=1))
 
 
-def test_jobs_are_processes_at_most(monkeypatch: pytest.MonkeyPatch, runs: Path) -> None:
-    counts = []
-
-    class Counting:
-        def __init__(self, count: int) -> None:
-            counts.append(count)
-            raise OSError("no processes in this test")
-
-    monkeypatch.setattr(sweep, "_Processes", Counting)
-    monkeypatch.setattr(sweep, "cores", lambda: 64)
-    files = find_recordings([runs])
-    for jobs, expected in ((3, 3), (50, len(files))):
-        with pytest.raises(OSError, match="no processes"):
-            audit_all(files, jobs=jobs)
-        assert counts.pop() == expected
-    assert len(audit_all(files, jobs=None)) == len(files)  # few: in this process
-    assert not counts
-    wrong: Any
-    for wrong in (0, -1, 1.5):
-        with pytest.raises(StudyError, match="jobs is"):
-            audit_all(files, jobs=wrong)
-
-
 def test_a_worker_that_fails_is_a_row_and_no_end(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -221,19 +164,6 @@ def test_a_worker_that_fails_is_a_row_and_no_end(
     assert list(table.texts("verdict")) == ["unreadable", "passive"]
     assert "too large" in table.texts("reason")[0]
     assert worst_exit_code(table) == 2
-
-
-def test_strict_reaches_every_recording(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    def judged(path: str, *, strict: bool) -> AuditReport:
-        seen.append(strict)
-        return audit(path, strict=strict)
-
-    monkeypatch.setattr(batch, "audit", judged)
-    for strict in (True, False):
-        audit_point({"file": str(runs / "stiff.mcap")}, strict=strict)
-    assert seen == [True, False]
 
 
 def test_the_command_prints_a_line_each_and_the_worst_exit_code(
@@ -284,29 +214,6 @@ def test_ctrl_c_leaves_the_table_of_what_was_judged(
     # before anything was judged there is nothing to tell
     code, out, err = call("audit", runs / "stiff.mcap", runs / "cut.mcap", "--jobs", 1)
     assert (code, out, err.strip()) == (130, "", "interrupted")
-
-
-@pytest.mark.parametrize("ending", ["parquet", "json"])
-def test_tables_are_written_as_parquet_and_json(
-    ending: str, runs: Path, call: Called, tmp_path: Path
-) -> None:
-    target = tmp_path / f"all.{ending}"
-    files = [tmp_path / f"{n}.mcap" for n in range(2)]
-    for file in files:
-        copyfile(runs / "stiff.mcap", file)
-    assert call("audit", *files, "--table", target)[0] == 1
-    if ending == "json":
-        rows = json.loads(target.read_text())
-    else:
-        read = importlib.import_module("pyarrow.parquet").read_table(target)
-        rows = read.to_pylist()
-        units = {f.name: f.metadata[b"unit"].decode() for f in read.schema if f.metadata}
-        numbers = {n for n, v in rows[0].items() if isinstance(v, float) or n == "ticks"}
-        assert units.keys() == numbers  # each of them, and nothing else
-        assert (units["duration"], units["margin"], units["slack"]) == ("s", "1", "J")
-    assert [row["file"] for row in rows] == [str(file) for file in files]
-    assert [row["certified"] for row in rows] == ["no", "no"]
-    assert "report" not in rows[0]
 
 
 def test_a_table_that_cannot_be_written_is_refused_before_anything_is_audited(

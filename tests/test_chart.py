@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chart_cases import FakeRun, made_up, small_chart
+from chart_cases import FakeRun, small_chart
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
@@ -22,14 +21,11 @@ from hapticbridge.lab.chart.catalogue import (
 )
 from hapticbridge.lab.chart.chart import (
     Chart,
-    Measurement,
     interleaved_costs,
     measure_chart,
-    one_core,
     pareto_front,
 )
 from hapticbridge.lab.chart.output import (
-    draw_chart,
     prepared_files,
     write_chart,
 )
@@ -85,14 +81,6 @@ def test_no_further_round_begins_when_patience_is_over_but_three_are_done() -> N
     run = FakeRun(1.0)
     costs = interleaved_costs([run], 0, repeats=9, patience=0.5, clock=lambda: float(next(now)))
     assert costs[0].repeats == run.calls == 3
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="the system pins no threads")
-def test_pinning_is_undone() -> None:
-    before = os.sched_getaffinity(0)
-    with one_core() as core:
-        assert os.sched_getaffinity(0) == {core}
-    assert os.sched_getaffinity(0) == before
 
 
 def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
@@ -175,33 +163,6 @@ def test_chart_without_a_point_is_refused() -> None:
         measure_chart(workload, [Setting(METHODS["weld"], 4e-3)], repeats=1)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["nowhere"], "no scene"),
-        (["point_mass", "--steps", "1", "0.3"], "does not divide"),
-        (["point_mass", "--methods", "magic"], "no method is called 'magic'"),
-        (["point_mass", "--engines", "all", "mujoco"], "give it alone"),
-    ],
-)
-def test_bad_input_at_the_command_line_is_one_sentence(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert main(["chart", *arguments, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.strip().splitlines()) == 1
-
-
-def test_folder_that_is_a_file_is_refused_before_anything_is_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    taken = tmp_path / "file"
-    taken.write_text("", encoding="utf-8")
-    assert main(["chart", "point_mass", "--out", str(taken)]) == 2
-    assert "is a file; name a folder" in capsys.readouterr().err
-
-
 def test_hand_path_beside_a_scene_is_never_overwritten(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,24 +211,3 @@ def test_table_says_what_contacts_and_solver_really_were() -> None:
     assert [each["solref"] for each in chosen] == given
     assert [each["cone"] for each in chosen] == ["elliptic"] * 4 + ["pyramidal"]
     assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 100, 5]
-
-
-def test_picture_says_what_its_words_and_pale_points_mean(chart: Chart) -> None:
-    def words(*points: Measurement) -> str:
-        labelled = tuple(replace(each, panel=chart.workload.panels[0].key) for each in points)
-        figure = draw_chart(replace(chart, measurements=labelled))
-        legend = figure.axes[0].get_legend()
-        assert legend is not None
-        return " ".join(text.get_text() for text in legend.get_texts())
-
-    steps = (2.5e-4, 5e-4, 1e-3)
-    plain = words(*(made_up(1.0, p, period=p) for p in steps))
-    assert "implicit (order 1.0)" in plain
-    for told in ("not settled", "gain nothing", "not comparable", "lower edge"):
-        assert told not in plain
-    assert "smaller steps gain nothing" in words(*(made_up(1.0, 0.1, period=p) for p in steps))
-    assert "not settled" in words(*(made_up(1.0, p**p, period=p) for p in (0.1, 0.4, 1.6)))
-    apart = words(made_up(1.0, 0.1, limit_apart=0.34))
-    assert "implicit (limit 0.34 off)" in apart
-    assert "not comparable" in apart
-    assert "at the lower edge: 0.0001 JND or less" in words(made_up(1.0, 1e-6))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 from engine_stand_in import StandIn
 from engine_tasks import engine_or_skip
-from matplotlib.container import ErrorbarContainer
 
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import chart as chart_module
@@ -24,11 +21,7 @@ from hapticbridge.lab.chart.catalogue import (
 from hapticbridge.lab.chart.chart import Chart, interleaved_costs, measure_chart
 from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
 from hapticbridge.lab.chart.output import (
-    CEILING,
-    draw_chart,
-    drawn_cost,
     summary_of,
-    table_of,
 )
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import PeerWork, Score, Workload
@@ -193,18 +186,6 @@ def test_free_rod_begins_where_the_rod_of_the_plane_does() -> None:
         assert task.body.inertia[1] == pytest.approx(scene.model.body("rod").inertia[1])
 
 
-def test_engine_that_is_not_installed_is_left_out_with_a_sentence(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def missing(name: str) -> Engine:
-        raise StudyError(f"engine '{name}' is not installed")
-
-    monkeypatch.setattr(chart_module, "open_engine", missing)
-    settings = [Setting(METHODS["implicit"], FINE), *peer_settings(["gone"], [FINE])]
-    chart = measure_chart(workload("point_mass"), settings, repeats=1)
-    assert chart.skipped == {"gone": "engine 'gone' is not installed"}
-
-
 def test_engines_are_not_divided_into_substeps() -> None:
     work = workload("point_mass").peer_work()
     setting = Setting(METHODS["explicit"], FINE, substeps=2)
@@ -220,14 +201,6 @@ def chart_with(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> Chart:
         *peer_settings([engine.name], [GRID, FINE]),
     ]
     return measure_chart(workload("point_mass"), settings, repeats=1)
-
-
-def marks_of(chart: Chart) -> list[tuple[float, float]]:
-    """Returns where the picture has its marks: cost and error."""
-    drawn = (each for each in draw_chart(chart).axes[0].containers)
-    marks = [each.lines[0] for each in drawn if isinstance(each, ErrorbarContainer)]
-    places = [np.asarray(mark.get_xydata(), dtype=np.float64)[0] for mark in marks]
-    return [(float(cost), float(error)) for cost, error in places]
 
 
 @pytest.mark.parametrize("error", [RuntimeError, StudyError])
@@ -247,43 +220,9 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     said = f"raised {error.__name__}: no convergence after 0.3 s"
     assert broken.score.reason == said
     assert broken.cost.median > 0  # of the 300 steps that it came
-    row = next(
-        row
-        for row in csv.DictReader(io.StringIO(table_of(chart)))
-        if row["error_verdict"] == "failed"
-    )
-    assert (row["engine"], row["period_s"], row["error_reason"]) == ("stand_in", "0.001", said)
-    assert (row["method"], row["integrator"]) == ("held force", "")
     point = next(p for p in summary_of(chart)["points"] if p["error_verdict"] == "failed")
     assert point["error_reason"] == said
     assert point["error_felt"] is None
-    assert (broken.cost.median, CEILING) in marks_of(chart)
-    legend = draw_chart(chart).axes[0].get_legend()
-    assert legend is not None
-    told = [text.get_text() for text in legend.get_texts()]
-    assert "the engine failed (at the upper edge)" in told
-
-
-def test_engine_that_cannot_even_begin_is_drawn_with_the_dearest_point(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    chart = chart_with(StandIn(fails_at=0, fails_below=2 * FINE), monkeypatch)
-    broken = chart.measurements[-1]
-    assert broken.score.verdict == "failed"
-    assert broken.score.reason == "raised RuntimeError: no convergence after 0 s"
-    assert np.isnan(broken.cost.median)
-    dearest = np.nanmax([each.cost.median for each in chart.measurements])
-    assert drawn_cost(broken, chart.measurements) == dearest
-    assert (dearest, CEILING) in marks_of(chart)
-    assert summary_of(chart)["points"][-1]["cost_median"] is None
-
-
-def test_engine_that_refuses_a_task_is_left_out_with_its_sentence(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    chart = chart_with(StandIn(fails_at=0, error=StudyError), monkeypatch)
-    assert chart.skipped == {"stand_in": "no\nconvergence"}
-    assert {each.setting.engine for each in chart.measurements} == {"hapticbridge"}
 
 
 def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
@@ -307,19 +246,3 @@ def test_point_that_diverged_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [each.score for each in chart.measurements if each.setting.engine == "stand_in"]
     assert [each.verdict for each in found] == ["diverged", "diverged"]
     assert all(each.reason.startswith("the tool was 10 m away after 0.") for each in found)
-
-
-def test_json_tells_every_engines_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    chart = chart_with(StandIn(), monkeypatch)
-    assert summary_of(chart)["engines"] == {
-        "stand_in": {
-            "version": "1.0",
-            "settings": {"coupling": {"value": "held force", "source": "its own head"}},
-        }
-    }
-
-
-def test_engine_with_a_spring_of_its_own_is_called_so() -> None:
-    (held, spring) = peer_settings(["ode", "ode_spring"], [FINE])
-    assert held.label == "ode, held force, 1 ms"
-    assert spring.label == "ode_spring, own spring, 1 ms"

@@ -23,12 +23,6 @@ def test_points_whose_spreads_meet_cost_alike_whichever_is_disturbed() -> None:
     assert recommended([calm, apart]) is calm
 
 
-def test_recommendation_says_where_its_error_is_not_counted_from_the_truth() -> None:
-    point = made_up(0.01, 0.2)
-    assert "not from the truth" in recommendation([point], "a machine", is_truth=False)
-    assert "not from the truth" not in recommendation([point], "a machine", is_truth=True)
-
-
 def test_usual_contact_is_recommended_where_errors_are_alike() -> None:
     odd = made_up(0.0100, 0.300, contact="2 steps", spread=0.1)
     usual = made_up(0.0101, 0.301)
@@ -75,13 +69,6 @@ def test_slower_than_a_kilohertz_is_never_recommended() -> None:
     assert recommended([slow]) is None
     assert "nothing was tried that runs at this rate" in recommendation([slow], "a machine")
     assert recommended([slow, made_up(0.1, 0.5)]) is not slow
-
-
-def test_recommendation_says_machine_setting_and_numbers() -> None:
-    text = recommendation([made_up(0.012, 0.25, method="lossless")], "a machine")
-    assert text.startswith("For 1 kHz on this machine (a machine) and an error below one JND, use")
-    assert "lossless, 1 ms" in text
-    assert "0.25 JND at 12 µs a tick, 1.2 % of a core" in text
 
 
 def test_setting_that_no_other_step_bears_out_is_recommended_last_and_said_to_be_luck() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from dataclasses import astuple
 from itertools import count
 from pathlib import Path
@@ -12,26 +10,18 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from hapticbridge.check.cost import TimingStats
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.output import prepared_files
 from hapticbridge.lab.chart.work import (
     FAMILIES,
-    USUAL,
     VARIANTS,
-    WORK_ENDINGS,
-    Work,
-    WorkChart,
     floating,
     growth_of,
     measure_work,
     mesh_ball,
-    paragraph,
     plate,
     resting,
     sphere,
-    write_work,
 )
 
 
@@ -102,47 +92,6 @@ def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
     (point,) = chart.points
     assert point.time.median == pytest.approx(1e-6)
     assert point.rate == pytest.approx(0.5 / 1e-6)
-
-
-def made_up() -> WorkChart:
-    """Returns a chart in which the time of a tick is known."""
-
-    def point(family: str, variant: str, size: int, seconds: float) -> Work:
-        spread = TimingStats(100, seconds, seconds)
-        return Work(family, variant, size, 0, 0, 6, spread, seconds, seconds, 0.5 / seconds)
-
-    points = [point("bodies", USUAL.name, size, 1e-5 * size) for size in (1, 10, 100)]
-    for variant, factor in zip(VARIANTS, (1.0, 3.0, 1.0, 0.1), strict=True):
-        points += [point("resting", variant.name, size, factor * 1e-5 * size) for size in (10, 100)]
-    return WorkChart(tuple(points), "a machine")
-
-
-def test_paragraph_says_how_it_grows_and_what_holds_a_kilohertz() -> None:
-    text = paragraph(made_up())
-    assert "µs a tick for 1, 1e+03 µs for 100; up to 10 hold 1 kHz" in text
-    assert f"Boxes at rest, {VARIANTS[1].name}: 300 µs a tick for 10, 3e+03 µs for 100" in text
-
-
-def test_files_hold_every_point(tmp_path: Path) -> None:
-    paths = prepared_files(tmp_path, "work", WORK_ENDINGS)
-    said = write_work(made_up(), paths)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        f"work.{ending}" for ending in ("png", "svg", "csv", "json")
-    }
-    with paths["csv"].open(encoding="utf-8") as lines:
-        rows = list(csv.DictReader(lines))
-    assert len(rows) == 11
-    assert {row["variant"] for row in rows} == {variant.name for variant in VARIANTS}
-    assert json.loads(paths["json"].read_text(encoding="utf-8")) == said
-    assert said["growth"]["bodies"][USUAL.name]["exponent"] == pytest.approx(1.0)
-    assert paths["png"].stat().st_size > 10_000
-
-
-def test_work_into_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    taken = tmp_path / "file"
-    taken.write_text("", encoding="utf-8")
-    assert main(["chart", "work", "--out", str(taken)]) == 2
-    assert "is a file; name a folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -31,15 +31,6 @@ def test_prints_of_c_are_told_once_and_kept_from_stdout(
     assert capfd.readouterr().out == "after\n"
 
 
-def test_what_was_printed_before_stays_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    told: list[str] = []
-    ctypes.CDLL(None).puts(b"before")
-    with caught_prints(told.append):
-        pass
-    assert capfd.readouterr().out == "before\n"
-    assert told == []
-
-
 def test_stdout_is_itself_again_after_an_error_and_what_was_printed_is_told(
     capfd: pytest.CaptureFixture[str],
 ) -> None:

@@ -265,13 +265,6 @@ def test_a_pull_off_the_centre_turns_the_tool(engine: Engine) -> None:
     assert np.linalg.norm(velocity.angular - spin) < share * np.linalg.norm(spin)
 
 
-def test_every_engine_has_a_source_for_every_setting(engine: Engine) -> None:
-    assert engine.version
-    law = "implicit spring" if engine.name in SPRINGS else "held force"
-    assert engine.settings["coupling"].value.startswith(law)
-    assert all(setting.value and setting.source for setting in engine.settings.values())
-
-
 def test_a_task_can_be_closed_twice_and_its_timestep_is_checked(engine: Engine) -> None:
     task = Task("free", Body(1.0, (1.0,) * 3))
     simulation = engine.open(task, 1e-3)

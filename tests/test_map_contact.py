@@ -12,21 +12,15 @@ import mujoco
 import numpy as np
 import pytest
 from map_runs import recorded_and_audited
-from map_tables import Row, written
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
-from hapticbridge.lab.maps.base import MISSING, VERDICTS, Point, loop_in, run_map, set_tool_mass
+from hapticbridge.lab.maps.base import loop_in, run_map, set_tool_mass
 from hapticbridge.lab.maps.contact import (
     COMPARED,
     CONTACT,
-    PANELS,
     RIGS,
-    agreement,
-    cases_of,
-    evaluate,
-    exceptions,
     method_runs,
     points,
 )
@@ -39,9 +33,7 @@ from hapticbridge.lab.maps.contact_rigs import (
     peg_device,
     peg_runs,
     start_in_hole,
-    summary,
     ticks_of,
-    until_active,
     wall_runs,
 )
 from hapticbridge.lab.methods import METHODS
@@ -162,20 +154,6 @@ def test_the_audit_of_a_bridge_names_the_tick_at_which_the_map_sees_a_contact_cr
         assert mapped.first_active == -1
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_methods_meet_the_same_hands_and_come_and_go(rig: str) -> None:
-    runs = {
-        method: list(method_runs(rig, method, [(1000.0, 0.1, 0.0, hand) for hand in (0, 1)]))
-        for method in COMPARED
-    }
-    for one, other in zip(runs["lossless"], runs["compensated"], strict=True):
-        assert one.depth > 0
-        # the same contact, but not the same approach to it
-        assert one.peak_force == pytest.approx(other.peak_force, rel=0.2)
-        assert one.peak_force != other.peak_force
-    assert len(cases_of(rig, 0.1)) == {"taps": 40, "mouth": 80}[rig]
-
-
 def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() -> None:
     case = [LIGHT_AT_MOUTH]
     (lossless,) = method_runs("mouth", "lossless", case)
@@ -195,120 +173,11 @@ def of(environment: str, depth: float, *, created: float = 0.0, first: int = -1)
     return ContactRun(environment, created, 10 * created, first, 1e3 * depth, depth)
 
 
-def test_runs_end_with_the_first_that_is_active_and_are_counted_by_verdict() -> None:
-    runs = [
-        of("strict", 1e-3),
-        of("within slack", 4e-3, created=0.02),
-        of("active", 2e-3, created=0.2, first=70),
-        of("active", 9e-3, created=0.9, first=5),
-    ]
-    asked = iter(runs)
-    made = until_active(asked)
-    assert made == runs[:3]
-    assert next(asked) is runs[3]  # never made
-    found = summary(made)
-    assert (found["runs"], found["strict"], found["within_slack"], found["active"]) == (3, 1, 1, 1)
-    assert found["created"] == 0.2
-    assert found["slack_share"] == 2.0
-    assert found["first_active"] == 70
-    assert found["peak_force"] == 4.0
-    assert found["median_depth"] == 2e-3
-    assert found["largest_depth"] == 4e-3
-    assert summary(runs)["first_active"] == 5
-    assert summary(runs[:2])["first_active"] == -1
-
-
 def test_a_mass_set_before_leaves_no_trace_in_a_run() -> None:
     (alone,) = peg_runs(Treatment(), 1000.0, LIGHT)
     list(peg_runs(Treatment(), 1000.0, [(0.1, 0.0, 1), (0.37, 0.0, 1)]))
     (after,) = peg_runs(Treatment(), 1000.0, LIGHT)
     assert after == alone
-
-
-def grid_row(rig: str, method: str, k: float, setting: tuple[float, float], verdict: str) -> Row:
-    """Returns a row of the grid, of one run."""
-    point: Point = {"rig": rig, "treatment": "", "method": method, "stiffness": k}
-    steps, ratio = setting
-    return point | {"steps": steps, "dampratio": ratio, "mass": 0.0}, counted(verdict)
-
-
-def counted(*verdicts: str, depth: float = 1e-4) -> dict[str, float | int]:
-    counts = {name.replace(" ", "_"): verdicts.count(name) for name in VERDICTS[:3]}
-    return {
-        "runs": len(verdicts),
-        **counts,
-        "created": 0.01 * counts["active"],
-        "slack_share": 0.25 * len(verdicts),
-        "first_active": -1,
-        "peak_force": 1.0,
-        "median_depth": depth,
-        "largest_depth": 3 * depth,
-    }
-
-
-def search_row(name: str, mass: float, *verdicts: str, depth: float = 1e-4) -> Row:
-    point = grid_row("search", "implicit", 0.0, (0.0, 0.0), "strict")[0]
-    return point | {"treatment": name, "mass": mass}, counted(*verdicts, depth=depth)
-
-
-def method_row(rig: str, method: str, *verdicts: str) -> Row:
-    point = grid_row(rig, method, 0.0, (0.0, 0.0), "strict")[0]
-    return point | {"mass": 0.1}, counted(*verdicts)
-
-
-SETTINGS = ((0.5, 8.0), (2.0, 2.0), (1.0, 1.0))
-"""τ = 60.8, 15.2 and 1.9 steps: strict, for heavy tools alone and none by the rule."""
-
-WRITTEN = [
-    *(
-        grid_row(rig, method, k, setting, verdict)
-        for rig, method, stiffness, _ in PANELS
-        for k in stiffness
-        for setting, verdict in zip(SETTINGS, ("strict", "within slack", "active"), strict=True)
-    ),
-    search_row(SHIPPED, 0.03, "strict", "active", depth=2e-4),
-    search_row(SHIPPED, 0.3, "strict", "within slack", "strict", depth=4e-4),
-    search_row("damped: 0.0005 8", 0.03, "strict", "strict", depth=3e-4),
-    search_row("damped: 0.0005 8", 0.3, "strict", "strict", depth=5e-4),
-    search_row("MuJoCo's default 0.02 1", 0.03, "strict", depth=2e-3),
-    search_row("4 substeps, 0.002 1", 0.03, "strict", depth=1e-5),
-    *(method_row("taps", method, "strict", "strict") for method in COMPARED),
-    method_row("mouth", "implicit", "strict", "active"),
-    method_row("mouth", "lossless", "strict", "within slack"),
-]
-
-
-def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
-    finding = CONTACT.read(written(WRITTEN))
-    found = {one["treatment"]: one for one in finding.boundary["search"]}
-    shipped = found[SHIPPED]
-    assert (shipped["runs"], shipped["strict"], shipped["within_slack"]) == (5, 3, 1)
-    assert shipped["active"] == 1
-    assert shipped["created"] == 0.01
-    assert shipped["slack_share"] == 0.75
-    assert shipped["median_depth"] == pytest.approx(3e-4)
-    assert shipped["largest_depth"] == pytest.approx(12e-4)
-    rule = finding.boundary["rule"]
-    assert {name: one["cells"] for name, one in rule.items()} == {
-        "strict": 2,
-        "relaxed": 2,
-        "abrupt": 2,
-    }
-    assert len(finding.boundary["methods"]) == 5
-    assert finding.boundary["exceptions"] == []
-    said = finding.paragraph
-    assert "2 of 2 settings that the rule calls strict were so in every run" in said
-    assert "creates energy at 67% of the settings" in said
-    assert "least deep is 'damped: 0.0005 8', median 0.0004 m, 4 times as deep" in said
-
-
-@pytest.mark.parametrize("rig", ["peg", "search", "wall", "methods"])
-def test_a_rig_that_fails_is_named_and_the_others_are_read(rig: str) -> None:
-    rigs = RIGS if rig == "methods" else (rig,)
-    rows: list[Row] = [(at, "E" if at["rig"] in rigs else got) for at, got in WRITTEN]
-    finding = CONTACT.read(written(rows))
-    texts = [MISSING in [text.get_text() for text in axes.texts] for axes in finding.figure.axes]
-    assert sum(texts) == {"peg": 2, "search": 1, "wall": 4, "methods": 1}[rig]
 
 
 def test_map_at_reduced_resolution_agrees_with_the_rule(
@@ -361,59 +230,6 @@ def test_treatments_reach_the_model_whatever_was_set_before() -> None:
         assert model.opt.o_friction[0] == 0.3
 
 
-class Rows(dict[str, Any]):
-    """The part of a table that the comparison needs."""
-
-    def select(self, rows: Any) -> Rows:
-        return Rows({name: values[rows] for name, values in self.items()})
-
-
-@pytest.mark.parametrize(
-    ("name", "mass", "measured", "is_worse"),
-    [
-        (SHIPPED, 0.03, "active", False),
-        (SHIPPED, 0.1, "active", True),
-        (SHIPPED, 0.1, "within slack", False),
-        ("0.00025 8", 0.03, "active", True),
-        ("damped: 0.0005 8", 0.1, "within slack", True),
-        ("damped: 0.0005 8", 0.1, "strict", False),
-        ("impedance 0.99 throughout", 0.3, "active", False),
-        ("pyramidal cone", 0.3, "active", False),
-        ("diagexact off", 0.3, "active", False),
-        ("implicitfast", 0.3, "active", False),
-    ],
-)
-def test_only_runs_worse_than_the_rule_says_are_exceptions(
-    name: str, mass: float, measured: str, is_worse: bool
-) -> None:
-    row: Any = Rows(
-        treatment=np.array([name]),
-        mass=np.array([mass]),
-        active=np.array([int(measured == "active")]),
-        within_slack=np.array([int(measured == "within slack")]),
-    )
-    assert bool(exceptions(row)) == is_worse
-
-
-def test_regions_of_the_rule_are_told_apart_on_the_grid() -> None:
-    # τ = 60.8, 30.4, 15.2 and 1.9 h; what promises nothing is abrupt
-    steps, ratio = [0.5, 0.25, 2.0, 1.0], [8.0, 8.0, 2.0, 1.0]
-    table: Any = Rows(
-        rig=np.array(["peg"] * 4),
-        steps=np.array(steps),
-        dampratio=np.array(ratio),
-        active=np.array([0, 0, 0, 1]),
-        within_slack=np.array([0, 1, 0, 0]),
-    )
-    found = agreement(table)
-    assert {name: one["cells"] for name, one in found.items()} == {
-        "strict": 1,
-        "relaxed": 2,
-        "abrupt": 1,
-    }
-    assert found["relaxed"]["within_slack"] == found["abrupt"]["active"] == 1
-
-
 def wall_depths(treatment: Treatment) -> Any:
     """Returns the depth in m of 50 g that a hand presses hard for 1.5 s and then lightly."""
     loop = loop_in("virtual_wall", "contact")
@@ -446,10 +262,3 @@ def test_steady_depth_is_as_many_times_the_shipped_one_as_said(name: str) -> Non
     ratio = float(other[-1] / shipped[-1])
     said = TREATMENTS[name].static_depth
     assert 0.35 * said < ratio < 1.05 * said
-
-
-def test_points_are_about_as_many_as_asked_and_evaluate_to_numbers() -> None:
-    assert abs(len(points(CONTACT.default_points)) - CONTACT.default_points) < 40
-    first = next(p for p in points(1) if p["rig"] == "wall")
-    found = evaluate(first)
-    assert found["runs"] == found["strict"] + found["within_slack"] + found["active"]

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from map_runs import NEVER, recorded_and_audited
-from map_tables import Row, written
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -26,10 +25,8 @@ from hapticbridge.lab.maps.coupling import (
     DEVICE_DAMPING,
     PATH,
     PERIOD,
-    THEORIES,
     TOOL_MASS,
     evaluate,
-    points,
 )
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
@@ -149,84 +146,6 @@ def test_the_audit_of_a_bridge_names_the_tick_and_the_port_of_the_map(
     assert (-1 if report.tick is None else report.tick) == mapped["fault_tick"]
 
 
-def ran(method: str, stiffness: float, damping: float, **other: float | str | bool) -> Row:
-    """Returns a row of a run in which nothing went wrong, but for what is said."""
-    row: dict[str, float | str | bool] = {
-        "stable_free": True,
-        "stable_tapping": True,
-        "environment": "strict",
-        "fault_tick": -1,
-        "fault_port": "",
-        "slack_share": 0.0,
-        "peak_force": 3.0,
-    }
-    if method != "weld":
-        row["stable_on_wall"] = True
-    return cell(method, stiffness, damping), row | other
-
-
-def limited(method: str, damping: float, limit: float) -> Row:
-    """Returns a row of a search on a wall."""
-    point: Point = {"what": "limit", "method": method, "stiffness": 0.0, "damping": damping}
-    return point, {"limit": limit}
-
-
-def test_boundary_counts_each_way_to_fail_and_only_below_the_bound() -> None:
-    # (6) is at 4000 N/m for B = 0 and at 2000 N/m for B = 1: three of four points lie below
-    grid = [(1000.0, 0.0), (3000.0, 0.0), (1000.0, 1.0), (3000.0, 1.0)]
-    rows = [ran("implicit", k, b) for k, b in grid[:3]]
-    rows += [ran("implicit", *grid[3], stable_on_wall=False)]
-    rows += [
-        ran("implicitfast", 1000.0, 0.0, stable_on_wall=False),
-        ran("implicitfast", 3000.0, 0.0, stable_free=False),
-        ran("implicitfast", 1000.0, 1.0, environment="active", fault_port="environment"),
-        ran("implicitfast", 3000.0, 1.0, environment="active", fault_port="environment"),
-    ]
-    # what is used and felt counts below the bound alone: the last point lies above
-    used, felt = (0.4, 0.3, 0.2, 0.9), (3.0, 4.0, 5.0, 8.0)
-    rows += [
-        ran("explicit", *point, environment="within slack", slack_share=share, peak_force=force)
-        for point, share, force in zip(grid, used, felt, strict=True)
-    ]
-    rows += [ran("weld", k, b) for k, b in grid[1:]]
-    rows += [
-        ran("weld", *grid[0], stable_tapping=False, fault_port="device", fault_tick=7),
-        # at the bound itself nothing is promised any more
-        ran("implicit", 4000.0, 0.0, environment="active", fault_port="environment"),
-        ran("implicitfast:compensated", 1000.0, 0.0, stable_free=False),
-    ]
-    rows += [limited("implicit", 0.0, 4040.0), limited("implicit", 1.0, 1990.0)]
-    finding = COUPLING.read(written(rows))
-    found = finding.boundary["methods"]
-    assert found["implicit"]["runs_below_6"] == 3
-    assert found["implicit"]["passive_share_below_6"] == 1.0
-    assert found["implicit"]["environment_faults_below_6"] == 0
-    assert found["implicit"]["damping"] == [0.0, 1.0]
-    assert found["implicit"]["measured_on_wall"] == [4040.0, 1990.0]
-    assert found["implicit"]["predicted_6"] == pytest.approx([4000.0, 2000.0])
-    assert found["implicit"]["largest_deviation"] == pytest.approx(0.01)
-    assert found["implicitfast:compensated"]["passive_share_below_6"] == 0.0
-    assert found["implicitfast"]["passive_share_below_6"] == 0.0
-    assert found["implicitfast"]["environment_faults_below_6"] == 1
-    assert found["explicit"]["passive_share_below_6"] == 1.0
-    assert found["explicit"]["most_slack_used_below_6"] == 0.4
-    assert found["explicit"]["largest_tapping_force_below_6"] == 5.0
-    assert found["weld"]["passive_share_below_6"] == pytest.approx(2 / 3)
-    assert found["weld"]["device_faults_below_6"] == 1
-    assert "unstable within 1.00% of K = 2 (b − B)/T" in finding.paragraph
-    assert "'weld' is stable and passive at 67% of the 3 points below (6)" in finding.paragraph
-    assert "'explicit:rk4'" not in finding.paragraph  # no point of it was computed
-
-
-def test_points_are_a_grid_for_every_method_and_about_as_many_as_asked() -> None:
-    asked = 4500
-    grid = points(asked)
-    cells = [point for point in grid if point["what"] == "cell"]
-    assert {point["method"] for point in cells} == set(THEORIES)
-    assert 3 * len(cells) == pytest.approx(asked, rel=0.1)
-    assert COUPLING.default_points >= 4000
-
-
 def test_map_leaves_picture_table_and_boundary(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         files = run_map(COUPLING, tmp_path, points=24, executor=pool)
@@ -238,10 +157,3 @@ def test_map_leaves_picture_table_and_boundary(tmp_path: Path) -> None:
     assert implicit["passive_share_below_6"] == 1.0
     assert np.isfinite(implicit["measured_on_wall"]).all()
     assert "within 0." in said["paragraph"]
-
-
-def test_a_table_in_which_only_limits_were_found_is_read() -> None:
-    found = COUPLING.read(
-        written([limited("implicit", 0.0, 4000.0), (cell("weld", 1.0, 0.0), "E")])
-    )
-    assert found.boundary["methods"]["implicit"]["passive_share_below_6"] is None

@@ -8,33 +8,24 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from map_runs import NEVER, recorded_and_audited
-from map_tables import Row, written
 
-from hapticbridge.device import Hand, Motion, SimulatedDevice
-from hapticbridge.lab.maps.base import VERDICTS, Point, run_map
+from hapticbridge.lab.maps.base import Point, run_map
 from hapticbridge.lab.maps.geometry import (
     BEHIND,
-    BOUNDS,
-    DEVICE_DAMPING,
     GEOMETRY,
     LENGTH,
     PERIOD,
     ROTATIONAL_DAMPING,
     contact_stiffness_limit,
-    device_and_coupling,
     evaluate,
     first_growth,
     is_stable,
     length_limit,
-    points,
     run,
     set_length,
     torque,
 )
-from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
-from hapticbridge.theory.bounds import minimum_damping
 
 
 def test_the_printed_limit_is_its_own_inverse() -> None:
@@ -66,15 +57,6 @@ def test_what_takes_its_lag_off_bears_a_third_more_at_every_length(
     # nothing is left of B_r at 2 b_θ/T = 4; the same give, on the safe side
     assert is_stable(method, length, 3.98)
     assert not is_stable(method, length, 4.12)
-
-
-def test_the_bound_of_a_method_is_what_its_law_asks_of_the_device() -> None:
-    assert pytest.approx({"implicit": 3.0, "compensated": 4.0, "lossless": 4.0}) == BOUNDS
-    for name, bound in BOUNDS.items():
-        _, coupling = device_and_coupling(name, bound)
-        used = METHODS[name].used(coupling, PERIOD)
-        needed = minimum_damping(used, PERIOD, axis="rotation")
-        assert needed == pytest.approx(DEVICE_DAMPING)
 
 
 @pytest.mark.parametrize("stiffness", [0.4, 2.0])
@@ -139,111 +121,6 @@ def test_the_peg_fills_its_hole_and_touches_nothing_else() -> None:
         assert sorted(np.sign(contacts.pos[deep, 2])) == [-1, -1, 1, 1]
 
 
-@pytest.mark.parametrize(
-    ("method", "share", "port"),
-    [("direct", 1.05, "device"), ("direct", 0.95, ""), ("implicit", 1.05, "")],
-)
-def test_the_audit_of_a_bridge_names_the_device_where_the_peg_is_too_long(
-    method: str, share: float, port: str, tmp_path: Path
-) -> None:
-    stiffness = 1e4
-    length = share * float(length_limit(stiffness))
-    scene = load_scene("planar_peg")
-    set_length(scene.model, length)
-    mujoco.mj_setConst(scene.model, scene.data)
-    scene.reset()
-    device, coupling = device_and_coupling(method, stiffness if method == "direct" else 2.9)
-    # next to no inertia: the damper alone is the worst hand; a feeble hand turns it by 0.01 rad
-    turned = [np.cos(0.005), 0, np.sin(0.005), 0]
-    turning = SimulatedDevice(
-        damping=device.info.damping or 0.0,
-        rotational_inertia=1e-9,
-        rotational_damping=DEVICE_DAMPING,
-        hand=Hand(
-            mass=0,
-            damping=0,
-            stiffness=0,
-            rotational_inertia=0,
-            rotational_damping=0,
-            rotational_stiffness=0.02,
-        ),
-        path=Motion([0, 0.02, 1], np.zeros((3, 3)), np.array([[1, 0, 0, 0], turned, turned])),
-        force_limit=NEVER,
-        torque_limit=NEVER,
-    )
-    report = recorded_and_audited(scene, turning, coupling, method, PERIOD, 200, tmp_path)
-    assert report.resimulation == "bit for bit"
-    assert (report.verdict, report.port) == ("active" if port else "passive", port)
-    if port:
-        # what is left of a step grows by K T/b_θ − 1 = 2 · 1.05² − 1 a tick: tenfold in 12 ticks
-        assert report.tick is not None and 12 < report.tick < 60
-    assert report.environment == "strict"
-
-
-def ran(method: str, length: float, stiffness: float, **other: float | str | bool) -> Row:
-    """Returns a row of a run in which nothing went wrong, but for what is said."""
-    point: Point = {"what": "cell", "method": method, "length": length, "stiffness": stiffness}
-    row: dict[str, float | str | bool] = {"stable": True, "environment": "strict", "created": 0.0}
-    return point, row | {"first_active": -1, "first_growth": -1} | other
-
-
-def limited(method: str, given: float, limit: float) -> Row:
-    """Returns a row of a search, at K_c for ``direct`` and at L behind the coupling."""
-    length, stiffness = (0.0, given) if method == "direct" else (given, 0.0)
-    point: Point = {"what": "limit", "method": method, "length": length, "stiffness": stiffness}
-    return point, {"limit": limit}
-
-
-WRITTEN = [
-    ran("direct", 0.01, 1e4),
-    ran("direct", 0.01, 1e5, stable=False),
-    ran("direct", 0.1, 1e4, environment="active"),
-    ran("direct", 0.1, 1e5, environment="within slack"),
-    ran("implicit", 0.01, 2.0),
-    # 28.284 mm are predicted at 10 kN/m, 282.84 mm at 100 N/m
-    limited("direct", 1e4, 1.1 * 28.284e-3),
-    limited("direct", 100.0, 0.98 * 282.84e-3),
-    limited("implicit", 0.01, 3.06),
-    limited("implicit", 0.05, 2.4),
-    limited("implicit", 0.2, 3.6),
-    limited("lossless", 0.01, 4.4),
-    limited("lossless", 0.2, 4.2),
-]
-
-
-def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
-    found = GEOMETRY.read(written(WRITTEN))
-    direct, behind = found.boundary["direct"], found.boundary["implicit"]
-    assert direct["contact_stiffness"] == [1e4, 100.0]
-    assert direct["measured_length"] == pytest.approx([0.0311124, 0.2771832])
-    assert direct["predicted_length"] == pytest.approx([0.028284, 0.28284], rel=1e-4)
-    assert direct["largest_deviation"] == pytest.approx(0.1, rel=1e-3)
-    assert behind["length"] == [0.01, 0.05, 0.2]
-    assert behind["predicted_6"] == pytest.approx(3.0)
-    assert behind["largest_deviation"] == pytest.approx(0.2)
-    assert behind["smallest"] == 2.4
-    assert behind["largest"] == 3.6
-    assert behind["largest_over_smallest"] == pytest.approx(1.5)
-    assert "within 10.00% of L = 2 √(b_θ/(T K_c))" in found.paragraph
-    assert "between 2.4 and 3.6 N m/rad over all lengths" in found.paragraph
-    assert "compensated" not in found.paragraph
-    lossless = found.boundary["lossless"]
-    assert (lossless["predicted_6"], lossless["largest"]) == (pytest.approx(4.0), 4.4)
-    assert lossless["largest_deviation"] == pytest.approx(0.1)
-    left = found.figure.axes[0]
-    cells = np.asarray(left.collections[0].get_array())
-    names = [[VERDICTS[int(number)] for number in row] for row in cells]
-    assert names == [["strict", "active"], ["unstable", "within slack"]]
-
-
-def test_a_search_without_an_end_is_no_limit() -> None:
-    rows = [limited("implicit", 0.1, 0.0), limited("implicit", 0.2, float("inf"))]
-    found = GEOMETRY.read(written(rows))
-    assert found.boundary["implicit"]["largest_over_smallest"] is None
-    mixed = GEOMETRY.read(written([*rows, limited("implicit", 0.3, 3.0)]))
-    assert mixed.boundary["implicit"]["largest_over_smallest"] == 1.0
-
-
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         files = run_map(GEOMETRY, tmp_path, points=32, executor=executor)
@@ -255,7 +132,3 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
         assert boundary[name]["largest_deviation"] < 0.03
     assert boundary["lossless"]["smallest"] > 1.3 * boundary["implicit"]["largest"]
     assert files.picture.stat().st_size > 10_000
-
-
-def test_the_grid_has_about_as_many_points_as_asked() -> None:
-    assert 3000 < len(points(GEOMETRY.default_points)) < 4200

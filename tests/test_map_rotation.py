@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from map_runs import NEVER, recorded_and_audited
-from map_tables import Row, written
 
 from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.lab.maps.base import Point, run_map
@@ -25,7 +23,6 @@ from hapticbridge.lab.maps.rotation import (
     evaluate,
     free_creation,
     gyroscopic_speed,
-    points,
     speed_of_cut,
     spin,
     spinning_scene,
@@ -153,75 +150,3 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     assert boundary["fastest_passive"]["explicit"] is None
     assert boundary["cut"]["speed_measured"] == pytest.approx(cut_speed(SOFT), rel=0.02)
     assert files.picture.stat().st_size > 10_000
-
-
-GOOD: dict[str, float | int | bool | str] = {
-    "ticks": TICKS,
-    "environment": "strict",
-    "created": 0.0,
-    "crossed": -1,
-    "torque_jump": 0.1,
-}
-
-
-def row(
-    what: str,
-    method: str,
-    stiffness: float,
-    speed: float,
-    got: Mapping[str, float | int | bool | str],
-) -> Row:
-    """Returns a row of the map's table."""
-    point: Point = {"what": what, "method": method, "rotational_stiffness": stiffness}
-    return point | {"speed": speed, "angle": 0.0}, got
-
-
-def test_boundary_and_paragraph_follow_from_a_made_up_table() -> None:
-    runs: list[tuple[str, str, float, float, dict[str, float | str]]] = [
-        ("cell", "implicit", SOFT, 0.0, {}),
-        ("cell", "implicit", SOFT, 20.0, {}),
-        ("cell", "implicit", SOFT, 40.0, {"environment": "within slack"}),
-        # a run that diverged is no passive one, whatever its ledger said until then
-        ("cell", "implicit", SOFT, 60.0, {"ticks": TICKS - 1}),
-        ("cell", "implicit", SOFT, 100.0, {"environment": "active", "crossed": 9}),
-        ("cell", "explicit", SOFT, 0.0, {}),
-        ("cell", "explicit", SOFT, 20.0, {"environment": "active"}),
-        ("line", "implicit", 0.0, 20.0, {"created": 1.1 * free_creation(20.0)}),
-        ("line", "implicit", 0.0, 40.0, {"created": 1.1 * free_creation(40.0)}),
-        ("line", "implicit", 0.0, 60.0, {"created": 0.0}),
-        ("cut", "implicit", SOFT, 80.0, {"crossed": 5, "torque_jump": 12.0, "created": 0.5}),
-        ("cut", "implicit", SOFT, 50.0, {"torque_jump": 99.0, "created": 9.0}),
-    ]
-    finding = ROTATION.read(written([row(*run[:4], GOOD | run[4]) for run in runs]))
-    found = finding.boundary
-    assert found["fastest_passive"]["implicit"] == 40.0
-    assert found["fastest_passive"]["explicit"] is None
-    assert found["share_strict_below"]["implicit"] == 0.75
-    assert found["first_passed"] == dict.fromkeys(found["first_passed"]) | {"implicit": 100.0}
-    assert found["translation_only"]["grows_up_to"] == 40.0
-    assert found["cut"]["torque_jump"] == 12.0
-    assert found["cut"]["created"] == 0.5
-    jumps = found["cut"]["largest_torque_jump"]
-    assert jumps == dict.fromkeys(jumps) | {"implicit": 99.0}
-    told = found["translation_only"]
-    assert told["speed"] == [20.0, 40.0, 60.0]
-    assert told["predicted"] == pytest.approx([free_creation(v) for v in (20.0, 40.0, 60.0)])
-    # ½T²|ω × Iω|²/I is 0.5 % of the tool's energy at 20 rad/s, too much of it at 60 rad/s
-    assert told["compared_up_to"] < 60.0
-    assert told["largest_deviation"] == pytest.approx(0.1)
-    assert found["cut"]["speed_measured"] is None
-
-
-def test_the_grid_has_about_as_many_points_as_asked() -> None:
-    assert 1200 < len(points(ROTATION.default_points)) < 1800
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("method", "implicit"), ("what", "line"), ("what", "cut"), ("what", "limit")],
-)
-def test_a_group_that_fails_is_named(name: str, value: str) -> None:
-    rows: list[Row] = []
-    for point in points(40):
-        found = {"limit": 73.7} if point["what"] == "limit" else GOOD
-        rows.append((point, "StudyError: not today" if point[name] == value else found))

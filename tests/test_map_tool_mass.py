@@ -6,35 +6,27 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
-from map_runs import NEVER, recorded_and_audited
-from map_tables import Row, written
+from map_tables import Row
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
+from hapticbridge.lab.maps.base import Point, run_map
 from hapticbridge.lab.maps.tool_mass import (
     DAMPING,
     DEVICE_DAMPING,
-    KNOCK,
-    PATH,
     PERIOD,
     THEORIES,
     TOOL_MASS,
-    coupling_of,
     evaluate,
     felt,
-    hand_worst_for,
     held_still,
     least_mass,
     predicted_limit,
     worst_angle,
     worst_hand,
 )
-from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.sampled_loop import SampledLoop
 from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
@@ -174,65 +166,6 @@ def test_where_no_mass_is_stable_theory_has_no_limit() -> None:
     assert np.isnan(nowhere["limit"])
 
 
-def test_a_search_finds_the_predicted_limit() -> None:
-    found = evaluate({"what": "held still", "method": "explicit", "stiffness": 9000.0, "mass": 0.0})
-    assert found["limit"] == pytest.approx(0.00475, rel=0.01)
-
-
-def tool_of(mass: float) -> Scene:
-    scene = load_scene("point_mass")
-    set_tool_mass(scene.model, "tool", mass)
-    mujoco.mj_setConst(scene.model, scene.data)
-    return scene
-
-
-def unlimited(**options: object) -> SimulatedDevice:
-    return SimulatedDevice(force_limit=NEVER, torque_limit=NEVER, **options)  # type: ignore[arg-type]
-
-
-def test_the_audit_names_the_environment_where_a_held_force_meets_too_light_a_tool(
-    tmp_path: Path,
-) -> None:
-    least = least_mass("explicit", 9000.0, DAMPING, PERIOD)
-    for mass, verdict in ((0.97 * least, "active"), (1.03 * least, "passive")):
-        # an ordinary hand swings the tool; device and coupling are as they should be
-        device = unlimited(damping=DEVICE_DAMPING, path=PATH)
-        scene, coupling = tool_of(mass), coupling_of(9000.0)
-        report = recorded_and_audited(
-            scene, device, coupling, "explicit", PERIOD, 600, tmp_path, name=verdict
-        )
-        assert (report.verdict, report.certified) == (verdict, True)
-        assert report.resimulation == "bit for bit"
-        if verdict == "active":
-            assert report.port == "environment"
-            assert report.tick is not None and 0 < report.tick < 600
-
-
-def test_the_audit_names_the_device_where_the_worst_hand_holds_a_tool_too_heavy(
-    tmp_path: Path,
-) -> None:
-    # 'implicit' beyond (6): there a light tool is stable, and a heavy one in the worst hand is not
-    stiffness = 33_000.0
-    limit = float(predicted_limit("implicit", stiffness, is_held=False)["limit"])
-    for mass, verdict in ((4 * limit, "active"), (0.5 * limit, "passive")):
-        hand = hand_worst_for("implicit", stiffness, mass)
-        device = unlimited(damping=DEVICE_DAMPING, hand=hand)
-        report = recorded_and_audited(
-            tool_of(mass),
-            device,
-            coupling_of(stiffness),
-            "implicit",
-            PERIOD,
-            400,
-            tmp_path,
-            knock=KNOCK,
-            name=verdict,
-        )
-        assert (report.verdict, report.environment) == (verdict, "strict")
-        assert report.certified is False  # (6) is enough for any tool, and needed for a wall
-        assert report.port == ("device" if verdict == "active" else "")
-
-
 def cell(name: str, stiffness: float, *, held: bool, worst: bool, created: float = 0.0) -> Row:
     point: Point = {"what": "cell", "method": name, "stiffness": stiffness, "mass": 0.01}
     return point, {
@@ -243,61 +176,6 @@ def cell(name: str, stiffness: float, *, held: bool, worst: bool, created: float
         "slack_share": 0.0,
         "first_active": -1,
     }
-
-
-def limit_row(what: str, stiffness: float, mass: float, *, light: bool, heavy: bool) -> Row:
-    point: Point = {"what": what, "method": "explicit", "stiffness": stiffness, "mass": 0.0}
-    return point, {"limit": mass, "stable_if_light": light, "stable_if_heavy": heavy}
-
-
-NONE = float("nan")
-FULL = [
-    cell("explicit", 2000.0, held=True, worst=True, created=0.25),
-    cell("explicit", 20_000.0, held=False, worst=True, created=9.0),
-    cell("explicit", 29_000.0, held=True, worst=False, created=8.0),
-    cell("explicit", 31_000.0, held=False, worst=False, created=7.0),  # (6) is at 30 kN/m
-    cell("explicit", 50_000.0, held=True, worst=True, created=0.125),
-    # theory: 4.75 g, 7.5 g and 10 g at 9, 20 and 30 kN/m
-    limit_row("held still", 9000.0, 1.2 * 0.00475, light=False, heavy=True),
-    limit_row("held still", 20_000.0, NONE, light=True, heavy=True),
-    limit_row("held still", 30_000.0, 0.010, light=False, heavy=True),
-    limit_row("worst hand", 9000.0, NONE, light=False, heavy=False),
-    limit_row("worst hand", 40_000.0, NONE, light=False, heavy=False),
-]
-
-
-def test_what_is_read_is_what_the_table_says() -> None:
-    found = TOOL_MASS.read(written(FULL))
-    mine = found.boundary["methods"]["explicit"]
-    assert mine["points"] == 5
-    assert mine["unstable_held_still"] == 2
-    assert mine["points_below_6"] == 3
-    assert mine["unstable_below_6"] == 2
-    assert mine["most_created"] == 0.25
-    held, worst = mine["held still"], mine["worst hand"]
-    assert held["measured_mass"] == [1.2 * 0.00475, None, 0.010]
-    assert held["predicted_mass"] == pytest.approx([0.00475, 0.0075, 0.010], rel=1e-3)
-    assert held["worst_ratio_error"] == pytest.approx(0.2, rel=1e-2)
-    assert held["disagreements"] == 1  # where no limit was found and theory has one
-    assert "'explicit': held still, a tool is unstable at 2 of 5 points" in found.paragraph
-    assert worst["disagreements"] == 1  # beyond (6) nothing is stable, and theory says so too
-
-
-def test_a_limit_at_the_other_end_is_a_disagreement_too() -> None:
-    right = limit_row("held still", 9000.0, 0.00475, light=False, heavy=True)
-    turned = limit_row("held still", 9000.0, 0.00475, light=True, heavy=False)
-    for row, count in ((right, 0), (turned, 1)):
-        mine = TOOL_MASS.read(written([row])).boundary["methods"]["explicit"]["held still"]
-        assert mine["disagreements"] == count
-
-
-def test_what_failed_is_left_out_and_named() -> None:
-    found = TOOL_MASS.read(written([row for row in FULL if row[0]["what"] == "cell"]))
-    assert found.boundary["methods"]["implicit"] == {}
-    assert "held still" not in found.boundary["methods"]["explicit"]
-    TOOL_MASS.read(written([row for row in FULL if row[0]["what"] != "cell"]))
-    some = [(p, "SceneError: no") if p["what"] == "worst hand" else (p, got) for p, got in FULL]
-    assert "worst hand" not in TOOL_MASS.read(written(some)).boundary["methods"]["explicit"]
 
 
 def few(count: int) -> list[Point]:

@@ -19,13 +19,8 @@ from rendering_runs import WALL
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
-from hapticbridge.film_process import Stage
 from hapticbridge.guard import Limits
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Recording, Timeline, due_times, read_recording
-from hapticbridge.report import telling_time
-from hapticbridge.report.evidence import Evidence, draw_recording
-from hapticbridge.report.plots import draw_motion
 from hapticbridge.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
@@ -218,24 +213,3 @@ def test_a_timeline_finds_the_tick_nearest_to_any_time(late: Recording) -> None:
             off = np.abs(due - time)
             assert off[line.row_at(float(time))] <= off.min() + 1e-9
     assert Timeline([], T).duration == 0.0
-
-
-def test_a_picture_stands_where_the_clock_says(late: Recording) -> None:
-    stage = Stage(late.path)
-    assert stage.duration == pytest.approx(0.131)
-    assert [stage.tick_at(time) for time in (0.0, 0.020, 0.051, 0.131)] == [0, 19, 20, 99]
-    assert stage.tick_at(0.049) == 20  # in the stall of 31 ms, nearer to its end
-    assert stage.tick_at(0.022) == 19
-    # the picture of a report is of the tick that it is asked for
-    force = np.linalg.norm(late.ticks["wrench_on_tool"][:, :3], axis=1)
-    assert stage.tick_at(telling_time(late, audit(late.path))) == int(np.argmax(force))
-
-
-def test_the_slider_moves_on_the_clock(late: Recording, tmp_path: Path) -> None:
-    pytest.importorskip("viser", reason="needs the extra 'view'")
-    from hapticbridge.view.replay import Replay
-
-    replay = Replay(late.path)
-    assert [sight.time for sight in replay.sights] == pytest.approx([0.001, 0.02, 0.067, 0.1])
-    time, _ = replay.trace.curves()
-    np.testing.assert_allclose(time, [sight.time for sight in replay.sights])

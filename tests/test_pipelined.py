@@ -204,10 +204,8 @@ def test_energies_that_are_not_finite_end_in_zero_force(tmp_path: Path, pipeline
 def test_what_mujoco_cannot_split_or_would_reset_is_a_whole_step() -> None:
     rig = fast_run(FREE_BALL, at_rest(1))
     model, data, state = rig.scene.model, rig.scene.data, rig.binding.state[0]
-    splits = [
-        can_split(model, scheme) for scheme in (Scheme.IMPLICIT, Scheme.WELD, Scheme.MASSLESS)
-    ]
-    assert splits == [True, False, False]
+    schemes = (Scheme.IMPLICIT, Scheme.WELD, Scheme.MASSLESS)
+    assert [can_split(model, scheme) for scheme in schemes] == [True, False, False]
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     assert not can_split(model, Scheme.IMPLICIT)
     for value in (1e10, -1e11, np.inf, np.nan):

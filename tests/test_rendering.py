@@ -214,7 +214,7 @@ def test_inputs_that_cannot_be_metered_are_refused(method: str) -> None:
         with pytest.raises(SceneError, match="cannot meter the work of inputs"):
             bridge.set_input(body_wrench={"peg": np.zeros(6)})
         # a tool without coupling puts no condition on the device
-        found = run_conditions(bridge.device.info, bridge.parameters, bridge.method)
+        found = run_conditions(bridge.device.info, bridge.session.parameters, bridge.setup.method)
         assert len(found) == (0 if method == "direct" else 2)
 
 

@@ -22,8 +22,6 @@ from hapticbridge.lab.maps.base import (
     Point,
     Sentences,
     StabilityMap,
-    draw_verdicts,
-    paragraph,
     run_map,
     verdict_numbers,
 )
@@ -110,11 +108,6 @@ def test_too_few_points_and_a_file_for_a_folder_are_refused(tmp_path: Path) -> N
         run_map(SQUARES, blocker)
 
 
-def test_a_million_points_are_the_most(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match="1000000 at most"):
-        run_map(SQUARES, tmp_path, points=1_000_001)
-
-
 def test_a_file_that_cannot_be_written_is_noticed_before_the_sweep(tmp_path: Path) -> None:
     (tmp_path / "squares.png").mkdir()
     calls.clear()
@@ -165,32 +158,12 @@ def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
     assert [VERDICTS[i] for i in numbers] == ["strict", "active", "within slack", "unstable"]
 
 
-def test_cells_lie_around_their_points() -> None:
-    axes = new_figure(3, 3).subplots()
-    x, y = np.meshgrid([1.0, 10.0, 100.0], [0.0, 1.0])
-    verdict = np.arange(6).reshape(2, 3) % 4
-    draw_verdicts(axes, x.ravel(), y.ravel(), verdict.ravel(), log_x=True)
-    (mesh,) = axes.collections
-    assert np.array_equal(np.asarray(mesh.get_array()), verdict)
-    assert axes.get_xlim() == pytest.approx((10**-0.5, 10**2.5))
-    assert axes.get_ylim() == pytest.approx((-0.5, 1.5))
-
-
 def test_command_lists_the_maps_for_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stability", "couplings"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     for name in (*MAPS, "all"):
         assert f"'{name}'" in said
-
-
-def test_command_maps_with_a_pool_of_processes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["stability", "coupling", "--points", "20", "--out", str(tmp_path), "--json"]) == 0
-    (said,) = json.loads(capsys.readouterr().out)
-    assert said["map"] == "coupling"
-    assert (tmp_path / "coupling.png").is_file()
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -200,9 +173,3 @@ def test_a_table_without_a_computed_row_is_refused(name: str) -> None:
         MAPS[name].read(written(failed))
     with pytest.raises(StudyError, match=f"map '{name}': the table has no rows"):
         MAPS[name].read(without_rows(written(failed)))
-
-
-def test_a_sentence_that_lacks_a_number_is_left_out() -> None:
-    numbers = {"a": 0.5, "b": None}
-    said = paragraph([("{a:.0%}", numbers), ("{b:.0%}", numbers), ("{c}", numbers), ("end", {})])
-    assert said == "50%. end."

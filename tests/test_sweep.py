@@ -7,12 +7,10 @@ import functools
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -294,19 +292,6 @@ def test_a_line_that_a_crash_has_cut_is_computed_again(scratch: Path) -> None:
     assert computed(scratch)[11] == 2
 
 
-def test_an_executor_of_somebody_else_that_breaks_is_one_sentence() -> None:
-    class Broken(Executor):
-        def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
-            raise BrokenExecutor
-
-    with pytest.raises(StudyError, match=r"one of .*'stiffness': 1000.*fresh executor"):
-        sweep(functions.bound, POINTS, executor=Broken())
-    with ThreadPoolExecutor(1) as threads:
-        pass
-    with pytest.raises(StudyError, match="takes no tasks"):
-        sweep(functions.bound, POINTS, executor=threads)
-
-
 def test_a_file_of_another_function_or_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "kept"
     sweep(functions.bound, POINTS, results=path, jobs=1)
@@ -381,18 +366,3 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it(
         serial().write(tmp_path / "table.parquet")
     with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[cluster\]'"):
         sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
-
-
-def test_a_scheduler_that_does_not_answer_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port is closed, the protocol is unknown, or a server stays silent."""
-    distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr(sys.modules["hapticbridge.sweep.sweep"], "_PATIENCE", 0.2)
-    # a client that was refused is given up after 10 s, with a traceback that cannot be caught
-    monkeypatch.setattr(distributed, "Client", None)
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        port = silent.getsockname()[1]
-        for address in ("tcp://127.0.0.1:1", "nonsense://x", f"tcp://127.0.0.1:{port}"):
-            with pytest.raises(StudyError, match="no dask scheduler answers") as refusal:
-                sweep(functions.bound, POINTS, scheduler=address)
-            assert address in str(refusal.value)
-            assert "()" not in str(refusal.value)
