@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_tables import Row
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
@@ -164,18 +163,6 @@ def test_where_no_mass_is_stable_theory_has_no_limit() -> None:
     nowhere = predicted_limit("explicit", 40_000.0, is_held=False)
     assert (nowhere["stable_if_light"], nowhere["stable_if_heavy"]) == (False, False)
     assert np.isnan(nowhere["limit"])
-
-
-def cell(name: str, stiffness: float, *, held: bool, worst: bool, created: float = 0.0) -> Row:
-    point: Point = {"what": "cell", "method": name, "stiffness": stiffness, "mass": 0.01}
-    return point, {
-        "stable_held_still": held,
-        "stable_worst_hand": worst,
-        "environment": "strict",
-        "created": created,
-        "slack_share": 0.0,
-        "first_active": -1,
-    }
 
 
 def few(count: int) -> list[Point]:
