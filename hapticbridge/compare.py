@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.record import CLOCK_FIELDS, COLUMNS, TICK_DTYPE, Column, TickFlag
+from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, columns_of
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.run_description import meta_float
 
@@ -138,9 +138,6 @@ _IGNORED_FLAGS = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE)
 SHORTEST, LONGEST = 1e-9, 1e3
 """Range of periods in s; ticks are matched by whole ns in 64 bits."""
 
-COMPARED = tuple(column for column in COLUMNS if column.field not in CLOCK_FIELDS)
-"""Compared columns: every number of a record except times."""
-
 
 def compare(first: str | Path, second: str | Path) -> Comparison:
     """Compares two recordings tick by tick and bit by bit, in constant memory.
@@ -186,12 +183,12 @@ class _Found:
     def add_all(self, files: tuple[RecordingFile, RecordingFile]) -> None:
         """Compares all records with equal due times, block by block."""
         streams = self._due(files, 0), self._due(files, 1)
-        nothing = np.zeros(0, TICK_DTYPE), np.zeros(0, np.int64)
-        waiting = [nothing, nothing]
+        nothing = [(np.zeros(0, file.record), np.zeros(0, np.int64)) for file in files]
+        waiting = [*nothing]
         while True:
             for side in (0, 1):
                 if not waiting[side][0].size:
-                    waiting[side] = next(streams[side], nothing)
+                    waiting[side] = next(streams[side], nothing[side])
             (a, due_a), (b, due_b) = waiting
             if not (a.size and b.size):
                 break
@@ -223,10 +220,13 @@ class _Found:
             yield ticks, due
 
     def add(self, a: NDArray[np.void], b: NDArray[np.void]) -> None:
-        """Compares records of equal due times."""
+        """Compares records of equal due times in the fields that both have."""
         self.compared += len(a)
         earliest: tuple[int, Difference] | None = None
-        for column in COMPARED:
+        both = set(b.dtype.names or ()) - set(CLOCK_FIELDS)
+        for column in columns_of(a.dtype):
+            if column.field not in both:
+                continue
             x, y = _numbers(a, column), _numbers(b, column)
             unequal = x.view(np.int64) != y.view(np.int64)
             if not unequal.any():
@@ -303,5 +303,8 @@ def _notes(file: RecordingFile) -> Iterator[str]:
         yield f"{file.path} is cut; the rest is compared"
     elif file.digest != file.computed_digest:
         yield f"{file.path} does not match its digest: it was changed"
+    missing = [name for name in TICK_DTYPE.names or () if name not in (file.record.names or ())]
+    if missing:
+        yield f"{file.path} is of an earlier version, without {', '.join(missing)}"
     if file.problems:
         yield f"{file.path} is damaged: {'; '.join(file.problems)}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra
-from hapticbridge.record import COLUMNS, TICK_DTYPE, Column
+from hapticbridge.record import Column, columns_of
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.format import Timeline, due_times
 from hapticbridge.run_description import meta_float
@@ -29,7 +29,7 @@ class Sink(Protocol):
     def __init__(self, path: Path, recording: RecordingFile) -> None: ...
 
     def add(self, ticks: NDArray[np.void]) -> None:
-        """Appends records, ``TICK_DTYPE``."""
+        """Appends records."""
 
     def close(self) -> None:
         """Finishes the file."""
@@ -53,27 +53,28 @@ def sidecar_of(path: Path) -> Path:
 
 
 class CsvSink:
-    """CSV writer whose numbers read back to the same doubles; NaN loses its payload.
+    """CSV writer whose numbers read back bit for bit; only a NaN loses its payload.
 
     The header has names only. Units, metadata and events go to ``NAME.csv.json`` as one object
     ``{"units", "meta", "events"}``, because most programs cannot read comments in a CSV.
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
+        self._columns = columns_of(recording.record)
         about = {
-            "units": {column.name: column.unit for column in COLUMNS},
+            "units": {column.name: column.unit for column in self._columns},
             "meta": recording.meta,
             "events": recording.events,
         }
         text = json.dumps(about, indent=1, ensure_ascii=False)
         sidecar_of(path).write_text(text + "\n", encoding="utf-8")
         self._file = path.open("w", encoding="ascii", newline="")
-        self._file.write(",".join(column.name for column in COLUMNS) + "\n")
+        self._file.write(",".join(column.name for column in self._columns) + "\n")
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
         # repr of a float is the shortest text that reads back to it
-        texts = [map(repr, column_values(ticks, column).tolist()) for column in COLUMNS]
+        texts = [map(repr, column_values(ticks, column).tolist()) for column in self._columns]
         self._file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
     def close(self) -> None:
@@ -115,8 +116,8 @@ class Hdf5Sink:
         ticks = self._file.create_group("ticks")
         self._count = 0
         self._columns = []
-        for column in COLUMNS:
-            kind = TICK_DTYPE[column.field].base
+        for column in columns_of(recording.record):
+            kind = recording.record[column.field].base
             data = ticks.create_dataset(
                 column.name, (0,), kind, maxshape=(None,), chunks=(_CHUNK,), compression="gzip"
             )
@@ -152,15 +153,16 @@ class ParquetSink:
     def __init__(self, path: Path, recording: RecordingFile) -> None:
         self._arrow = import_extra("pyarrow", "Parquet", "tables", RecordingError)
         parquet = import_extra("pyarrow.parquet", "Parquet", "tables", RecordingError)
+        self._columns = columns_of(recording.record)
         kinds = {"i": self._arrow.int64(), "f": self._arrow.float64()}
         fields = [
             self._arrow.field(
                 column.name,
-                kinds[TICK_DTYPE[column.field].base.kind],
+                kinds[recording.record[column.field].base.kind],
                 nullable=False,
                 metadata={"unit": column.unit},
             )
-            for column in COLUMNS
+            for column in self._columns
         ]
         about = {
             "hapticbridge.meta": json.dumps(recording.meta),
@@ -174,7 +176,7 @@ class ParquetSink:
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
-        arrays = [self._arrow.array(column_values(ticks, column)) for column in COLUMNS]
+        arrays = [self._arrow.array(column_values(ticks, column)) for column in self._columns]
         self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:

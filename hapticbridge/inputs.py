@@ -43,8 +43,8 @@ def input_writes(
     Raises:
         SceneError: A name does not exist, belongs to the bridge, or has the wrong number of values.
     """
-    given = {"ctrl": ctrl, "mocap": mocap, "joint_force": joint_force, "body_wrench": body_wrench}
-    for kind, values in given.items():
+    inputs = {"ctrl": ctrl, "mocap": mocap, "joint_force": joint_force, "body_wrench": body_wrench}
+    for kind, values in inputs.items():
         if values is not None and not isinstance(values, Mapping):
             raise SceneError(
                 f"{kind} is {values!r:.80}; it must be values by name: {kind}={{'NAME': …}}"

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 
 
 def lazy_exports(
-    package: str, places: Mapping[str, str], present: tuple[str, ...] = ()
+    package: str, places: Mapping[str, str], present: tuple[str, ...]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Returns ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
 

@@ -289,7 +289,7 @@ class RunSetup:
             period_of(options.rate),
             options.substeps,
         )
-        scales, laws = options.workspace.scales, method.laws(substeps)
+        scales, laws = options.workspace.scales, method.law_evaluations(substeps)
         if options.mark is not None and not is_recorded:
             raise RecordingError(
                 f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
@@ -343,7 +343,7 @@ class RunSetup:
     @property
     def law_evaluations(self) -> int:
         """Evaluations of the wrench on the tool per tick."""
-        return self.method.laws(self.substeps)
+        return self.method.law_evaluations(self.substeps)
 
     @property
     def coupling_limits(self) -> CouplingLimits:

@@ -11,6 +11,7 @@ from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 class TickFlag(IntFlag):
@@ -75,6 +76,7 @@ TICK_DTYPE = np.dtype(
         ("device_energy", "<f8"),
         ("injected_damping", "<f8"),
         ("injected_rotational_damping", "<f8"),
+        ("share", "<f8"),
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
@@ -82,7 +84,16 @@ after the step. Positions are in m, quaternions (w, x, y, z) with w >= 0, energi
 works in J. Wrenches (force in N, torque in N m) are in the world frame about the grip
 (``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
-of that kind."""
+of that kind. ``share`` is the share of the wrench that ramp and fade transmitted, 0 to 1."""
+
+LATER_FIELDS = ("share",)
+"""Fields that recordings of earlier versions lack; such a recording is read without them."""
+
+
+def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> NDArray[np.bool_]:
+    """Returns True for each record with at least one of some flags."""
+    return np.asarray((ticks["flags"] & int(flag)) != 0)
+
 
 _POSITION, _QUATERNION = (("x", "y", "z"), "m"), (("w", "x", "y", "z"), "1")
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz"), "N"
@@ -142,6 +153,12 @@ def _columns() -> Iterator[Column]:
 
 COLUMNS = tuple(_columns())
 """All numbers of a record, in order."""
+
+
+def columns_of(record: np.dtype[np.void]) -> tuple[Column, ...]:
+    """Returns the columns of a record, which an earlier version may have written."""
+    return tuple(column for column in COLUMNS if column.field in (record.names or ()))
+
 
 CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
 """Fields that depend on the clock; they may differ between two runs with equal input."""

@@ -71,7 +71,7 @@ class Method:
         )
         return step
 
-    def laws(self, substeps: int) -> int:
+    def law_evaluations(self, substeps: int) -> int:
         """Returns the evaluations of the tool's wrench per tick."""
         return law_evaluations(self.scheme, substeps)
 

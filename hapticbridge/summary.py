@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -45,7 +45,7 @@ def was_never_lossless(count: int, flags: int) -> bool:
 
 
 def coupling_sentences(
-    used: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
+    law: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
 ) -> tuple[str, ...]:
     """Describes effective and law coupling: translation, then rotation if it has a spring.
 
@@ -55,7 +55,7 @@ def coupling_sentences(
     the device condition b >= K T/2 + B' counts B'.
 
     Args:
-        used: K and B' of the law.
+        law: K and B' of the law.
         method: The rendering method; without a coupling law there are no sentences.
         period: T in s.
         substeps: MuJoCo steps per tick.
@@ -64,36 +64,37 @@ def coupling_sentences(
     """
     if not method.has_law:
         return ()
-    kinds = [("K", "B", used.stiffness, used.damping, "N/m", "N s/m")]
-    if used.rotational_stiffness > 0:
-        rotation = used.rotational_stiffness, used.rotational_damping
-        kinds.append(("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
+    kinds = [_AxisGains("K", "B", law.stiffness, law.damping, "N/m", "N s/m")]
+    if law.rotational_stiffness > 0:
+        rotation = law.rotational_stiffness, law.rotational_damping
+        kinds.append(_AxisGains("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
     name, adds = method.name, method.adds
     if is_always_held and method.scheme == Scheme.MIDPOINT:
         name, adds = f"{name}, here always implicit,", IMPLICIT_LAG
-    return tuple(_sentence(name, adds, period / substeps, substeps, *kind) for kind in kinds)
+    return tuple(_sentence(name, adds, period / substeps, substeps, kind) for kind in kinds)
 
 
-def _sentence(
-    name: str,
-    adds: float | None,
-    step: float,
-    substeps: int,
-    spring: str,
-    damper: str,
-    stiffness: float,
-    damping: float,
-    spring_unit: str,
-    damper_unit: str,
-) -> str:
+class _AxisGains(NamedTuple):
+    """Gains of the law along one kind of axis, with their symbols and units."""
+
+    spring: str
+    damper: str
+    stiffness: float
+    damping: float
+    spring_unit: str
+    damper_unit: str
+
+
+def _sentence(name: str, adds: float | None, step: float, substeps: int, gains: _AxisGains) -> str:
+    spring, damper, stiffness, damping, spring_unit, damper_unit = gains
     start = f"{spring} = {stiffness:.4g} {spring_unit}, {damper} ="
     if adds is None:
         return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as asked)"
-    felt = effective_damping(stiffness, damping, step, adds)
+    effective = effective_damping(stiffness, damping, step, adds)
     parts = substeps / adds
     added = ("KT" if spring == "K" else f"{spring} T") + (f"/{parts:g}" if parts != 1 else "")
     return (
-        f"{start} {felt:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
+        f"{start} {effective:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
         f"{damping:.4g})"
     )
 

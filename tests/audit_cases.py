@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.audit.energy import EnergyBalance, Reached
+from hapticbridge.audit.energy import EnergyBalance, energy_balances
 from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.guard import AuditedBlock
+from hapticbridge.audit.state import AuditState
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -22,7 +24,7 @@ from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
-from hapticbridge.run_description import MODEL_ATTACHMENT, STARTS, meta_start
+from hapticbridge.run_description import MODEL_ATTACHMENT
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
 
@@ -49,21 +51,13 @@ TAP = """t,x,y,z,qw,qx,qy,qz
 """A hand that taps the mouth of the hole in every direction, off centre and tilted."""
 
 
-def balance_of(recording: Recording, parameters: RunParameters) -> EnergyBalance:
-    """Returns the balance of a whole recording from where its metadata says that it began."""
-    starts = {name: meta_start(recording.meta, name) for name in STARTS}
-    home = np.array(starts["tool_start"])
-    return EnergyBalance.of(
-        recording.ticks,
-        parameters,
-        Reached.at_start(
-            parameters,
-            np.array(starts["handle_start"]),
-            home,
-            starts["start_kinetic"][0] + starts["start_potential"][0],
-        ),
-        RunEvents.of(recording.events, parameters, home),
-    )
+def balance_of(
+    recording: Recording, parameters: RunParameters
+) -> tuple[AuditedBlock, EnergyBalance]:
+    """Returns a whole recording as one block, with its balance from the recorded start."""
+    state = AuditState.at_start(recording, parameters)
+    events = RunEvents.of(recording, parameters)
+    return next(energy_balances([recording.ticks], state, events))
 
 
 def recorded(
@@ -114,6 +108,7 @@ def rewritten(
         {**recording.meta, **(meta or {})},
         [Attachment(name, "application/octet-stream", data) for name, data in files.items()],
         int(recording.meta["epoch_ns"]),
+        record=(recording.ticks if ticks is None else ticks).dtype,
     )
     writer.write_ticks(recording.ticks if ticks is None else ticks)
     for event in recording.events if events is None else events:
@@ -127,6 +122,16 @@ def without_model(recording: Recording) -> Recording:
     """Leaves out what a re-simulation needs."""
     files = {name: data for name, data in recording.attachments.items() if name != MODEL_ATTACHMENT}
     return Recording(**{**vars(recording), "attachments": files})
+
+
+def without_share(recording: Recording) -> NDArray[np.void]:
+    """Returns the records as an earlier version wrote them."""
+    names = [name for name in recording.ticks.dtype.names or () if name != "share"]
+    record = np.dtype([(name, recording.ticks.dtype[name]) for name in names])
+    ticks = np.zeros(len(recording.ticks), record)
+    for name in names:
+        ticks[name] = recording.ticks[name]
+    return ticks
 
 
 class ScriptedDevice:

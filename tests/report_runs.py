@@ -131,11 +131,6 @@ def active_beside_a_fan(folder: Path) -> Path:
     return path
 
 
-def active_with_a_fine_encoder(folder: Path) -> Path:
-    """As by its rate, with an encoder without friction whose steps of 5 µm are no matter."""
-    return _held_to_an_anvil(folder / "fine.mcap", 10_000.0, 2.0, resolution=5e-6)
-
-
 def active_by_rotation(folder: Path) -> Path:
     """K_r T/2 = 0.01 N m s/rad on a device of 0.002."""
     scene, path = folder / "turn.xml", folder / "turn.mcap"

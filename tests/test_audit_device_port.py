@@ -12,7 +12,12 @@ from audit_cases import ScriptedDevice, balance_of, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.energy import EnergyBalance, stored_in_coupling
+from hapticbridge.audit.energy import (
+    EnergyBalance,
+    SpringPath,
+    stored_in_coupling,
+    work_of_commands,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
@@ -51,23 +56,21 @@ def test_the_balance_is_the_identity_behind_the_bound(change: float) -> None:
     b = RUN.coupling.damping * (1 + change * generator.uniform(-1, 1, count))
     none = np.zeros(count)
     gains = np.stack([k, b, none, none], axis=1)
+    gains_before = np.concatenate([gains[:1], gains[:-1]])
     h, x = generator.normal(0, 1e-3, (2, count, 3))
     d, moved = (np.diff(v, axis=0, prepend=np.zeros((1, 3))) for v in (h, x))
     e, de = h - x, d - moved
     force = k[:, None] * e + b[:, None] / T * de
     still = np.zeros((count, 3))
-    parts, held = stored_in_coupling(
-        RUN,
-        gains=(np.concatenate([gains[:1], gains[:-1]]), gains),
-        pulled=(e + moved, still),
-        stretch=(e, still),
-        stretched=(de, still),
-        work=(np.sum(force * moved, axis=1), np.zeros(count)),
-        passed=(np.ones(count), np.ones(count)),
-        since_start=np.arange(count, dtype=np.float64),
-        share=np.ones(count),
+    whole = np.ones(count)
+    paths = (
+        SpringPath(e + moved, e, de, np.sum(force * moved, axis=1), whole),
+        SpringPath(still, still, still, none, whole),
     )
-
+    share_before = np.concatenate([[0.0], whole[:-1]])
+    is_start = np.arange(count) == 0
+    parts, held = stored_in_coupling(RUN, gains, paths, is_start, whole, share_before)
+    parts = parts - work_of_commands(RUN, gains_before, gains, paths, share_before)
     kept = np.cumsum(parts) + held
 
     def norm(v: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
@@ -98,17 +101,14 @@ def kept(
     none = np.zeros((count, 3))
     coupling = run.coupling
     gains = np.tile([coupling.stiffness, coupling.damping, 0.0, 0.0], (count, 1))
-    parts, held = stored_in_coupling(
-        run,
-        gains=(gains, gains),
-        pulled=(e, none),
-        stretch=(e, none),
-        stretched=(none, none),
-        work=(np.full(count, work), np.zeros(count)),
-        passed=(np.full(count, passed), np.ones(count)),
-        since_start=np.arange(count, dtype=np.float64),
-        share=np.minimum(np.arange(1.0, count + 1) / (run.ramp_ticks + 1), 1.0),
+    share = np.minimum(np.arange(1.0, count + 1) / (run.ramp_ticks + 1), 1.0)
+    paths = (
+        SpringPath(e, e, none, np.full(count, work), np.full(count, passed)),
+        SpringPath(none, none, none, np.zeros(count), np.ones(count)),
     )
+    share_before = np.concatenate([[0.0], share[:-1]])
+    is_start = np.arange(count) == 0
+    parts, held = stored_in_coupling(run, gains, paths, is_start, share, share_before)
     return [float(value) for value in np.cumsum(parts) + held]
 
 
@@ -146,7 +146,7 @@ def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:
             duration=0.2,
             workspace=Workspace(force_scale=force_scale),
         )
-        lost.append(kicked(path, 0.0, 0.0))
+        lost.append(unpaid(path, 0.0, 0.0))
     assert np.abs(lost[0]).max() > 1e-6
     np.testing.assert_allclose(lost[1], 0.5 * lost[0], rtol=1e-9, atol=1e-15)
 
@@ -157,12 +157,12 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
     parameters = replace(
         parameters_of(recording.meta), device_damping=damping, device_rotational_damping=rotational
     )
-    return balance_of(recording, parameters)
+    return balance_of(recording, parameters)[1]
 
 
-def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
+def unpaid(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
     """Returns what the device of a recording was given beyond what is paid for, in J."""
-    return balance(path, damping, rotational).kicked
+    return balance(path, damping, rotational).unpaid_energy
 
 
 @pytest.mark.parametrize(
@@ -170,8 +170,8 @@ def kicked(path: Path, damping: float | None = None, rotational: float = 1.0) ->
     [
         (1, 10.0, {}),
         (2, 0.3, {}),  # the force is limited most of the time
-        (3, 10.0, {"scale": 2.0}),
-        (4, 10.0, {"force_scale": 0.5}),
+        (3, 10.0, {"workspace": Workspace(scale=2.0)}),
+        (4, 10.0, {"workspace": Workspace(force_scale=0.5)}),
     ],
 )
 def test_a_device_that_bears_the_coupling_is_never_kicked(
@@ -182,7 +182,7 @@ def test_a_device_that_bears_the_coupling_is_never_kicked(
     limits = Limits(force=limit, torque=0.5, ramp=0.1)
     coupling = Coupling(2000.0, 0.5, 2.0, 5e-4)
     recorded(path, "peg_in_hole", device, coupling, duration=1.0, limits=limits, **options)
-    lost = kicked(path, 10.0)
+    lost = unpaid(path, 10.0)
     assert lost.max() <= 1e-12
     assert lost.min() < -1e-4  # and it is not zero by nature
 
@@ -190,7 +190,7 @@ def test_a_device_that_bears_the_coupling_is_never_kicked(
 def test_where_damping_is_unknown_nobody_can_tell(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     recorded(path, "point_mass", "simulated", duration=0.1)
-    assert not kicked(path).any()
+    assert not unpaid(path).any()
 
 
 @pytest.mark.parametrize("limit", [0.3, 1e3])
@@ -210,7 +210,7 @@ def test_what_the_scene_creates_within_its_slack_is_not_the_devices_fault(
     created = found.environment_energy
     assert created.max() > 1e-9
     assert np.all(created <= found.slack + 1e-12)
-    assert found.kicked.max() <= 1e-12
+    assert found.unpaid_energy.max() <= 1e-12
 
 
 class Turning(ScriptedDevice):

@@ -14,6 +14,7 @@ from audit_cases import (
     rewritten,
     verdict_of,
     without_model,
+    without_share,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -258,6 +259,38 @@ def test_numpy_alone_finds_what_exceeds_its_tolerance(
     assert report.resimulation == ""
 
 
+OLDER = {"versions": json.dumps(versions() | {"hapticbridge": "0.0.1"})}
+
+
+@pytest.mark.parametrize("meta", [{}, OLDER])
+def test_a_recording_without_the_share_is_read_judged_and_repaired(
+    tap: Recording, held: Recording, tmp_path: Path, meta: dict[str, str]
+) -> None:
+    for number, recording in enumerate((tap, held)):
+        old = tmp_path / f"{number}.mcap"
+        rewritten(recording, old, ticks=without_share(recording), meta=meta)
+        assert "share" not in (read_recording(old).ticks.dtype.names or ())
+        report = audit(old)
+        assert report.verdict == "passive", report.reason
+        assert report.energies == pytest.approx(audit(recording.path).energies)
+        if meta:
+            assert "without 'share' by an earlier version" in report.unchecked
+        else:
+            assert report.resimulation == "bit for bit"
+        old.write_bytes(old.read_bytes()[:-100])
+        assert repair(old, tmp_path / f"{number}_mended.mcap").record == without_share(tap).dtype
+
+
+@pytest.mark.parametrize(("name", "amount"), [("wrench_on_tool", 1e-6), ("wrench_on_device", 11.0)])
+def test_a_recording_without_the_share_is_still_held_to_law_and_limit(
+    held: Recording, folder: Path, name: str, amount: float
+) -> None:
+    ticks = without_share(held)
+    ticks[name][150, 2] += amount
+    report = verdict_of(held, folder, ticks=ticks, meta=OLDER)
+    assert (report.verdict, report.port, report.tick) == ("invalid", name, 150)
+
+
 def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder: Path) -> None:
     other = {"versions": json.dumps(versions() | {"mujoco": "3.0"})}
     report = verdict_of(tap, folder, meta=other)
@@ -265,6 +298,9 @@ def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder:
     assert report.resimulation == (
         f"not re-simulated: recorded with mujoco 3.0, here is {mujoco.__version__}"
     )
+    assert "wrench_on_device and share" in report.unchecked
+    assert report.unchecked in report.reason
+    assert not verdict_of(tap, folder).unchecked
     # below NumPy's tolerance, so only the re-simulation can tell; with it the same is invalid
     ticks = tap.ticks.copy()
     ticks["kinetic"][60] *= 1 + 1e-12

@@ -1,4 +1,4 @@
-"""What a device's own rate and delay do to its condition, its default coupling, and its verdict."""
+"""A device's rate and delay in its condition, its default coupling and its verdict."""
 
 from __future__ import annotations
 

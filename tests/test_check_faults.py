@@ -1,3 +1,5 @@
+"""Faults planted in a scene, each named with its line and a change that mends it."""
+
 from __future__ import annotations
 
 from pathlib import Path

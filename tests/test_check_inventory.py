@@ -1,3 +1,5 @@
+"""Counts of what a scene models, against MuJoCo's own."""
+
 from __future__ import annotations
 
 from pathlib import Path

@@ -307,8 +307,8 @@ def test_what_is_only_seen_goes_and_its_mass_stays(tmp_path: Path) -> None:
 def test_mass_stays_where_geoms_overrule_what_is_written(tmp_path: Path) -> None:
     weight = '<geom size="0.02" pos="0.05 0 0" mass="0.5" contype="0" conaffinity="0"/>'
     overruled = '<inertial pos="0 0 0" mass="9" diaginertia="1 1 1"/>'
-    text = block_of_mesh(BOX, weight + overruled)
-    text = text.replace("<mujoco>", '<mujoco><compiler inertiafromgeom="true"/>')
+    compiler = '<mujoco><compiler inertiafromgeom="true"/>'
+    text = block_of_mesh(BOX, weight + overruled).replace("<mujoco>", compiler)
     draft = draft_of(tmp_path, text)
     changed = draft.copy()
     assert all_of(draft, PRESS)["nothing only seen"].edit(changed)

@@ -8,7 +8,6 @@ import pytest
 from check_scenes import PLANTS, bench, line_of
 
 from hapticbridge.cli import main
-from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import scene_path
 
@@ -113,30 +112,6 @@ def test_parameters_of_a_scene_are_checked_as_set(capsys: pytest.CaptureFixture[
     before = other["inventory"]
     assert isinstance(before, dict)
     assert inventory["deepest"] != before["deepest"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nowhere"], "no scene is called 'nowhere'"),
-        (["peg_in_hole", "--grip", "handle_bar"], "no site 'handle_bar'"),
-        (["peg_in_hole", "--motion", "none.csv"], "none.csv"),
-        (["peg_in_hole", "--workspace", "-1"], "workspace is -1.0 m"),
-        (["peg_in_hole", "--rate", "0"], "rate"),
-        (["peg_in_hole", "--stiffness", "nan"], "stiffness"),
-        (["peg_in_hole", "--scale", "0"], "scale"),
-        (["peg_in_hole", "--plot", "check.txt"], "must end in"),
-        (["peg_in_hole", "--set", "weight=1"], "no parameter 'weight'"),
-    ],
-)
-def test_bad_input_is_one_sentence(
-    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["check", *arguments]) == USAGE_ERROR
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("error:") == 1
-    assert "Traceback" not in said
 
 
 def test_check_leaves_no_log_of_mujocos_warnings(

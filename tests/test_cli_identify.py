@@ -44,13 +44,6 @@ def test_a_profile_that_cannot_be_written_costs_no_measurement(
     assert "cannot write" in told.err and "Traceback" not in told.err
 
 
-def test_the_help_says_which_hand_cannot_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["identify", "--help"])
-    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "one that only damps cannot be told from the device" in told
-
-
 def test_as_json_it_tells_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["identify", FREE, "--axes", "y", "--duration", "5", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -80,24 +73,3 @@ def test_a_z_width_that_is_not_known_is_not_drawn_and_it_says_why(
     assert told in captured.out and told in " ".join(captured.err.split())
     assert "not measured: " in captured.out
     assert not width.exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["simulated"], "were not commanded: let go of it"),
-        ([FREE, "--axes", "q"], "--axes q: the device has 'rx', 'ry', 'rz', 'x', 'y', 'z'"),
-        ([FREE, "--travel", "nan"], "--travel is nan m; it must be 0.0001 to 1"),
-        ([FREE, "--duration", "0.5"], "--duration is 0.5 s; it must be 2 to 600"),
-        ([FREE, "--force-share", "1.5"], "--force-share is 1.5; it must be 0.001 to 1"),
-        ([FREE, "--plot", "fit.txt"], "must end in"),
-        ([FREE, "--plot", "a.png", "--zwidth", "a.png"], "--plot and --zwidth both name 'a.png'"),
-        (["no-such-device"], "unknown device 'no-such-device'"),
-    ],
-)
-def test_bad_input_gets_one_sentence(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["identify", *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error and "Traceback" not in error

@@ -40,7 +40,6 @@ NOT_FOR_A_RUN = frozenset(
         "pyarrow",
         "h5py",
         "http.cookies",
-        "mcap",
         "hapticbridge.device.discovery",
         "hapticbridge.device.falcon",
         "hapticbridge.device.force_dimension",

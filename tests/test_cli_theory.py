@@ -29,19 +29,6 @@ class Told:
         return json.loads(self.out, parse_constant=pytest.fail)
 
 
-def test_zwidth_names_lines_limit_corner_and_next_command(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    told = Told(ZWIDTH, capsys)
-    assert told.code == 0
-    assert "passive for any hand 4000 N/m 2 N s/m b > K T/2 + B'" in told.words
-    assert "free of limit cycles 10000 N/m 5 N s/m" in told.words
-    assert "stable without a hand 4013.4 N/m" in told.words
-    assert "limited by: passive for any hand" in told.out
-    assert "use K = 2400 N/m, B = 1.7 N s/m felt (lossless adds KT/2 to its B' = 0.5)" in told.words
-    assert told.out.endswith("next: hapticbridge run SCENE --stiffness 2400 --damping 1.7\n")
-
-
 def test_next_command_of_zwidth_runs_and_is_certified(capsys: pytest.CaptureFixture[str]) -> None:
     command = Told(f"{ZWIDTH} --rate 2000 --delay 1 --json", capsys).json()["next"]
     assert "--rate 2000" in command
@@ -72,36 +59,6 @@ def test_zwidth_as_json_holds_the_whole_region(capsys: pytest.CaptureFixture[str
     assert [line["required"] for line in facts["lines"]] == [True, True, True]
 
 
-def test_zwidth_tells_of_limit_cycles_delay_and_low_pass(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    told = Told("zwidth --damping 2 --friction 0 --resolution 1e-5 --delay 1", capsys)
-    assert "passive against a wall" in told.out
-    assert "not kept" in told.out
-    assert "expect limit cycles" in told.out
-    assert "no general bound exists" in told.out
-    told = Told("zwidth --damping 2 --filter-time 0.001", capsys)
-    assert "next:" not in told.out
-    assert "leave --filter-time out" in told.out
-
-
-def test_bound_shows_every_alternative(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told(BOUND, capsys)
-    assert told.code == 0
-    for row in (
-        r"method lossless: B = 1 felt, B' = 0 1 N s/m every frequency",
-        r"method compensated: B = 2 felt, B' = 0 1 N s/m every frequency",
-        r"method implicit: B = 3 felt, B' = 1 2 N s/m 500 Hz",
-        r"B' = B at half the period 1\.5 N s/m 1000 Hz",
-        r"B' = B, low-pass of 1 ms on the damper 1\.333 N s/m 500 Hz",
-        r"B' = B, Tustin's damper none suffices 500 Hz",
-        r"B' = B, one tick late, against a wall 2\.5 N s/m 166\.7 Hz",
-        r"B' = B, one tick late, any environment none suffices -",
-        r"transmission line of that stiffness 2 N s/m every frequency",
-    ):
-        assert re.search(row, told.words)
-
-
 @pytest.mark.parametrize(
     ("coupling", "needed", "changes"),
     [
@@ -129,9 +86,7 @@ def test_bound_judges_a_device_and_says_what_helps(
     told = Told(f"bound {coupling} --device-damping 2", capsys)
     assert told.code == 1
     changes = [*changes, f"take a device with {needed} N s/m"]
-    assert f"device damping 2 < {needed} N s/m: not passive in any hand {' '.join(changes)}" in (
-        told.words
-    )
+    assert f"not passive in any hand {' '.join(changes)}" in told.words
     # each piece of advice is right, and only just
     rate = 1000.0
     for change in changes[:-1]:
@@ -145,19 +100,6 @@ def test_bound_judges_a_device_and_says_what_helps(
         for share, code in ((1.0, 0), (0.99, 1)):
             command = f"bound --stiffness {stiffness} --damping {damping} --rate {rate}"
             assert Told(f"{command} --device-damping {2 * share}", capsys).code == code
-
-
-def test_bound_tells_what_a_device_bears(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told("bound --stiffness 2000 --damping 1.5 --device-damping 2", capsys)
-    assert told.code == 0
-    assert "any K up to 4000 N/m with any B up to 2 N s/m" in told.out
-    assert "cannot show" not in told.out
-    assert "next: hapticbridge run SCENE --stiffness 2000 --damping 1.5\n" in told.out
-    assert Told("bound --stiffness 4000 --damping 2 --device-damping 2", capsys).code == 0
-    assert Told("bound --stiffness 4001 --damping 2 --device-damping 2", capsys).code == 1
-    assert Told("bound --stiffness 4000 --damping 2.01 --device-damping 2", capsys).code == 1
-    told = Told("bound --stiffness 2000 --damping 0.5 --device-damping 2", capsys)
-    assert "method lossless cannot show less than B = 1 N s/m" in told.words
 
 
 @pytest.mark.parametrize(("device", "code", "holds"), [("", 0, None), ("0.9", 1, False)])
@@ -186,86 +128,12 @@ def test_picture_is_written_where_it_is_wanted(
     assert (tmp_path / "out.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("command", "sentence"),
-    [
-        ("zwidth --damping 0", "device damping is 0 N s/m"),
-        ("zwidth --damping nan", "device damping is nan"),
-        ("zwidth --damping 2 --mass -1", "mass is -1 kg"),
-        ("zwidth --damping 2 --delay -1", "delay is -1"),
-        ("zwidth --damping 2 --rate 0", "rate is 0.0 Hz"),
-        ("zwidth --damping 2 --plot x.gif", "must end in"),
-        ("bound --stiffness -1", "stiffness is -1"),
-        ("bound --stiffness inf", "stiffness is inf"),
-        ("bound --stiffness 1 --rate nan", "rate is nan Hz"),
-        ("bound --stiffness 1 --filter-time -1", "filter time is -1 s"),
-        ("bound --stiffness 1 --device-damping 0", "device damping is 0 N s/m"),
-        ("bound --stiffness 1 --plot x", "must end in"),
-        ("bound --stiffness 1 --plot /nowhere/x.png", "cannot write '/nowhere/x.png'"),
-    ],
-)
-def test_bad_values_are_refused_in_a_sentence(
-    command: str, sentence: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = Told(command, capsys)
-    assert told.code == 2
-    assert sentence in told.err
-    assert "Traceback" not in told.err
-
-
-@pytest.mark.parametrize("command", ["zwidth", "bound"])
-def test_help_holds_an_example(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
-    assert stop.value.code == 0
-    out = capsys.readouterr().out
-    assert f"hapticbridge {command}" in out.split("usage:")[1].partition("\n")[2]
-    assert "{None}" not in out
-
-
 def test_bound_of_a_plain_spring_names_no_frequency(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told("bound --stiffness 2000", capsys)
-    assert "Tustin's damper 1 N s/m every frequency" in told.words
-    assert "500 Hz" not in told.words
     facts = Told("bound --stiffness 2000 --json", capsys).json()
     assert facts["frequency_hz"] is None
     assert facts["alternatives"][5] == {
         "name": "B' = B, Tustin's damper", "needed": 1.0, "frequency_hz": None
     }  # fmt: skip
-
-
-def test_a_heavy_device_is_limited_by_the_hand(capsys: pytest.CaptureFixture[str]) -> None:
-    told = Told("zwidth --damping 2 --mass 1e9", capsys)
-    assert "stable without a hand 4000 N/m" in told.words
-    assert "limited by: passive for any hand" in told.out
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "zwidth --damping 1e300",
-        "zwidth --damping 1e30 --rate 1e6",
-        "zwidth --damping 1e-300",
-        "zwidth --damping 2 --mass 1e300",
-        "zwidth --damping 2 --friction 1e300 --resolution 1e-5",
-        "zwidth --damping 2 --filter-time 1e300",
-        "zwidth --damping 2 --delay 1000",
-        "bound --stiffness 1e300",
-        "bound --stiffness 1e-300",
-        "bound --stiffness 1 --damping 1e300",
-        "bound --stiffness 1 --filter-time 1e300",
-        "bound --stiffness 1 --device-damping 1e300",
-    ],
-)
-@pytest.mark.parametrize("option", ["", " --json"])
-def test_extreme_numbers_are_refused_in_one_line(
-    command: str, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    told = Told(command + option, capsys)
-    assert told.code == 2
-    assert told.out == ""
-    assert told.err.startswith("error: ")
-    assert "between 1e-30 and 1e+30" in " ".join(told.err.split()) or "delay is 1000" in told.err
 
 
 @pytest.mark.parametrize(

@@ -40,23 +40,6 @@ def test_a_device_of_less_damping_than_was_said_is_found_out(
     assert "bears less" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ([], "zwidth needs --damping, and it is missing"),
-        (["--measure", FREE, "--axis", "rx"], "--axis rx: the device moves by force along"),
-        (["--measure", FREE, "--delay", "2"], "leave --filter-time and --delay out"),
-        (["--measure", "falcon"], "no device 'falcon' is plugged in"),
-    ],
-)
-def test_bad_input_gets_one_sentence(
-    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["zwidth", *words]) == 2
-    error = capsys.readouterr().err
-    assert told in error and "Traceback" not in error
-
-
 def test_a_device_is_closed_whatever_was_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
 

@@ -227,7 +227,7 @@ def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float
     allowed = replace(allowance(delay=delay), substeps=substeps)
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
         used = allowed.law(allowed.requested(Couple(stiffness, damping), COUPLING))
-        laws = allowed.method.laws(substeps)
+        laws = allowed.method.law_evaluations(substeps)
         said = required_axis_damping(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
         need = allowed.translation.needed(stiffness, damping)
         if substeps == 1 and not delay:

@@ -1,3 +1,5 @@
+"""The contract that every device fulfils, and the refusals of data sheets and specifications."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -343,5 +345,4 @@ def test_the_device_in_the_protocols_description_is_a_whole_one(tmp_path: Path) 
     with hb.Bridge("point_mass", names["Rail"](), clock=hb.SimulatedClock(), recording=path) as run:
         summary = run.run(0.5)
     assert summary.is_certified is True
-    assert 0.1 < summary.peak_force < 10.0
     assert hb.audit(path).verdict == "passive"

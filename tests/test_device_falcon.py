@@ -1,9 +1,10 @@
-"""A Falcon in the loop: what it reports, what it does with a force, and how it is lost."""
+"""A Falcon from power-on to its loss: program, homing, samples, forces."""
 
 from __future__ import annotations
 
 import array
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -244,8 +245,7 @@ def _program(tmp_path: Path) -> str:
 def test_a_falcon_with_its_program_is_not_loaded_again(program: str) -> None:
     bench = Bench()
     bench.opened(firmware=program).close()
-    assert bench.model.uploaded == b""
-    assert bench.told == []
+    assert (bench.model.uploaded, bench.told) == (b"", [])
 
 
 def test_the_program_arrives_byte_for_byte_and_its_progress_is_told(program: str) -> None:
@@ -263,43 +263,39 @@ def test_without_program_and_file_the_option_is_named() -> None:
     assert bench.link.is_closed
 
 
-def test_an_echo_that_differs_is_named_by_its_byte(program: str) -> None:
-    bench = Bench(program=None)
-    bench.model.faults.bad_echo_at = 1234
-    there, back = PROGRAM[1234], PROGRAM[1234] ^ 0x40
-    words = rf"sent back 0x{back:02x} for byte 1234 \(0x{there:02x}\) of its firmware; switch"
+ECHO = rf"sent back 0x{PROGRAM[1234] ^ 0x40:02x} for byte 1234 \(0x{PROGRAM[1234]:02x}\) of"
+
+
+@pytest.mark.parametrize(
+    ("fault", "valid", "words"),
+    [
+        ({"bad_echo_at": 1234}, PROGRAM, ECHO),
+        ({}, b"the maker's", r"accepted '.*falcon.bin' but does not answer"),
+        ({"is_deaf": True}, PROGRAM, "its loader does not answer; switch its power off"),
+    ],
+)
+def test_a_program_that_does_not_arrive_or_run_is_told(
+    program: str, fault: dict[str, Any], valid: bytes, words: str
+) -> None:
+    bench = Bench(program=None, valid=valid)
+    for name, value in fault.items():
+        setattr(bench.model.faults, name, value)
     with pytest.raises(DeviceError, match=words):
-        bench.opened(firmware=program)
-
-
-def test_a_program_that_does_not_run_is_no_firmware(program: str) -> None:
-    bench = Bench(program=None, valid=b"the maker's")
-    with pytest.raises(DeviceError, match=r"accepted '.*falcon.bin' but does not answer"):
-        bench.opened(firmware=program)
-
-
-def test_a_loader_that_stays_silent_is_given_up(program: str) -> None:
-    bench = Bench(program=None)
-    bench.model.faults.is_deaf = True
-    with pytest.raises(DeviceError, match="its loader does not answer; switch its power off"):
         bench.opened(firmware=program)
     assert bench.time.now < 15.0
 
 
-@pytest.mark.parametrize(
-    ("size", "words"),
-    [(None, "cannot be read"), (0, "has 0 bytes"), (70_000, "has 70000 bytes; a Falcon's fi")],
-)
-def test_a_file_that_is_no_program_is_refused(tmp_path: Path, size: int | None, words: str) -> None:
-    path = tmp_path / "image"
-    if size is not None:
-        path.write_bytes(bytes(size))
-    with pytest.raises(DeviceError, match=words):
-        read_firmware(str(path))
-    with pytest.raises(DeviceError, match="cannot be read"):
-        read_firmware(str(tmp_path))
-    with pytest.raises(DeviceError, match="cannot be read"):
-        read_firmware("a\0b")
+def test_a_file_that_is_no_program_is_refused(tmp_path: Path) -> None:
+    empty, large = tmp_path / "empty", tmp_path / "large"
+    empty.write_bytes(b"")
+    large.write_bytes(bytes(70_000))
+    for path, words in (
+        (empty, "has 0 bytes"),
+        (large, "has 70000 bytes; a Falcon's firm"),
+        *((path, "cannot be read") for path in (tmp_path / "none", tmp_path, "a\0b")),
+    ):
+        with pytest.raises(DeviceError, match=words):
+            read_firmware(str(path))
 
 
 def test_an_unhomed_falcon_waits_until_the_grip_has_passed_its_zeros(tmp_path: Path) -> None:

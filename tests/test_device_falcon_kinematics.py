@@ -1,3 +1,5 @@
+"""The Falcon's geometry against another writing of it, differences and published numbers."""
+
 from __future__ import annotations
 
 import math

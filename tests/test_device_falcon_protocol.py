@@ -1,3 +1,5 @@
+"""The Falcon's packets as the protocol describes them, whole and damaged."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -251,9 +251,10 @@ def test_one_of_several_is_chosen_by_its_number() -> None:
     device.start(PERIOD)
     ticks(bench, device, 10)
     assert device.info.serial == "049E"
-    first, second = bench.service.devices.values()
-    assert second.force.any()
-    assert not first.force.any()
+    assert [inverse.force.any() for inverse in bench.service.devices.values()] == [False, True]
+    bench.service.devices.clear()
+    with pytest.raises(DeviceError, match=r"is plugged in \(looked for a device of the Inverse"):
+        bench.opened()
 
 
 @pytest.mark.parametrize("device_id", ["", "../049D", 7, None, "x" * 65])
@@ -261,15 +262,6 @@ def test_a_number_that_is_no_name_is_refused(device_id: object) -> None:
     told = {"session_id": 1, "inverse3": [{"device_id": device_id}]}
     with pytest.raises(DeviceError, match="without a device_id"):
         messages.inventory(json.dumps(told))
-
-
-def test_a_service_without_devices_says_so() -> None:
-    bench = Bench()
-    bench.service.devices.clear()
-    with pytest.raises(
-        DeviceError, match=r"no device 'haply' is plugged in \(looked for a device of the Inverse"
-    ):
-        bench.opened()
 
 
 def test_scaled_positions_are_refused_because_their_work_is_none() -> None:

@@ -35,6 +35,7 @@ from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
 from hapticbridge.identify import identify
 from hapticbridge.identify.profile import measured_profile
+from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.scene import load_scene, scene_path
 
@@ -95,7 +96,7 @@ def stick(name: str = "usual", model: PidStick | None = None) -> Rig:
     device, model, seam = opened_stick(model, damping=4.0, mass=0.25, travel=WIDE)
     # the scene lies in x and z, the stick in x and y
     axes = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    scene = {"scene": "planar_peg", "axes": axes}
+    scene = {"scene": "planar_peg", "workspace": Workspace(axes=axes)}
     later = lambda s: model.advance(seam.now + s)  # noqa: E731
     return Rig(device, DrivingClock(seam), model, seam, model.force, later, scene)
 
@@ -143,12 +144,13 @@ def rows(recording: Path) -> NDArray[np.void]:
 def test_the_peg_goes_in_behind_it_and_is_audited_passive(name: str, tmp_path: Path) -> None:
     make, condition = RIGS[name]
     rig, recording = make(), tmp_path / "run.mcap"
-    summary = rig.run(recording, 4.0)
+    seconds = 2.5 if name == "falcon" else 4.0  # emulated bit by bit, it is the slowest
+    summary = rig.run(recording, seconds)
     report, ticks = hb.audit(recording), rows(recording)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.certified is None
     assert condition in report.conditions[0]
-    assert summary.ticks == len(ticks) == 4000
+    assert summary.ticks == len(ticks) == 1000 * seconds
     assert (ticks["flags"] & int(TickFlag.CONTACT)).any()
     assert summary.peak_force > 0.05
     assert name not in {"haply", "omega.3", "sigma.7"} or ticks["tool_position"][-1, 2] < 0.0

@@ -1,3 +1,5 @@
+"""Force-feedback sticks behind the real driver, in virtual time."""
+
 from __future__ import annotations
 
 import math
@@ -244,7 +246,12 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
     quantities = {"force_limit": Quantity(7.0, "a gauge"), "workspace": room}
     profile = Profile("stick", "pid", "P1", None, "", quantities)
     asked: list[tuple[str, str, str]] = []
-    monkeypatch.setattr(sheet, "profile_of", lambda *given: asked.append(given) or profile)
+
+    def profile_of(device: str, serial: str, model: str) -> Profile:
+        asked.append((device, serial, model))
+        return profile
+
+    monkeypatch.setattr(sheet, "profile_of", profile_of)
     model = PidStick()
     model.place = (1.0, 0.0)
     device = open_pid({"damping": 1.0, "newtons": 7.0}, ignore_message, HidSeam(model))

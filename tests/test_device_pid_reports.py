@@ -1,3 +1,5 @@
+"""PID reports against the table that made the descriptor."""
+
 from __future__ import annotations
 
 import dataclasses

@@ -1,3 +1,5 @@
+"""Raw HID devices behind the real driver, in virtual time."""
+
 from __future__ import annotations
 
 import math
@@ -47,7 +49,8 @@ def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
     assert (info.damping, info.mass, info.force_limit) == (0.4, 0.06, 4.0)
     info = opened(RawHid(None, Claims(delay=5e-4)))[0].info
     # what the device adds, a state of one period's age, and 1 ms on the bus each way
-    assert (info.axes, info.delay) == (AXES, pytest.approx(5e-4 + 1e-3 + 2e-3))
+    assert info.axes == AXES
+    assert info.delay == pytest.approx(5e-4 + 1e-3 + 2e-3)
     # what does not move along a line needs no limit of force
     info = opened(RawHid(None, Claims(axes=0b100000, force_limit=NAN)))[0].info
     assert (info.axes, info.force_limit > 0.0) == (("rz",), True)

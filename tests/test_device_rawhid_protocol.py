@@ -1,3 +1,5 @@
+"""Frames of the raw HID protocol: document, codec, and the reference firmware compiled here."""
+
 from __future__ import annotations
 
 import ctypes

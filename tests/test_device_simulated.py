@@ -1,3 +1,5 @@
+"""The simulated device against ODE solvers, closed forms and the theory's own loop."""
+
 from __future__ import annotations
 
 import math

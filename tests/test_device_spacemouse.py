@@ -1,3 +1,5 @@
+"""SpaceMouse pucks behind the real driver, in virtual time."""
+
 from __future__ import annotations
 
 import math

@@ -1,3 +1,5 @@
+"""Motions from files and recordings, against NumPy's and SciPy's interpolation."""
+
 from __future__ import annotations
 
 import os

@@ -1,3 +1,5 @@
+"""The link over hidapi on an emulated device, and its log."""
+
 from __future__ import annotations
 
 import importlib

@@ -1,4 +1,4 @@
-"""The link over pyusb, with pyusb real and an emulated device in place of libusb."""
+"""The link over pyusb, with pyusb real and an emulated device in place of libusb; its context."""
 
 from __future__ import annotations
 

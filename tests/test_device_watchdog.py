@@ -1,4 +1,4 @@
-"""When a device counts as gone: silence is counted in readings, not in time alone."""
+"""Silence of a device, counted in readings and not in time alone."""
 
 from __future__ import annotations
 

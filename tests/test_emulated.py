@@ -1,4 +1,4 @@
-"""What emulated devices are to pyusb, and how the handle behind them moves."""
+"""Emulated devices as pyusb sees them, and the motion of the handle behind them."""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_no_file(recording: Path) 
     foreign.write_bytes(b"nothing")
     nowhere = recording.parent / "no" / "out.parquet"
     ends = "no tick was due from 7 s to 8 s; the recording ends at 0.15 s"
-    for call, message in (
+    table: list[tuple[Callable[[], object], str]] = [
         (lambda: export(recording, "csv", span=(0.1, 0.1)), "from 0.1 s to 0.1 s is empty"),
         (lambda: export(recording, "csv", span=(0.2, 0.1)), "its end must be later"),
         (lambda: export(recording, "csv", span=(math.nan, 0.1)), "is empty"),
@@ -251,7 +251,8 @@ def test_what_cannot_be_exported_is_refused_and_leaves_no_file(recording: Path) 
         (lambda: export(recording, "parquet", nowhere), r"the folder .* does not exist"),
         (lambda: export(recording, "xls"), r"'xls' is unknown.*'csv', 'hdf5', 'parquet'"),
         (lambda: export(foreign, "csv"), "not an MCAP file"),
-    ):
+    ]
+    for call, message in table:
         with pytest.raises(RecordingError, match=message):
             call()
     assert {path.name for path in recording.parent.iterdir()} == {"run.mcap", "foreign.mcap"}

@@ -1,4 +1,4 @@
-"""A file is there whole or not at all."""
+"""Files that are there whole or not at all, and JSON of finite numbers."""
 
 from __future__ import annotations
 

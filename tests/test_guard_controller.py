@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.guard import capped_sum
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -277,13 +276,14 @@ def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either
     assert observer["generated_energy"][0] == pytest.approx(0.008)
 
 
-def test_the_audits_capped_sum_is_the_recursion() -> None:
-    values = np.random.default_rng(4).normal(0.0, 0.02, (500, 2))
-    total, expected = np.zeros(2), []
-    for row in values:
-        total = np.maximum(total + row, -0.05)
-        expected.append(total)
-    np.testing.assert_allclose(capped_sum(values, 0.05), expected, atol=1e-15)
+def test_a_changed_injected_damping_does_not_pass_the_audit(tmp_path: Path) -> None:
+    knocked(tmp_path, 1.5, None, "damper")
+    recording = read_recording(tmp_path / "run.mcap")
+    ticks = recording.ticks.copy()
+    at = int(np.argmax(ticks["injected_damping"]))
+    ticks["injected_damping"][at] *= 1.01
+    report = verdict_of(recording, tmp_path, ticks=ticks)
+    assert (report.verdict, report.port, report.tick) == ("invalid", "injected_damping", at)
 
 
 def test_a_recording_from_before_the_guard_is_judged_as_it_was(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What ``identify`` says of devices whose numbers are known."""
+"""Identification of devices whose numbers are known, and refusals of runs that tell nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""A run of S seconds lasts S seconds of its clock, whatever was missed on the way."""
+"""Missed deadlines: how long a run lasts, what its device bears, and the one clock of all pictures.
+
+A device is pushed into a spring and comes out again in equal steps δ. The force that is held from
+one sample to the next gives it ½Kδ² a step more than the spring's energy, and its damper burns
+bδ²/t in the time t of a step: it is kicked where K/2 > b/t, the bound b > Kt/2 with the true t.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,7 @@ from hapticbridge.summary import Summary
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.4])
+@pytest.mark.parametrize("seconds", [0.1, 0.4])
 def test_a_run_that_misses_deadlines_ends_when_the_clock_says(
     tmp_path: Path, seconds: float
 ) -> None:
@@ -118,7 +123,7 @@ def check(summary: Summary, report: AuditReport, *, is_kicked: bool) -> None:
         assert report.port == "device"
 
 
-@pytest.mark.parametrize("missed", [0, 1, 2, 5])
+@pytest.mark.parametrize("missed", [0, 1, 5])
 @pytest.mark.parametrize("excess", [0.95, 1.05])
 def test_a_device_is_kicked_where_k_exceeds_2b_over_the_time_of_a_hold(
     tmp_path: Path, missed: int, excess: float
@@ -165,6 +170,37 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     device = ScriptedDevice(report_runs.circling)
     recorded(path, "point_mass", device, duration=0.131, clock=SlowClock(STALLS), on_tick=change)
     return read_recording(path)
+
+
+def rows(due: list[int]) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    made = np.zeros(len(due), TICK_DTYPE)
+    made["tick"], made["deadline_ns"] = np.arange(len(due)), due
+    return made
+
+
+def test_curves_and_events_stand_on_the_same_clock(late: Recording) -> None:
+    evidence = Evidence.of(late)
+    assert evidence is not None
+    assert len(late.ticks) == 100
+    [change] = [event for event in late.events if event["event"] == "coupling"]
+    tick, at = change["tick"], 1e-9 * change["time_ns"]
+    assert tick >= CHANGED > 20  # counted in ticks it would stand 30 ms earlier
+    assert evidence.time[tick - 1] <= at <= evidence.time[tick] + T
+    stop = 1e-9 * late.events[-1]["time_ns"]
+    assert evidence.time[-1] == pytest.approx(stop) == pytest.approx(0.131)
+    for figure in (draw_motion(evidence), draw_recording(late)):
+        drawn = figure.axes[0].lines[0].get_xdata()
+        assert np.max(drawn) == pytest.approx(0.131)
+
+
+@pytest.mark.parametrize(
+    "due", [[1_000_000, 2_000_000, 3_000_000], [1, 5, 4], [3, 3, 4], [0, 1, 2], [-(2**63), 1, 2]]
+)
+def test_a_tick_is_due_at_the_end_of_its_period_also_where_deadlines_cannot_be(
+    due: list[int],
+) -> None:
+    np.testing.assert_allclose(due_times(rows(due), T), (T, 2 * T, 3 * T))
+    assert due_times(rows([]), T).shape == (0,)
 
 
 def test_a_timeline_finds_the_tick_nearest_to_any_time(late: Recording) -> None:

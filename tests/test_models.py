@@ -1,4 +1,4 @@
-"""The scenes of models/: what their files promise, and what happens on their own hand paths."""
+"""The scenes of models/: their files, their contact, and the pegs on their own hand paths."""
 
 from __future__ import annotations
 

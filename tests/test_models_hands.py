@@ -1,4 +1,4 @@
-"""Every scene in eight random hands of 3 cm and 45 degrees for 5 s: finite, passive, in bounds."""
+"""Every scene in random hands of 3 cm and 45 degrees, and in the hand that it asks for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scenes of hand tools: each does its task on its own hand path."""
+"""The scenes of hand tools on their own hand paths: tasks, forces, torques."""
 
 from __future__ import annotations
 

@@ -115,6 +115,8 @@ def test_the_force_rises_slower_by_what_the_coupling_holds_beyond_the_allowance(
     steps = np.diff(np.linalg.norm(ticks["wrench_on_device"][30:300, :3], axis=1))
     full = min(float(np.linalg.norm(ticks["wrench_on_tool"][200, :3])), 10.0)
     assert np.median(steps) == pytest.approx(full / (RAMP + 1) / slower, rel=0.02)
+    rises = np.diff(ticks["share"][30:300])
+    assert np.median(rises) == pytest.approx(1 / (RAMP + 1) / slower, rel=0.02)
 
 
 def test_about_an_axis_too(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.device.profile import SHIPPED, Profile, profile_named, profiles
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
+from hapticbridge.options import Workspace
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 
@@ -50,7 +51,7 @@ def clutched(path: Path, reach: float | None, asked: float | None = None, **opti
 def test_a_device_that_knows_its_reach_is_let_go_beyond_it(tmp_path: Path, scale: float) -> None:
     """It counts the device's own metres: a scale moves the handle, not the stops."""
     path = tmp_path / "run.mcap"
-    summary, distance, is_clutched = clutched(path, REACH, scale=scale)
+    summary, distance, is_clutched = clutched(path, REACH, workspace=Workspace(scale=scale))
     assert is_clutched.tolist() == (distance > REACH).tolist()
     assert 100 < np.count_nonzero(is_clutched) < 600
     assert summary.reach == REACH

@@ -1,4 +1,4 @@
-"""What is asked of the system: given back, never refused in silence. Nothing grows in a tick."""
+"""Requests to the system: given back, never refused in silence. Nothing grows in a tick."""
 
 from __future__ import annotations
 
@@ -105,15 +105,7 @@ def facts() -> tuple[Any, ...]:
     return policy, priority, os.sched_getaffinity(0), slack, gc.isenabled(), gc.get_freeze_count()
 
 
-def test_everything_is_given_back_also_after_an_error() -> None:
-    before = facts()
-    with pytest.raises(KeyError), real_time():
-        assert facts() != before
-        raise KeyError
-    assert facts() == before
-
-
-def test_the_collector_and_the_lock_are_given_back(library: Library) -> None:
+def test_everything_is_given_back_also_after_an_error(library: Library) -> None:
     before = facts()
     with pytest.raises(KeyError), memory_at_rest() as grants:
         assert all(grant.is_granted for grant in grants)
@@ -122,6 +114,10 @@ def test_the_collector_and_the_lock_are_given_back(library: Library) -> None:
         assert library.asked[-1] != 0
         raise KeyError
     assert library.asked[-1] == 0
+    assert facts() == before
+    with pytest.raises(KeyError), real_time():
+        assert facts() != before
+        raise KeyError
     assert facts() == before
 
 
@@ -251,15 +247,20 @@ def test_a_refused_core_is_told_with_remedy(
             warn_of_refusals((core,))
 
 
-def test_who_wants_real_time() -> None:
-    real, simulated = RealClock(), SimulatedClock()
-    assert wants_real_time(None, real, is_real=True)
-    assert not wants_real_time(None, real, is_real=False)
-    assert not wants_real_time(None, simulated, is_real=False)
-    assert not wants_real_time(False, real, is_real=True)
-    assert wants_real_time(True, real, is_real=False)
+@pytest.mark.parametrize(
+    ("asked_for", "clock", "is_real", "is_wanted"),
+    [
+        (None, RealClock, True, True),
+        (None, RealClock, False, False),
+        (None, SimulatedClock, False, False),
+        (False, RealClock, True, False),
+        (True, RealClock, False, True),
+    ],
+)
+def test_who_wants_real_time(asked_for: Any, clock: Any, is_real: bool, is_wanted: bool) -> None:
+    assert wants_real_time(asked_for, clock(), is_real=is_real) == is_wanted
     with pytest.raises(HapticBridgeError, match="simulated clock"):
-        wants_real_time(True, simulated, is_real=False)
+        wants_real_time(True, SimulatedClock(), is_real=False)
 
 
 def test_a_run_without_permission_says_so_and_records_it(refusing: Library, tmp_path: Path) -> None:

@@ -255,7 +255,11 @@ def test_cyclictest_takes_its_turns_where_it_is_and_may(
 ) -> None:
     late = cyclictest.parsed(output)
     asked: list[tuple[Any, ...]] = []
-    turn = lambda *given, **_: asked.append(given) or (output if late is None else late)  # noqa: E731
+
+    def turn(*given: Any, **_locks: bool) -> Any:
+        asked.append(given)
+        return output if late is None else late
+
     monkeypatch.setattr(cyclictest, "is_there", lambda: True)
     monkeypatch.setattr(cyclictest, "run", turn)
     monkeypatch.setattr(diagnosis, "current_priority", lambda: 40)

@@ -1,3 +1,5 @@
+"""The recorder's process: every record of a run, also of one that is killed."""
+
 from __future__ import annotations
 
 import io
@@ -67,7 +69,7 @@ def ring() -> Iterator[Ring]:
 
 
 def process_of(recorder: Recorder) -> int:
-    return recorder._process.pid
+    return recorder.pid
 
 
 def test_recorder_writes_every_record_and_event_of_a_run(ring: Ring, tmp_path: Path) -> None:
@@ -203,11 +205,11 @@ recorder.event({"event": "start"}, 0)
 rows, done = numbered(0, int(count)), 0
 while done < rows.size:
     done += ring.append(rows[done:])
-print(recorder._process.pid, ring.name, flush=True)
+print(recorder.pid, ring.name, flush=True)
 if victims == "both":
     while ring.pending():
         time.sleep(0.005)
-    os.kill(recorder._process.pid, signal.SIGKILL)
+    os.kill(recorder.pid, signal.SIGKILL)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 

@@ -1,3 +1,5 @@
+"""The ring between two processes, against a queue."""
+
 from __future__ import annotations
 
 import subprocess
@@ -176,17 +178,13 @@ def test_ring_of_a_killed_process_is_swept_and_a_living_one_is_not(shared: Ring)
     assert Path(str(shared.name)).exists()
 
 
-@pytest.mark.parametrize("capacity", [0, -1])
-def test_ring_without_room_is_refused(capacity: int) -> None:
-    with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
-        Ring.local(capacity)
-    with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
-        Ring.shared(capacity)
-
-
 @pytest.mark.parametrize("content", [b"", b"short", bytes(4096), b"hbring01" + b"\xff" * 4096])
-def test_file_that_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_what_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "ring"
     path.write_bytes(content)
     with pytest.raises(RecordingError, match="ring"):
         Ring.attach(str(path))
+    for make in (Ring.local, Ring.shared):
+        for capacity in (0, -1):
+            with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
+                make(capacity)

@@ -39,16 +39,10 @@ def test_a_scene_is_drawn_or_the_missing_renderer_is_named(tmp_path: Path) -> No
     # drivers differ in edges and shadows, not in what is where
     assert drawn.shape == shipped.shape
     assert np.median(np.abs(drawn - shipped)) < 8
-    with Image.open(tmp_path / "all.png") as picture:
-        assert picture.width == 800
-
-
-def test_a_renderer_that_does_not_work_is_named_in_one_sentence(tmp_path: Path) -> None:
-    done = render("virtual_wall", "--out", tmp_path, MUJOCO_GL="disable")
-    assert done.returncode == 2
-    assert "MUJOCO_GL=disable does not work here, so" in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+    for file in (tmp_path / "all.png", ROOT / "scripts/figures/scenes.png"):
+        assert file.stat().st_size < 300_000
+        with Image.open(file) as picture:
+            assert picture.width == 800
 
 
 @pytest.mark.parametrize("name", scene_names())

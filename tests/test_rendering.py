@@ -1,4 +1,4 @@
-"""Every method goes through one interface, one record and one audit."""
+"""Rendering methods: one interface, what each creates, what each needs, and what each refuses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded, rewritten, without_model
-from kernel_runs import T, live, load, samples_of, sines, unlimited, wrench_law
+from kernel_runs import T, load, samples_of, sines, unlimited, wrench_law
 from rendering_runs import (
     COUPLING,
     FREE,
@@ -36,7 +36,7 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import OK
@@ -45,6 +45,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, check_prepared, default_method, method_named, prepare
 from hapticbridge.scene import load_scene
@@ -52,6 +53,7 @@ from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand
 
 HAZARDOUS = [name for name in METHODS if METHODS[name].hazard]
+MOVED_BY = SERVO.replace("{mocap}", "false").replace("{actuator}", "{}")
 PROVEN = ("implicit", "compensated", "lossless")
 
 
@@ -88,12 +90,6 @@ def test_compiled_advance_equals_the_python_binding(name: str, substeps: int) ->
         assert binding.row[0].tobytes() == run.ticks[k].tobytes()
 
 
-def test_prepare_without_a_method_is_the_default_one() -> None:
-    samples = waved()
-    run = rendered("implicit", COUPLING, samples, TURNED_TOOL)
-    assert run.ticks.tobytes() == live(TURNED_TOOL, samples, COUPLING).ticks.tobytes()
-
-
 @pytest.mark.parametrize(
     "name",
     [n for n in METHODS if METHODS[n].has_law and METHODS[n].scheme == IMPLICIT.scheme]
@@ -103,11 +99,6 @@ def test_wrench_is_the_coupling_law_at_the_recorded_poses(name: str) -> None:
     run = rendered(name, COUPLING, waved(), TURNED_TOOL)
     scale = np.abs(run.ticks["wrench_on_tool"]).max()
     assert run.ticks["wrench_on_tool"] == pytest.approx(wrench_law(run), abs=1e-11 * scale)
-
-
-def test_unknown_method_lists_those_that_exist() -> None:
-    with pytest.raises(SceneError, match=r"'direct', 'explicit', 'explicit:implicitfast'"):
-        method_named("impedance")
 
 
 @pytest.mark.parametrize("name", HAZARDOUS)
@@ -121,62 +112,129 @@ def test_on_a_real_device_only_what_is_proven_goes_unasked(name: str) -> None:
         Bridge("point_mass", Rotor(is_real=True), COUPLING, method=proven)
 
 
-@pytest.mark.parametrize("name", ["weld", "implicit", "explicit"])
-def test_stiffness_beyond_all_magnitudes_is_refused(name: str) -> None:
-    with pytest.raises(SceneError, match="between 1e-30 and 1e\\+30"):
-        prepare(load(FREE_MASS.format(mass=0.05)), Coupling(1e300, 0, 0, 0), T, 1, METHODS[name])
+NO_EQUALITY = '<option><flag equality="disable"/></option></mujoco>'
+UNPREPARED = [
+    # method, scene, message
+    ("implicit", FREE_MASS.format(mass=0.05), "between 1e-30 and 1e\\+30"),
+    ("direct", "virtual_wall", "free joint"),
+    ("direct", SERVO.format(gravcomp=0, mocap="false", actuator=""), "other joints"),
+    (
+        "direct",
+        SERVO.format(gravcomp=0, mocap="true", actuator='<motor joint="arm"/>'),
+        "other joints and actuators and mocap bodies",
+    ),
+    ("weld", "virtual_wall", "1 of 6"),
+    (
+        "weld",
+        FREE_MASS.format(mass=0.05).replace("</mujoco>", NO_EQUALITY),
+        "disables flag equality, and a weld is an equality",
+    ),
+    # work that an integrator hides
+    ("explicit:rk4", MOVED_BY.format('<motor name="m" joint="arm"/>', gravcomp=0), "'m'"),
+    ("explicit:rk4", MOVED_BY.format("", gravcomp=1), "gravity compensation"),
+    ("implicitfast", MOVED_BY.format('<velocity name="v" joint="arm" kv="1"/>', gravcomp=0), "'v'"),
+    ("weld", MOVED_BY.format('<position name="p" joint="arm" kv="1"/>', gravcomp=0), "'p'"),
+]
+
+
+@pytest.mark.parametrize(("method", "scene", "message"), UNPREPARED)
+def test_a_scene_that_a_method_cannot_render_is_refused(
+    method: str, scene: str, message: str
+) -> None:
+    loaded = load(scene) if scene.lstrip().startswith("<") else load_scene(scene)
+    coupling = Coupling(1e300, 0, 0, 0) if method == "implicit" else COUPLING
+    with pytest.raises(SceneError, match=message):
+        prepare(loaded, coupling, T, 1, method_named(method))
+    prepare(loaded, COUPLING, T, 1)
+
+
+PARAMETERS: dict[str, Any] = {
+    "grip": "grip",
+    "period": T,
+    "substeps": 1,
+    "coupling": COUPLING,
+    "force_limit": 1.0,
+    "torque_limit": 1.0,
+    "ramp_ticks": 0,
+    "device_origin": (0, 0, 0, 1, 0, 0, 0),
+    "handle_origin": (0, 0, 0, 1, 0, 0, 0),
+    "device_start": (0, 0, 0, 1, 0, 0, 0),
+}
+MASSLESS = METHODS["direct"].scheme
 
 
 @pytest.mark.parametrize(
-    ("method", "claimed"),
-    [("explicit", "implicit"), ("implicitfast", "implicit"), ("explicit", "explicit:rk4")],
+    ("changes", "message"),
+    [
+        ({"scheme": 7}, "scheme is 7"),
+        ({"scheme": MASSLESS}, r"contact stiffness is 0\.0"),
+        ({"contact_stiffness": 5.0}, r"contact stiffness is 5\.0"),
+        ({"scheme": MASSLESS, "contact_stiffness": 5.0, "substeps": 2}, "substeps is 2"),
+    ],
 )
-def test_recording_that_claims_another_method_is_invalid(
-    method: str, claimed: str, tmp_path: Path
+def test_parameters_that_contradict_each_other_are_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(HapticBridgeError, match=message):
+        RunParameters(**(PARAMETERS | changes))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "impedance"}, r"'direct', 'explicit', 'explicit:implicitfast'"),
+        ({"contact_stiffness": 500.0}, "only 'direct'"),
+        ({"method": "lossless", "substeps": 2}, "substeps is 2; a lossless coupling"),
+        *(
+            ({"method": "direct", "contact_stiffness": value}, "contact stiffness")
+            for value in (0.0, -1.0, math.nan, math.inf, 1e-31, 1e308)
+        ),
+        *(({"substeps": n}, "substeps is .* whole number") for n in (0, 101, 1.5, math.nan)),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused_wherever_it_enters(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(HapticBridgeError, match=message):
+        Bridge("peg_in_hole", "simulated", **options)
+    if "substeps" in options and "method" not in options:
+        with pytest.raises(CouplingError, match=message):
+            required_damping(LIGHT, T, options["substeps"])
+        with pytest.raises(CouplingError, match=message):
+            default_coupling(SimulatedDevice().info, T, laws=options["substeps"])
+        with pytest.raises(HapticBridgeError, match=message):
+            ClosedLoop(load_scene("point_mass")).run(
+                SimulatedDevice(), LIGHT, METHODS["implicit"], **options
+            )
+
+
+@pytest.mark.parametrize("method", ["explicit:rk4", "direct"])
+def test_inputs_that_cannot_be_metered_are_refused(method: str) -> None:
+    with Bridge("peg_in_hole", Rotor(), clock=SimulatedClock(), method=method) as bridge:
+        with pytest.raises(SceneError, match="cannot meter the work of inputs"):
+            bridge.set_input(body_wrench={"peg": np.zeros(6)})
+        # a tool without coupling puts no condition on the device
+        found = run_conditions(bridge.device.info, bridge.session.parameters, bridge.setup.method)
+        assert len(found) == (0 if method == "direct" else 2)
+
+
+@pytest.mark.parametrize(
+    ("method", "claim"),
+    [
+        ("explicit", {"method": "implicit"}),
+        ("implicitfast", {"method": "implicit"}),
+        ("explicit", {"method": "explicit:rk4"}),
+        ("weld", {"felt": "[1.0, 0.0, 0.0, 0.0]"}),
+    ],
+)
+def test_recording_that_claims_another_method_or_a_softer_weld_is_invalid(
+    method: str, claim: dict[str, str], tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
     recorded(path, "point_mass", "simulated", duration=0.1, method=method)
-    changed = rewritten(read_recording(path), tmp_path / "b.mcap", meta={"method": claimed})
-    assert audit(changed).verdict == "invalid"
-
-
-def test_parameters_that_contradict_each_other_are_refused() -> None:
-    common: dict[str, Any] = {
-        "grip": "grip",
-        "period": T,
-        "substeps": 1,
-        "coupling": COUPLING,
-        "force_limit": 1.0,
-        "torque_limit": 1.0,
-        "ramp_ticks": 0,
-        "device_origin": (0, 0, 0, 1, 0, 0, 0),
-        "handle_origin": (0, 0, 0, 1, 0, 0, 0),
-        "device_start": (0, 0, 0, 1, 0, 0, 0),
-    }
-    direct = METHODS["direct"].scheme
-    with pytest.raises(HapticBridgeError, match="scheme is 7"):
-        RunParameters(**common, scheme=7)
-    with pytest.raises(HapticBridgeError, match=r"contact stiffness is 0\.0"):
-        RunParameters(**common, scheme=direct)
-    with pytest.raises(HapticBridgeError, match=r"contact stiffness is 5\.0"):
-        RunParameters(**common, contact_stiffness=5.0)
-    with pytest.raises(HapticBridgeError, match="substeps is 2"):
-        RunParameters(**(common | {"substeps": 2}), scheme=direct, contact_stiffness=5.0)
-
-
-def test_fake_real_device_needs_its_own_flag_in_its_sheet() -> None:
-    info: DeviceInfo = Rotor(is_real=True).info
-    assert info.is_real
-    assert DeviceInfo.from_json(info.to_json()) == info
-
-
-def test_a_tool_without_coupling_has_no_condition_on_the_device() -> None:
-    for method, count in (("direct", 0), ("implicit", 2)):
-        with Bridge("peg_in_hole", clock=SimulatedClock(), method=method) as bridge:
-            found = run_conditions(
-                bridge.device.info, bridge.session.parameters, bridge.setup.method
-            )
-            assert len(found) == count
+    report = audit(rewritten(read_recording(path), tmp_path / "b.mcap", meta=claim))
+    assert report.verdict == "invalid"
+    assert method != "weld" or "weld" in report.reason
 
 
 def test_geometry_touching_within_a_margin_pushes_on_nothing() -> None:
@@ -293,34 +351,6 @@ def test_a_knock_or_missed_ticks_burn_nothing_that_was_not_burnt(timing: Timing 
     assert outcome.fault[1] == "device"
 
 
-@pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        ("virtual_wall", "free joint"),
-        (SERVO.format(gravcomp=0, mocap="false", actuator=""), "other joints"),
-        (
-            SERVO.format(gravcomp=0, mocap="true", actuator='<motor joint="arm"/>'),
-            "other joints and actuators and mocap bodies",
-        ),
-    ],
-)
-def test_massless_tool_refuses_a_scene_in_which_more_moves(scene: str, message: str) -> None:
-    loaded = load(scene) if scene.lstrip().startswith("<") else load_scene(scene)
-    with pytest.raises(SceneError, match=message):
-        prepare(loaded, COUPLING, T, 1, method_named("direct"))
-
-
-@pytest.mark.parametrize("stiffness", [0.0, -1.0, math.nan, math.inf, 1e-31, 1e308])
-def test_bad_contact_stiffness_is_refused(stiffness: float) -> None:
-    with pytest.raises(SceneError, match="contact stiffness"):
-        Bridge("peg_in_hole", "simulated", method="direct", contact_stiffness=stiffness)
-
-
-def test_contact_stiffness_belongs_to_direct_alone() -> None:
-    with pytest.raises(SceneError, match="only 'direct'"):
-        Bridge("peg_in_hole", "simulated", contact_stiffness=500.0)
-
-
 def test_created_energies_of_one_free_mass_are_those_of_the_theory() -> None:
     """K = 2000, B = 2, 50 g, 3 Hz for 2 s: none, 0.29 J for actuators that miss the position."""
     samples = sway()
@@ -377,23 +407,12 @@ def test_held_force_diverges_on_a_light_tool_where_implicit_is_strict(name: str)
     assert fault[1] == "environment"
     safe = rendered("implicit", COUPLING, sway(300), light)
     assert safe.ledger.environment == "strict"
+    for mass, is_bounded in ((0.00140, False), (0.00165, True)) if name == "explicit" else ():
+        run = rendered(name, COUPLING, sway(2000), FREE_MASS.format(mass=mass))
+        assert (len(run.ticks) == 2000) == is_bounded
 
 
-@pytest.mark.parametrize(("mass", "is_bounded"), [(0.00140, False), (0.00165, True)])
-def test_held_force_needs_the_mass_that_the_theory_says(mass: float, is_bounded: bool) -> None:
-    run = rendered("explicit", COUPLING, sway(2000), FREE_MASS.format(mass=mass))
-    assert (len(run.ticks) == 2000) == is_bounded
-
-
-@pytest.mark.parametrize(
-    ("name", "mass"),
-    [
-        ("implicitfast", 0.002),
-        ("explicit", 0.0006),
-        ("explicit:implicitfast", 0.0006),
-        ("explicit:rk4", 0.004),
-    ],
-)
+@pytest.mark.parametrize(("name", "mass"), [("implicitfast", 0.002), ("explicit:rk4", 0.004)])
 def test_meter_and_audit_name_the_tick_at_which_energy_was_created(
     name: str, mass: float, tmp_path: Path
 ) -> None:
@@ -417,33 +436,6 @@ def test_meter_and_audit_name_the_tick_at_which_energy_was_created(
     assert reports[name].port == "environment"
     assert f"tick {reports[name].tick}" in reports[name].reason
     assert (reports["implicit"].verdict, reports["implicit"].environment) == ("passive", "strict")
-
-
-@pytest.mark.parametrize(
-    ("method", "actuator", "gravcomp", "message"),
-    [
-        ("explicit:rk4", '<motor name="m" joint="arm"/>', 0, "'m'"),
-        ("explicit:rk4", "", 1, "gravity compensation"),
-        ("implicitfast", '<velocity name="v" joint="arm" kv="1"/>', 0, "'v'"),
-        ("weld", '<position name="p" joint="arm" kv="1"/>', 0, "'p'"),
-    ],
-)
-def test_scene_whose_ports_cannot_be_metered_is_refused(
-    method: str, actuator: str, gravcomp: int, message: str
-) -> None:
-    scene = load(SERVO.format(gravcomp=gravcomp, mocap="false", actuator=actuator))
-    with pytest.raises(SceneError, match=message):
-        prepare(scene, COUPLING, T, 1, method_named(method))
-    prepare(scene, COUPLING, T, 1)
-
-
-@pytest.mark.parametrize("method", ["explicit:rk4", "direct"])
-def test_inputs_that_cannot_be_metered_are_refused(method: str) -> None:
-    with (
-        Bridge("peg_in_hole", Rotor(), clock=SimulatedClock(), method=method) as bridge,
-        pytest.raises(SceneError, match="cannot meter the work of inputs"),
-    ):
-        bridge.set_input(body_wrench={"peg": np.zeros(6)})
 
 
 @pytest.mark.parametrize("method", ["explicit", "explicit:implicitfast", "implicitfast"])
@@ -552,16 +544,6 @@ def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
         assert sides + needed / T * np.sum(d**2) > -1e-12
 
 
-def test_audit_says_what_a_mean_leaves_unchecked(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    recorded(path, "peg_in_hole", "simulated", duration=0.2, substeps=4)
-    report = audit(path)
-    assert (report.resimulation, report.verdict) == ("bit for bit", "passive")
-    assert "re-simulation alone" in report.unchecked
-    recorded(path, "peg_in_hole", "simulated", duration=0.2)
-    assert audit(path).unchecked == ""
-
-
 @pytest.mark.parametrize(
     ("method", "substeps", "verdict"),
     [
@@ -576,7 +558,12 @@ def test_what_only_a_resimulation_confirms_is_not_called_passive_without_one(
 ) -> None:
     path = tmp_path / "run.mcap"
     recorded(path, "point_mass", duration=0.1, method=method, substeps=substeps)
-    assert audit(path).verdict == "passive"
+    known = audit(path)
+    assert known.verdict == "passive"
+    if substeps > 1:  # a mean leaves the law unchecked
+        assert (known.resimulation, known.unchecked != "") == ("bit for bit", True)
+        assert "re-simulation alone" in known.unchecked
+    assert method != "implicit" or substeps > 1 or known.unchecked == ""
     bare = rewritten(without_model(read_recording(path)), tmp_path / "bare.mcap")
     report = audit(bare)
     assert report.verdict == verdict
@@ -628,22 +615,6 @@ def test_true_stiffness_of_a_weld_is_mass_times_k_over_one_minus_d(
         assert moved == pytest.approx(1e-2, rel=2e-4)
 
 
-def test_weld_carries_changes_over_and_comes_off_again() -> None:
-    scene = load(FREE_MASS.format(mass=0.05))
-    scene.model.body_mass[scene.model.body("tool").id] = 0.2
-    mujoco.mj_setConst(scene.model, scene.data)
-    scene.model.opt.gravity[:] = 0, 0, -1
-    plain = scene.model
-    felt = prepare(scene, COUPLING, T, 1, method_named("weld"))
-    assert felt is not None
-    assert felt.stiffness == pytest.approx(0.2 * 2000 / 0.05, rel=1e-6)
-    assert scene.model.opt.gravity.tolist() == [0, 0, -1]
-    assert scene.model.neq == 1
-    assert prepare(scene, COUPLING, T, 1) is None
-    assert scene.model.neq == 0
-    assert (scene.model.body_mass == plain.body_mass).all()
-
-
 def test_weld_carries_over_what_was_changed_in_the_scenes_own_constraints() -> None:
     own = '<equality><weld name="own" body1="tool" body2="world" active="false"/></equality>'
     text = FREE_MASS.format(mass=0.05).replace("</mujoco>", own + "</mujoco>")
@@ -653,23 +624,19 @@ def test_weld_carries_over_what_was_changed_in_the_scenes_own_constraints() -> N
     scene.model.body_mass[scene.model.body("tool").id] = 0.2
     mujoco.mj_setConst(scene.model, scene.data)
     inertia = scene.model.stat.meaninertia
+    scene.model.opt.gravity[:] = 0, 0, -1
     for method, count in (("weld", 2), ("implicit", 1)):
-        prepare(scene, COUPLING, T, 1, method_named(method))
+        felt = prepare(scene, COUPLING, T, 1, method_named(method))
+        assert scene.model.opt.gravity.tolist() == [0, 0, -1]
+        assert scene.model.body_mass[scene.model.body("tool").id] == 0.2
+        assert (felt is None) == (method == "implicit")
         assert scene.model.neq == count
         assert scene.model.equality("own").solref.tolist() == [0.05, 0.7]
         assert scene.model.equality("own").data[0] == 0.25
         assert scene.model.stat.meaninertia == inertia
-        if method == "weld":
+        if felt is not None:
+            assert felt.stiffness == pytest.approx(0.2 * 2000 / 0.05, rel=1e-6)
             assert scene.model.equality("handle_weld").solref.tolist() == [-2000, -2]
-
-
-@pytest.mark.parametrize("flag", ["constraint", "equality"])
-def test_a_weld_is_refused_where_the_scene_disables_what_it_is_made_of(flag: str) -> None:
-    option = f'<option><flag {flag}="disable"/></option>'
-    scene = load(FREE_MASS.format(mass=0.05).replace("</mujoco>", option + "</mujoco>"))
-    with pytest.raises(SceneError, match=f"disables flag {flag}, and a weld is an equality"):
-        prepare(scene, COUPLING, T, 1, method_named("weld"))
-    prepare(scene, COUPLING, T, 1, method_named("implicit"))
 
 
 def test_a_device_that_bears_a_weld_is_still_not_called_certified() -> None:
@@ -704,16 +671,11 @@ def test_meter_and_audit_scale_alike_what_the_scene_gives_up(method: str, tmp_pa
     """Force returns half as large for a handle that moves thrice as far: gained times 1/6."""
     path = tmp_path / "run.mcap"
     options: dict[str, Any] = {"contact_stiffness": 2e4} if method == "direct" else {}
-    options |= {"method": method, "scale": 3.0, "force_scale": 0.5}
+    options |= {"method": method, "workspace": Workspace(scale=3.0, force_scale=0.5)}
     summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, **options)
     report = audit(path)
     assert report.resimulation == "bit for bit"
     assert (report.tick, report.port) == (summary.fault or (None, ""))
-
-
-def test_weld_refuses_a_tool_whose_joints_block_an_axis() -> None:
-    with pytest.raises(SceneError, match="1 of 6"):
-        prepare(load_scene("virtual_wall"), COUPLING, T, 1, method_named("weld"))
 
 
 @pytest.mark.parametrize(("method", "verdict"), [("weld", "active"), ("implicit", "passive")])
@@ -740,16 +702,6 @@ def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
         assert "constraint force" in report.unchecked
     else:
         assert (report.port, report.unchecked) == ("", "")
-
-
-def test_meter_and_audit_agree_on_the_tick_of_a_kick_in_all_directions(tmp_path: Path) -> None:
-    """The shipped peg behind a weld of 4800 N/m, on a device of 2 N s/m: it bears 4000."""
-    path = tmp_path / "run.mcap"
-    summary = recorded(path, "peg_in_hole", "simulated", duration=1.6, method="weld")
-    report = audit(path)
-    assert report.verdict == "active"
-    assert summary.fault == (report.tick, report.port)
-    assert report.port == "device"
 
 
 FREE_MASS_AND_MOCAP = FREE_MASS.replace(
@@ -791,15 +743,6 @@ def test_weld_affords_no_slack_and_is_told_by_its_stiffest_axis() -> None:
     largest = 0.1 / 3 * (0.05**2 + 0.005**2)
     assert felt.rotational_stiffness == pytest.approx(largest * 2000 / 0.05, rel=1e-6)
     assert felt.rotational_damping == pytest.approx(largest * 2 / 0.05, rel=1e-6)
-
-
-def test_recording_that_claims_a_softer_weld_is_invalid(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    recorded(path, "point_mass", "simulated", duration=0.1, method="weld")
-    recording = read_recording(path)
-    changed = rewritten(recording, tmp_path / "b.mcap", meta={"felt": "[1.0, 0.0, 0.0, 0.0]"})
-    assert "weld" in audit(changed).reason
-    assert audit(changed).verdict == "invalid"
 
 
 LIGHT = Coupling(2400.0, 0.5, 2.4, 5e-4)
@@ -851,11 +794,6 @@ def test_error_of_a_free_mass_falls_with_the_number_of_substeps(laws: int, perce
     assert 100 * abs(measured / exact - 1) == pytest.approx(percent, rel=0.1)
 
 
-def test_damping_that_substeps_need_is_what_is_printed() -> None:
-    needed = [required_damping(LIGHT, T, n) for n in (1, 2, 4, 8)]
-    assert needed == pytest.approx([1.70, 1.63, 1.90, 2.42], abs=6e-3)
-
-
 def test_strict_environments_need_less_than_the_form_grants() -> None:
     masses = (RIGID, 1.0, 0.2, 0.05, 0.02, 0.01)
     for laws, wall, most in ((1, 1.70, 1.70), (2, 1.30, 1.30), (4, 1.60, 1.65), (8, 1.75, 2.03)):
@@ -863,6 +801,8 @@ def test_strict_environments_need_less_than_the_form_grants() -> None:
         assert found[0] == pytest.approx(wall, abs=6e-3)
         assert max(found) == pytest.approx(most, abs=6e-3)
         assert max(found) <= required_damping(LIGHT, T, laws) * (1 + 1e-9)
+    needed = [required_damping(LIGHT, T, n) for n in (1, 2, 4, 8)]
+    assert needed == pytest.approx([1.70, 1.63, 1.90, 2.42], abs=6e-3)  # what is printed
 
 
 @pytest.mark.parametrize(("laws", "mass"), [(4, 0.05), (8, 0.05)])
@@ -893,8 +833,8 @@ def test_worst_hand_behind_substeps_diverges_below_the_limit_and_not_above(
     assert run(required_damping(LIGHT, T, laws)).is_stable
 
 
-@pytest.mark.parametrize("laws", [1, 2, 4, 8, 32])
-@pytest.mark.parametrize("period", [1e-4, 1e-3, 5e-3])
+@pytest.mark.parametrize("laws", [1, 2, 8, 32])
+@pytest.mark.parametrize("period", [1e-4, 5e-3])
 def test_default_coupling_is_certified_with_any_number_of_substeps(
     laws: int, period: float
 ) -> None:
@@ -905,27 +845,3 @@ def test_default_coupling_is_certified_with_any_number_of_substeps(
         conditions = device_conditions(info, used, period, *scales, laws)
         assert all(c.needed <= 0.85 * (c.available or 0.0) * (1 + 1e-6) for c in conditions)
         assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)
-
-
-def test_a_bridge_without_a_coupling_asked_for_is_certified_with_substeps() -> None:
-    with Bridge("point_mass", substeps=8, clock=SimulatedClock()) as bridge:
-        summary = bridge.run(0.05)
-    assert summary.is_certified
-    assert summary.requested == bridge.setup.coupling
-    assert summary.requested.stiffness < 2400
-
-
-@pytest.mark.parametrize("substeps", [0, 101, 100_000, 1.5, math.nan])
-def test_substeps_out_of_range_are_refused_in_one_sentence_wherever_they_enter(
-    substeps: int,
-) -> None:
-    with pytest.raises(HapticBridgeError, match=r"substeps is .* whole number"):
-        Bridge("point_mass", substeps=substeps)
-    with pytest.raises(CouplingError, match=r"substeps is .* whole number"):
-        required_damping(LIGHT, T, substeps)
-    with pytest.raises(CouplingError, match=r"substeps is .* whole number"):
-        default_coupling(SimulatedDevice().info, T, laws=substeps)
-    with pytest.raises(HapticBridgeError, match=r"substeps is .* whole number"):
-        ClosedLoop(load_scene("point_mass")).run(
-            SimulatedDevice(), LIGHT, METHODS["implicit"], substeps=substeps
-        )

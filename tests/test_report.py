@@ -1,4 +1,4 @@
-"""The page of a run: its verdict and cause, its size, and how a browser takes it."""
+"""The report of a run: its page, and why a run became active."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import ScriptedDevice, SlowClock, recorded
 from chromium import browser
 from cli_cases import Called
 from PIL import Image
@@ -27,8 +26,9 @@ from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import likely_cause, what_would_do
 from hapticbridge.report.evidence import Evidence, decimated
-from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts, head_facts
-from hapticbridge.report.plots import BINS, activities, draw_energies, draw_motion, draw_timing
+from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts
+from hapticbridge.report.page import is_warned, notes
+from hapticbridge.report.plots import BINS, activities, draw_motion, draw_timing
 from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")
@@ -38,18 +38,6 @@ def evidence_of(recording: Recording) -> Evidence:
     evidence = Evidence.of(recording)
     assert evidence is not None
     return evidence
-
-
-def test_the_bound_is_drawn_beside_what_was_created(made: Made) -> None:
-    recording, report = made(report_runs.active_by_method)
-    evidence = evidence_of(recording)
-    lines = {line.get_label(): line for line in draw_energies(evidence).axes[1].get_lines()}
-    created = np.asarray(lines["created by the environment"].get_ydata())
-    allowed = np.asarray(lines["allowed at most"].get_ydata())
-    above = int(np.argmax(created > allowed + 1e-6))
-    assert above == report.tick
-    assert draw_energies(evidence).axes[1].get_ylabel() == "energy (mJ)"
-    assert created[above] - allowed[above] == pytest.approx(1e3 * report.joules, rel=1e-5)
 
 
 def changed(recording: Recording, **parts: Any) -> Recording:
@@ -79,23 +67,22 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     run_file: Path, made: Made, tmp_path: Path
 ) -> None:
     passive, page = audit(run_file), tmp_path / "page.html"
-    borne = "The device bears this coupling, in any hand."
-    not_borne = "The device does not bear this coupling"
-    unknown = "It is not known if the device bears this coupling in any hand."
+    sentences = {
+        True: "The device bears this coupling, in any hand.",
+        False: "The device does not bear this coupling",
+        None: "It is not known if the device bears this coupling in any hand.",
+    }
+    for certified, words in sentences.items():
+        judged = replace(passive, certified=certified)
+        assert words in notes(judged)[-1]
+        assert is_warned(judged) is (certified is False)
+    assert not notes(replace(passive, verdict="active"))
     stopped = replace(passive, reason=f"{passive.reason}; the guard tripped", events={"trip": 1})
-    # report, its section, and what the page says
-    cases = [
-        (passive, "passive", unknown if passive.certified is None else borne),
-        (replace(passive, certified=False), "warned", not_borne),
-        (replace(passive, certified=None), "passive", unknown),
-        (stopped, "warned", "<p>The guard tripped.</p>"),
-    ]
-    for report, look, words in cases:
-        write_report(read_recording(run_file), report, page)
-        text = page.read_text(encoding="utf-8")
-        assert f'<section class="verdict {look}">' in text
-        assert words in text
-        assert "The moment" not in text
+    write_report(read_recording(run_file), stopped, page)
+    text = page.read_text(encoding="utf-8")
+    assert '<section class="verdict warned">' in text
+    assert "<p>The guard tripped.</p>" in text
+    assert "The moment" not in text
     recording, active = made(report_runs.active_by_method)
     evidence = evidence_of(recording)
     energy, allowed = evidence.judged(active)
@@ -173,20 +160,6 @@ def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> 
     assert said == set(names) - {"reseats"}  # which is what every run of a device does
 
 
-def test_a_page_says_how_many_deadlines_were_missed(run_file: Path, tmp_path: Path) -> None:
-    path, device = tmp_path / "late.mcap", ScriptedDevice(report_runs.circling)
-    recorded(path, "point_mass", device, duration=0.05, clock=SlowClock({20: 3, 30: 1}))
-    for file, told in (
-        (path, "0.050 s, 46 ticks, deadlines missed: 4, at 2 of them"),
-        (run_file, "0.201 s, 201 ticks, in simulated time"),
-    ):
-        recording, report = read_recording(file), audit(file)
-        assert dict(head_facts(report, evidence_of(recording)))["ran"] == told
-        live = replace(recording, meta=recording.meta | {"clock": "monotonic"})
-        ran = dict(head_facts(report, evidence_of(live)))["ran"]
-        assert ("no deadline missed" in ran) is (file == run_file)
-
-
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
     inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MOST_INPUTS)]
     trip = {"event": "trip", "tick": 400, "time_ns": 400_000_000, "reason": "it jumped"}
@@ -197,7 +170,7 @@ def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
     assert len(event_rows([*inputs, *others])) == MOST_EVENTS
 
 
-@pytest.mark.parametrize("name", ["page.mcap", "page.pdf", "page", "nowhere/page.html"])
+@pytest.mark.parametrize("name", ["page.mcap", "page", "nowhere/page.html"])
 def test_a_page_replaces_no_recording_and_no_picture(
     name: str, call: Called, run_file: Path, tmp_path: Path
 ) -> None:
@@ -246,7 +219,6 @@ def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
         (report_runs.active_by_quantisation, "device", "quantisation", "0.45 N"),
         (report_runs.active_by_mocap, "environment", "inputs", "'pusher' touched geom 'ball'"),
         (report_runs.active_beside_a_fan, "environment", "contact setting", "while geom 0 touched"),
-        (report_runs.active_with_a_fine_encoder, "device", "rate", "the coupling needs 5"),
         (report_runs.active_by_rotation, "device", "rate", "rotation: the device's damping"),
         (report_runs.active_by_repeated_samples, "device", "delay", "75% of the samples"),
     ],

@@ -1,4 +1,4 @@
-"""Which scenes are refused, with what culprit, and what loading sets in the others."""
+"""Refusals of scenes and of starts, with the culprit, and the options that loading sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The handle and its actuators, whatever the scene's defaults say."""
+"""The handle and its actuators, whatever the defaults say; all else of a scene survives."""
 
 from __future__ import annotations
 

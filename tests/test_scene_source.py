@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import mujoco
 import pytest
+from audit_cases import recorded
 from hypothesis import given
 from hypothesis import strategies as st
 from outside_scenes import mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
 from scene_cases import RICH
 
+from hapticbridge.audit import audit
+from hapticbridge.errors import SceneError
 from hapticbridge.run_description import compiled_model
 from hapticbridge.scene import load_scene
 from hapticbridge.scene.source import read_elements
@@ -204,3 +208,48 @@ def test_compiled_model_does_not_depend_on_the_folder_or_tell_it(tmp_path: Path)
         compiled.append(compiled_model(load_scene(folder / "s.xml").model))
     assert compiled[0] == compiled[1]
     assert str(tmp_path).encode() not in compiled[0]
+
+
+def built_spec() -> mujoco.MjSpec:
+    """A tool with numbers of more digits than MuJoCo writes, and a mesh that is in no file."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "built"
+    spec.assets = {"part.obj": obj_bytes()}
+    spec.add_mesh(name="part", file="part.obj")
+    tool = spec.worldbody.add_body(name="tool")
+    tool.add_freejoint()
+    tool.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part", mass=0.1234567890123)
+    tool.add_site(name="grip")
+    return spec
+
+
+def test_a_specification_is_loaded_with_its_exact_numbers_and_left_alone() -> None:
+    spec = built_spec()
+    scene = load_scene(spec)
+    assert (scene.name, scene.model.body("tool").mass[0]) == ("built", 0.1234567890123)
+    assert not spec.actuators and spec.body("tool") is not None
+    with pytest.raises(SceneError, match="a specification has no parameters, and 'clearance'"):
+        load_scene(spec, clearance=1e-4)
+
+
+def test_sources_of_a_specification_are_its_written_form_and_its_assets() -> None:
+    scene = load_scene(built_spec())
+    files = {source.name: source.data for source in scene.sources}
+    assert list(files) == ["built.xml", "part.obj"]
+    assert files["part.obj"] == obj_bytes()
+    again = mujoco.MjSpec.from_string(files["built.xml"].decode(), assets=files).compile()
+    assert again.body("tool").mass[0] == pytest.approx(0.1234567890123, rel=1e-5)
+
+
+def test_sources_of_a_specification_from_a_file_have_the_files_assets(tmp_path: Path) -> None:
+    (tmp_path / "part.obj").write_bytes(obj_bytes())
+    path = scene_file(tmp_path, mjcf(MESH.format("part.obj"), MESHED))
+    scene = load_scene(mujoco.MjSpec.from_file(str(path)))
+    assert [source.name for source in scene.sources][1:] == ["part.obj"]
+
+
+def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, load_scene(built_spec()), duration=0.1)
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")

@@ -1,4 +1,4 @@
-"""The bounds between a coupling, the period and a device's damping (closed forms)."""
+"""Bounds of the passivity theory against closed forms, frequency sweeps and printed numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a device needs to show a coupling as it feels, against spectrum, worst hand and motion."""
+"""The damping that a felt coupling needs, against spectrum, worst hand and motion."""
 
 from __future__ import annotations
 

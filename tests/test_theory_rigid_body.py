@@ -1,4 +1,4 @@
-"""Point mass under a given force and behind the coupling: energy and accuracy of each scheme."""
+"""Point mass and rotation: energy, momentum and accuracy of each scheme."""
 
 from __future__ import annotations
 
@@ -316,14 +316,14 @@ ONES = np.ones(5)
         (lambda: integrate_particle(0, ONES, T, "explicit"), "mass is 0 kg; it must be"),
         (lambda: integrate_particle(np.nan, ONES, T, "explicit"), "mass is nan kg; it must"),
         (lambda: integrate_particle(1, ONES, -1, "explicit"), "period is -1 s"),
-        (lambda: integrate_particle(1, ONES, T, "euler"), "'midpoint', 'semi_implicit'"),
+        (lambda: integrate_particle(1, ONES, T, "euler"), "'midpoint', 'semi_implicit'"),  # type: ignore[arg-type]
         (lambda: integrate_particle(1, [1.0], T, "explicit"), r"force has shape \(1,\)"),
         (lambda: integrate_particle(1, ["a"], T, "explicit"), "must be numbers in N"),
         (lambda: integrate_particle([1, 2], np.ones((5, 3)), T, "explicit"), "do not broadcast"),
-        (lambda: integrate_particle(1, ONES, [T], "explicit"), r"period has shape \(1,\)"),
+        (lambda: integrate_particle(1, ONES, [T], "explicit"), r"period has shape \(1,\)"),  # type: ignore[arg-type]
         (lambda: drive_mass(COUPLING, 1, [0, np.inf], T, "midpoint"), "handle position is inf m"),
         (lambda: drive_mass(COUPLING, 1, 0.0, T, "midpoint"), "handle has shape"),
-        (lambda: drive_mass(COUPLING, 1, ONES, T, "explicit"), "choose one of 'compensated'"),
+        (lambda: drive_mass(COUPLING, 1, ONES, T, "explicit"), "choose one of 'compensated'"),  # type: ignore[arg-type]
         (lambda: exact_mass_response(COUPLING, 1, 0), "frequency is 0 Hz"),
         (lambda: integrate_rotation([1, 1, -1], SPIN, T, 1, "implicit"), "inertia is -1 kg m²"),
         (lambda: integrate_rotation([1, 1, 3], SPIN, T, 1, "implicit"), "which no rigid body has"),
@@ -333,7 +333,7 @@ ONES = np.ones(5)
         (lambda: integrate_rotation(INERTIA, SPIN, T, 0, "implicit"), "steps is 0"),
         (lambda: integrate_rotation(INERTIA, SPIN, T, 5, "implicit", torque=np.zeros((4, 3))),
          r"torque has shape \(4, 3\); it must be \(6"),
-        (lambda: integrate_rotation(INERTIA, SPIN, T, 5, "rk4"), "choose one of 'explicit'"),
+        (lambda: integrate_rotation(INERTIA, SPIN, T, 5, "rk4"), "choose one of 'explicit'"),  # type: ignore[arg-type]
         (lambda: integrate_rotation(INERTIA, [100, 1000, 100], 1.0, 500, "explicit"),
          "shorten the period"),
     ],

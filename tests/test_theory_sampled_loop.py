@@ -213,7 +213,7 @@ def test_nyquist_hand_has_no_reactance_left_from_rounding(period: float) -> None
     [
         *((lambda bad=bad: WorstHand(1.0, bad, 1e-3), "frequency")
           for bad in (math.nan, math.inf, -1.0, 0.0, 4000.0, [100.0], "a", None, True)),
-        (lambda: WorstHand(1.0, 100.0, 1e-3, "a"), "response is"),
+        (lambda: WorstHand(1.0, 100.0, 1e-3, "a"), "response is"),  # type: ignore[arg-type]
         (lambda: WorstHand(1.0, 100.0, 1e-3, complex(math.inf, 0)), "response"),
         (lambda: WorstHand(0.0, 100.0, 1e-3), "device damping"),
         (lambda: WorstHand(math.nan, 100.0, 1e-3), "device damping"),
@@ -222,10 +222,10 @@ def test_nyquist_hand_has_no_reactance_left_from_rounding(period: float) -> None
         (lambda: SampledLoop(WALL, 1e-3, mass=-0.1), "mass"),
         (lambda: SampledLoop(WALL, 1e-3, mass=math.inf), "mass"),
         (lambda: SampledLoop(WALL, 1e-3, delay=-1), "delay"),
-        (lambda: SampledLoop(WALL, 1e-3, delay=1.5), "delay"),
+        (lambda: SampledLoop(WALL, 1e-3, delay=1.5), "delay"),  # type: ignore[arg-type]
         (lambda: SampledLoop(WALL, 1e-3, filter_time=math.nan), "filter time"),
-        (lambda: SampledLoop(WALL, 1e-3, integrator="leapfrog"), "'implicit', 'semi_implicit'"),
-        (lambda: SampledLoop(WALL, 1e-3, discretization="forward"), "'backward', 'tustin'"),
+        (lambda: SampledLoop(WALL, 1e-3, integrator="leapfrog"), "'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
+        (lambda: SampledLoop(WALL, 1e-3, discretization="forward"), "'backward', 'tustin'"),  # type: ignore[arg-type]
         (lambda: SampledLoop(WALL, 1e-3).simulate(WorstHand(1, 100, 2e-3), 10), r"0\.002 s, the l"),
         (lambda: SampledLoop(WALL, 1e-3).simulate(WorstHand(1, 100, 1e-3), 0), "run is 0"),
     ],

@@ -14,16 +14,13 @@ from numpy.typing import NDArray
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
-import trimesh
 
 from hapticbridge.view.geometry import (
     MOST_SAMPLES,
     MOST_TIMES,
     SHELL,
     Prop,
-    Surfaces,
     Tendons,
-    coil,
     enlargement,
     props_of,
     shell,
@@ -261,17 +258,6 @@ def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> N
     np.testing.assert_allclose(tip - tail, (0, 0, 0.5 * LONGEST_ARROW), atol=1e-6)
 
 
-def test_the_way_out_is_to_the_last_surface() -> None:
-    balls = [trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (0.5, 1.0)]
-    balls[1].apply_translation((0, 0, 3.0))
-    triangles = np.concatenate([ball.triangles for ball in balls])
-    both = Surfaces(triangles)
-    assert both.way_out(np.array([0.0, 0, 1])) == pytest.approx(4.0, rel=1e-3)
-    for along in ((1, 0, 0), (0, 0, -1), (0.6, 0.0, -0.8)):
-        assert both.way_out(np.array(along, float)) == pytest.approx(0.5, rel=5e-3)
-    assert Surfaces(balls[1].triangles).way_out(np.array([1.0, 0, 0])) == 0.0
-
-
 @given(st.floats(1e-9, 10.0), st.floats(0.0, 10.0))
 def test_a_stretch_is_drawn_as_long_as_there_is_room_in_round_numbers(
     room: float, stretch: float
@@ -281,12 +267,3 @@ def test_a_stretch_is_drawn_as_long_as_there_is_room_in_round_numbers(
     assert times <= MOST_TIMES
     assert times == 1 or times * stretch <= room * (1 + 1e-6)
     assert times == MOST_TIMES or 2.5 * times * stretch > room * (1 - 1e-6)
-
-
-@given(st.tuples(*[st.floats(-1, 1)] * 6))
-def test_a_spring_is_one_line_from_end_to_end(ends: tuple[float, ...]) -> None:
-    start, end = np.array(ends[:3]), np.array(ends[3:])
-    line = coil(start, end, 0.01)
-    np.testing.assert_allclose(line[0, 0], start, atol=1e-9)
-    np.testing.assert_allclose(line[-1, 1], end, atol=1e-9)
-    np.testing.assert_allclose(line[1:, 0], line[:-1, 1])

@@ -1,10 +1,11 @@
 """Verdict on a recording, from the recording alone; never imports the bridge.
 
-Read ``verdict`` first. It checks that the file is whole (``structure``), computes the energies
-again in plain NumPy (``energy``), checks the recorded motion against the coupling law (``motion``)
-and the guard (``guard``), and simulates the scene again (``replay``). ``events`` reads what
-happened during the run, ``report`` holds the result, ``batch`` audits folders. ``ask`` is the
-public entry point.
+Read ``verdict`` first; its function decide() alone calls a run passive, active or invalid. The
+audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
+(``energy``), checks the wrench against the coupling law (``motion``) and the guard (``guard``), and
+simulates the scene again (``replay``). ``state`` is carried from block to block, ``events`` reads
+external actions during the run, ``report`` holds the result, ``batch`` audits folders. ``ask`` is
+the public entry point.
 """
 
 from typing import TYPE_CHECKING

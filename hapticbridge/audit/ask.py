@@ -13,14 +13,15 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     """Judges a recording from the file alone.
 
     The audit checks the structure (checksums, schema, contiguous ticks, finite numbers, digest),
-    the wrench against the coupling law, energies recomputed from poses and wrenches, and the device
-    condition. If the versions match, a re-simulation must agree bit for bit. A device port that the
-    device condition does not prove safe is judged by its energy. The verdict is ``active`` from the
-    tick at which the device has received more than its damping dissipates and scene and coupling
-    release.
+    the wrench against coupling law and guard, energies recomputed from poses and wrenches, and the
+    device condition. If the versions match, a re-simulation must agree bit for bit. Without a
+    re-simulation, ``AuditReport.unchecked`` names the changes that would pass. A device port that
+    the device condition does not prove safe is judged by its energy. The verdict is ``active`` from
+    the tick at which the device has received more than its damping dissipates and scene and
+    coupling release.
 
-    The file is read three times, block by block: digest and events, structure, everything else.
-    Memory grows only with the number of events.
+    The file is read four times, block by block: digest and events, structure, second computation,
+    re-simulation. Memory grows only with the number of events.
 
     Args:
         path: The recording.

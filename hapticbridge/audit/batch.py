@@ -1,4 +1,4 @@
-"""Audit of many recordings into one table, in parallel."""
+"""Audit of many recordings in parallel, with one table as the result."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from hapticbridge.sweep.results import Interrupted, Table, check_format
 from hapticbridge.sweep.sweep import sweep
 
 FEW = 8
-"""Number of recordings below which no processes are started. Each takes 3 s to start, as long as
-the audit of two minutes at 1 kHz."""
+"""Number of recordings below which no processes are started. A process takes 3 s to start, as long
+as the audit of two minutes at 1 kHz."""
 
 UNREADABLE = "unreadable"
 """Verdict on a file that is not a recording or cannot be read."""
 
 _LONGEST_REASON = 1000
-"""Largest number of characters of a reason; a damaged file may have a problem in each chunk."""
+"""Largest length of a reason in characters. A damaged file may have a problem in each chunk."""
 
 _UNITS = {
     "margin": "1",
@@ -48,10 +48,16 @@ _UNITS = {
     "device_energy": "J",
     "slack": "J",
 }
-"""Units of the numeric columns."""
+"""Units of the numeric columns of a table."""
+
+_COLUMNS = (
+    *("margin", "verdict", "environment", "certified", "exit_code", "slack_share", "is_cut"),
+    *("ticks", "duration", "port", "joules", "resimulation", "reason"),
+)
+"""Columns of a table that every report fills, in order."""
 
 _REPORT = "report"
-"""Column with the whole report as JSON text."""
+"""Name of the column that holds the whole report as JSON text."""
 
 
 def audit_all(
@@ -63,30 +69,29 @@ def audit_all(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Table:
-    """Audits recordings; returns a row for each, sorted by margin.
+    """Audits recordings and returns one row for each, most critical first.
 
-    Rows run from the smallest margin (``AuditReport.margin``) to the largest, after unreadable
-    files and invalid recordings. A cut file is judged by its contents, as ``audit`` does.
+    Files that cannot be read come first, then invalid recordings, then the others by increasing
+    ``AuditReport.margin``. A cut file is judged on the part that remains.
 
-    Columns besides ``file`` are ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
-    ``certified`` (yes, no or unknown) and ``exit_code``. The other fields of ``AuditReport`` and
-    the energies at the end in J follow. ``report`` holds the whole report as JSON (empty if
-    unreadable).
+    Columns beside ``file``: ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
+    ``certified`` (yes, no or unknown), ``exit_code``, the other fields of ``AuditReport``, the
+    energies at the end in J, and ``report``, the whole report as JSON (empty if unreadable).
 
     Args:
         paths: Recordings; different files.
-        strict: As for ``audit``.
-        jobs: Largest number of processes; 1 works in this one. The default is the number of cores,
-            and 1 for fewer than 8 recordings.
+        strict: True accepts only (14) itself; see ``audit``.
+        jobs: Largest number of processes; 1 uses the present process. The default is the number of
+            cores, and 1 for fewer than 8 recordings.
         executor: Executor to use instead of processes.
-        scheduler: Address of a dask.distributed scheduler to use instead of processes; its workers
-            must see the files under equal paths.
-        progress: Called with the number of recordings done and the total.
+        scheduler: Address of a dask.distributed scheduler to use instead of processes. Its workers
+            must see the files under these names.
+        progress: Called with the number of finished recordings and the number of all.
 
     Raises:
-        StudyError: The workers cannot be started.
-        RecordingError: There is no recording.
-        Interrupted: Ctrl-C; it carries the rows so far, sorted by margin.
+        StudyError: The workers cannot be started or reached.
+        RecordingError: ``paths`` is empty.
+        Interrupted: Ctrl-C was pressed; its table holds the finished rows in this order.
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
@@ -119,21 +124,9 @@ def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
             "reason": str(error)[:_LONGEST_REASON],
         }
     report = replace(report, reason=report.reason[:_LONGEST_REASON])
-    known: dict[str, Value] = {
-        "margin": report.margin,
-        "verdict": report.verdict,
-        "environment": report.environment or "",
-        "certified": {True: "yes", False: "no", None: "unknown"}[report.certified],
-        "exit_code": report.exit_code,
-        "slack_share": report.slack_share,
-        "is_cut": report.is_cut,
-        "ticks": report.ticks,
-        "duration": report.duration,
-        "port": report.port,
-        "joules": report.joules,
-        "resimulation": report.resimulation,
-        "reason": report.reason,
-    }
+    known: dict[str, Value] = {name: getattr(report, name) for name in _COLUMNS}
+    known["environment"] = report.environment or ""
+    known["certified"] = {True: "yes", False: "no", None: "unknown"}[report.certified]
     if report.damping_margin is not None:
         known["damping_margin"] = report.damping_margin
     if report.tick is not None:
@@ -142,7 +135,7 @@ def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
 
 
 def reports_of(table: Table) -> list[dict[str, object]]:
-    """Returns the reports of a table in its order, without unreadable files."""
+    """Returns the whole reports of a table, in its order, without unreadable files."""
     return [json.loads(text) for text in table.texts(_REPORT) if text]
 
 
@@ -164,9 +157,9 @@ def check_table_name(path: Path) -> None:
 
 
 def write_audits(table: Table, path: Path) -> None:
-    """Writes a table of audits as Parquet, CSV or JSON (a list of rows), by the file's extension.
+    """Writes a table of audits as Parquet, CSV or JSON (a list of rows), by the extension.
 
-    In Parquet the metadata of a numeric column hold its unit, as in an export.
+    In Parquet the metadata of a numeric column hold its unit.
 
     Raises:
         StudyError: See ``check_table_name``, or the file cannot be written.
@@ -191,7 +184,7 @@ def worst_exit_code(table: Table) -> int:
 
 
 def _with_failures(table: Table) -> Table:
-    """Gives a verdict to rows whose worker failed, so that they are reported."""
+    """Gives the verdict ``unreadable`` to rows whose worker failed."""
     if not table.failed.any():
         return table
     filled = {
@@ -206,25 +199,25 @@ def _with_failures(table: Table) -> Table:
 def _sorted(table: Table) -> Table:
     margins = table.numbers("margin")
     is_read = table.texts("verdict") != UNREADABLE
-    # NaN margins come first here; equal margins are sorted by name
+    # a sort puts NaN last, here it comes first; equal margins are sorted by name
     order = np.lexsort((table.texts("file").astype(str), margins, ~np.isnan(margins), is_read))
     return table.select(order)
 
 
 ENDING = ".mcap"
-"""Extension of the recordings in a folder, in either case."""
+"""Extension of recordings in a folder, in small or capital letters."""
 
 
 def find_recordings(words: Iterable[str | Path]) -> list[Path]:
     """Returns the recordings named by files, folders and patterns, each once.
 
-    A folder stands for all files below it that end in ``.mcap``, sorted by name. A word that is not
-    a file and has ``*``, ``?`` or ``[`` is a pattern, in which ``**`` stands for any folders. Links
-    to files are followed. Links to folders below a folder are not, because they may form a circle.
-    Missing files and unreadable folders are kept, so that the audit reports them.
+    A folder stands for all ``.mcap`` files below it, in the order of their names. A word that is
+    not a file and contains ``*``, ``?`` or ``[`` is a pattern, in which ``**`` stands for any
+    folders. Links to files are followed; links to folders below a folder are not, because they may
+    form a circle. Missing files and unreadable folders are kept, so that the audit reports them.
 
     Raises:
-        RecordingError: A folder has no recording, or a pattern is invalid or matches none.
+        RecordingError: A folder contains no recording, or a pattern is malformed or matches none.
     """
     found: dict[Path, Path] = {}
     for word in words:
@@ -244,7 +237,7 @@ def find_recordings(words: Iterable[str | Path]) -> list[Path]:
 
 
 def _below(folder: Path) -> list[Path]:
-    """Returns the recordings in and below a folder, and its unreadable parts."""
+    """Returns the recordings in and below a folder, and the folders that cannot be read."""
     refused: list[Path] = []
 
     def refuse(error: OSError) -> None:
@@ -256,12 +249,12 @@ def _below(folder: Path) -> list[Path]:
         for name in names
         if name.lower().endswith(ENDING)
     ]
-    # links come after their possible targets, so that the target is the one named
+    # a link comes after its target, so that the target's name is kept
     return sorted([*files, *refused], key=lambda file: (file.is_symlink(), file))
 
 
 def _fitting(pattern: Path) -> list[Path]:
-    """Returns the files that match a pattern, and those below matching folders."""
+    """Returns the files that match a pattern, and those below the folders that match."""
     parts = pattern.parts
     first = next(index for index, part in enumerate(parts) if glob.has_magic(part))
     rest = str(Path(*parts[first:]))

@@ -1,26 +1,33 @@
 """Second computation of a recording's energies, in plain NumPy over recorded poses and wrenches.
 
 It is written apart from the kernel on purpose, with other formulas where possible (quaternion
-products over whole arrays), so that one mistake does not hide another. Long recordings are judged
-block by block; ``Reached`` carries the state.
+products over whole arrays), so that one mistake does not hide another.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.guard import Guarded, limits_on_tool, spring_energy
-from hapticbridge.audit.motion import Motion, steps, summed, turn_between, turns, wrench_by_law
+from hapticbridge.audit.guard import AuditedBlock, limits_on_tool, spring_energy
+from hapticbridge.audit.motion import Array, turn_between
+from hapticbridge.audit.state import AuditState
+from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.kernel.parameters import RunParameters
 
-# Energy balance of the device port, from recorded poses and wrenches.
+SLACK_SHARE = 0.5
+"""Share of the slack that counts with several laws per tick, without unit; equal to the assumption
+of ``certificate.required_damping``."""
 
 
-def burnt_by_damping(
+def dissipated_by_damping(
     parameters: RunParameters,
     moved: Array,
     turned: Array,
@@ -41,183 +48,117 @@ def burnt_by_damping(
         is_running: True for ticks of known duration. A jump before the first tick or in a pause
             took an unknown time and dissipates nothing here.
     """
-    burnt = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
-    burnt += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
+    energy = (parameters.device_damping or 0.0) * np.sum(moved**2, axis=1)
+    energy += (parameters.device_rotational_damping or 0.0) * np.sum(turned**2, axis=1)
     time = np.maximum(interval, parameters.period)
-    return np.asarray(np.where(is_running, burnt / time, 0.0))
+    return np.asarray(np.where(is_running, energy / time, 0.0))
 
 
-def passed_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Returns the shares of force and torque that the guard transmitted, (n,) each."""
+def transmitted_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
+    """Returns the shares of force and torque that passed limits, ramp and fade, (n,) each."""
     scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
     shares = []
     for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
         full = scale * np.linalg.norm(ticks["wrench_on_tool"][:, part], axis=1)
         sent = np.linalg.norm(ticks["wrench_on_device"][:, part], axis=1)
-        passed = np.divide(sent, full, out=np.ones_like(full), where=full > 0)
-        shares.append(np.minimum(passed, 1.0))  # injected damping may add to the wrench
+        share = np.divide(sent, full, out=np.ones_like(full), where=full > 0)
+        shares.append(np.minimum(share, 1.0))  # injected damping may add to the wrench
     return shares[0], shares[1]
+
+
+class SpringPath(NamedTuple):
+    """Motion of the coupling for one kind of axis, in m or as rotation vectors in rad.
+
+    Attributes:
+        pulled: p = h_k − x_{k−1}, (n, 3).
+        stretch: e = h − x, (n, 3).
+        stretched: δe, the change of e in each tick, (n, 3).
+        work: Work w of the coupling on the tool in each tick, (n,) in J.
+        transmitted: c, the share of force or torque that reached the device, (n,).
+    """
+
+    pulled: Array
+    stretch: Array
+    stretched: Array
+    work: Array
+    transmitted: Array
 
 
 def stored_in_coupling(
     parameters: RunParameters,
-    *,
-    gains: tuple[Array, Array],
-    pulled: tuple[Array, Array],
-    stretch: tuple[Array, Array],
-    stretched: tuple[Array, Array],
-    work: tuple[Array, Array],
-    passed: tuple[Array, Array],
-    since_start: Array,
+    gains: Array,
+    paths: tuple[SpringPath, SpringPath],
+    is_start: NDArray[np.bool_],
     share: Array,
-    share_before: float = 0.0,
-    has_end: bool = True,
+    share_before: Array,
 ) -> tuple[Array, Array]:
     """Returns the energy stored in coupling and tool from the handle, in J of the scene.
 
-        Σ c_k w_k + r_k V(e_k) − Σ max(0, r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
+        Σ c_k w_k + r_k V(e_k) − Σ (r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
 
     V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. Let E be
     the energy given to the device minus its dissipation plus this result. With b >= K T/2 + B and
     no active limit, E is never above zero, for any hand and tool. This is the identity behind (6),
-    with V(e) at the end on the left. What exceeds zero comes from the wrench held between samples
-    and is the fault of the port ``device``.
+    with V(e) at the end on the left. An excess above zero comes from the wrench held between
+    samples and is the fault of the port ``device``.
 
     The second sum is the energy already stretched into the spring when the force is switched on, in
-    a ramp or after a jump of the device before its first tick. W_k = r_{k−1} (V_k(p_k) −
-    V_{k−1}(p_k)), p = h_k − x_{k−1}, is the work of a command that changes K (``kernel.tuning``);
-    neither scene nor coupling released it.
+    a ramp or after a jump of the device before its first tick; r_{k−1} is 0 at a start. W_k is
+    ``work_of_commands``, which the caller subtracts.
 
     Args:
         parameters: Run parameters of a method with a coupling law and one law per tick.
-        gains: K, B', K_r and B'_r in the tick before each and in each, (n, 4) each.
-        pulled: p in m and as rotation vectors, (n, 3) each.
-        stretch: e in m and as rotation vectors, (n, 3) each.
-        stretched: Change of e in each tick.
-        work: Work w of force and of torque on the tool in each tick, (n,) each in J.
-        passed: c, the share of force and of torque that the guard transmitted, (n,) each.
-        since_start: Ticks since the force began to rise, (n,).
-        share: r, the share of the wrench transmitted by ramp and fading, (n,).
-        share_before: r of the tick before the first of these.
-        has_end: True counts r_k V(e_k), which a device at e_k could still receive. With an old
-            sample the device is elsewhere, and only the energy given so far counts.
+        gains: K, B', K_r and B'_r in each tick, (n, 4).
+        paths: Translation and rotation of the coupling.
+        is_start: True where the force begins to rise, (n,).
+        share: r, the share of the wrench that ramp and fade transmitted, (n,).
+        share_before: r of the previous tick, (n,).
 
     Returns:
-        The summand of each tick, and r V(e); (n,) each.
+        The summand of each tick without W_k, and r V(e); (n,) each.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
-    before = np.concatenate([[share_before], share[:-1]])
-    rise = np.where(since_start == 0, share, np.diff(share, prepend=share_before))
-    summed, held = np.zeros(len(share)), np.zeros(len(share))
-    for column, limit, e, de, w, c in zip(
-        (0, 2), limits_on_tool(parameters), stretch, stretched, work, passed, strict=True
-    ):
-        k, b = gains[1][:, column], gains[1][:, column + 1]
-        spring = spring_energy(k, np.linalg.norm(e, axis=1), limit)
-        found = spring + 0.5 * b / parameters.period * np.sum(de**2, axis=1)
-        taken = np.where(since_start > 0, c * w, 0.0)
-        summed += taken - rise * found
-        if has_end:
-            held += share * spring
-    return summed - work_of_commands(parameters, gains, pulled, before), held
+    rise = np.where(is_start, share, share - share_before)
+    parts, stored = np.zeros(len(share)), np.zeros(len(share))
+    for column, limit, path in zip((0, 2), limits_on_tool(parameters), paths, strict=True):
+        k, b = gains[:, column], gains[:, column + 1]
+        spring = spring_energy(k, np.linalg.norm(path.stretch, axis=1), limit)
+        present = spring + 0.5 * b / parameters.period * np.sum(path.stretched**2, axis=1)
+        parts += np.where(is_start, 0.0, path.transmitted * path.work) - rise * present
+        stored += share * spring
+    return parts, stored
 
 
 def work_of_commands(
     parameters: RunParameters,
-    gains: tuple[Array, Array],
-    pulled: tuple[Array, Array],
+    gains_before: Array,
+    gains: Array,
+    paths: tuple[SpringPath, SpringPath],
     share_before: Array,
 ) -> Array:
-    """Returns W_k of ``stored_in_coupling``, the work of commands on the springs, (n,) in J.
+    """Returns W_k = r_{k−1} (V_k(p_k) − V_{k−1}(p_k)), the work of commands that change K, in J.
 
-    Arguments are those of ``stored_in_coupling``; ``share_before`` has one value per tick.
+    Neither scene nor coupling released this energy. ``gains_before`` holds the gains of each
+    previous tick, (n, 4); the other arguments are those of ``stored_in_coupling``.
     """
     work = np.zeros(len(share_before))
-    for column, limit, p in zip((0, 2), limits_on_tool(parameters), pulled, strict=True):
-        k_before, k = gains[0][:, column], gains[1][:, column]
+    for column, limit, path in zip((0, 2), limits_on_tool(parameters), paths, strict=True):
+        k_before, k = gains_before[:, column], gains[:, column]
         if np.any(k != k_before):
-            length = np.linalg.norm(p, axis=1)
+            length = np.linalg.norm(path.pulled, axis=1)
             work += spring_energy(k, length, limit) - spring_energy(k_before, length, limit)
     return share_before * work
 
 
-# Audit state carried from one block of records to the next.
-
-SUMS = (
-    "coupling_work",
-    "throughput",
-    "device_energy",
-    "device_throughput",
-    "slack",
-    "given",
-    "burnt",
-    "kept",
-    "commanded",
-)
-"""Names of the cumulative energies."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reached:
-    """State of the balance after the previous tick.
-
-    Attributes:
-        handle: Handle pose (7,).
-        tool: Tool pose (7,).
-        device: Device pose (7,).
-        sent: Wrench sent to the device, (6,).
-        start_energy: Kinetic, potential and elastic energy before the first tick, in J.
-        share: Share of the wrench that ramp and fading transmitted.
-        guarded: State of the guard.
-        sums: Cumulative energies in J.
-    """
-
-    handle: Array
-    tool: Array
-    device: Array
-    sent: Array
-    start_energy: float
-    share: float
-    sums: dict[str, float]
-    guarded: Guarded
-
-    @classmethod
-    def at_start(
-        cls, parameters: RunParameters, handle: Array, tool: Array, start_energy: float
-    ) -> Reached:
-        """Returns the state before the first tick.
-
-        ``start_energy`` is kinetic plus potential energy, in J.
-        """
-        device = np.array(parameters.device_start)
-        guarded = Guarded.at_start(parameters, handle, tool, start_energy)
-        sums = dict.fromkeys(SUMS, 0.0)
-        return cls(handle, tool, device, np.zeros(6), start_energy, 0.0, sums, guarded)
-
-
-Array = NDArray[np.float64]
-
-SLACK_SHARE = 0.5
-"""Share of the slack that counts with several laws per tick, without unit; equal to the assumption
-of ``certificate.required_damping``."""
-
-
 @dataclass(frozen=True, slots=True)
 class EnergyBalance:
-    """Quantities computed from recorded poses and wrenches.
+    """Energies of some ticks, computed from recorded poses and wrenches.
 
     Cumulative values count from the first tick of the recording.
 
     Attributes:
-        wrench_on_tool: Wrench of the coupling law at the recorded poses, (n, 6) in N and N m; the
-            recorded wrench if poses alone do not determine it.
-        wrench_on_device: Wrench that the guard should have sent for the recorded one, (n, 6).
-        injected_damping: Largest damping that the passivity controller should have added on an axis
-            of translation and of rotation, (n, 2) in N s/m and N m s/rad.
-        handle_position: Handle position computed from the recorded device pose, (n, 3) in m.
-        handle_turn: Angle between recorded and computed handle orientation, (n,) in rad.
         coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded if
             several laws per tick are summed.
         throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
@@ -225,158 +166,123 @@ class EnergyBalance:
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        kicked: Energy given to the device beyond its dissipation and the energy released by scene
-            and coupling, (n,) in J. Zero for an unknown damping or several laws per tick. With a
-            coupling law, energy created by the environment is not included; it belongs to the other
-            port.
+        unpaid_energy: Energy given to the device beyond its dissipation and the energy released by
+            scene and coupling, (n,) in J. Zero for an unknown damping or several laws per tick.
+            With a coupling law, energy created by the environment is not included; it belongs to
+            the other port.
         commanded: Energy that commands added to the effective coupling, (n,) in J.
-        reached: State at the end of these ticks.
+        sums: Cumulative energies after the last of these ticks, for ``AuditState``.
     """
 
-    wrench_on_tool: Array
-    wrench_on_device: Array
-    injected_damping: Array
-    handle_position: Array
-    handle_turn: Array
     coupling_work: Array
     throughput: Array
     device_energy: Array
     device_throughput: Array
     environment_energy: Array
     slack: Array
-    kicked: Array
+    unpaid_energy: Array
     commanded: Array
-
-    reached: Reached
+    sums: dict[str, float]
 
     @classmethod
-    def of(
-        cls,
-        ticks: NDArray[np.void],
-        parameters: RunParameters,
-        before: Reached,
-        outside: RunEvents,
-        late: int = 0,
-        following: NDArray[np.void] | None = None,
-    ) -> EnergyBalance:
-        """Computes the balance of consecutive records.
-
-        Args:
-            ticks: Records without gaps, ``TICK_DTYPE``, at least one.
-            parameters: Run parameters.
-            before: State before these ticks.
-            outside: External actions during the run.
-            late: Delay in ticks: the wrench of row k acted on the motion between rows k + late and
-                k + late + 1.
-            following: The next ``late`` records, or fewer at the end.
-        """
-        sums = before.sums
-        numbers = ticks["tick"]
-        motion = Motion.of(ticks, before.handle, before.tool, outside)
-        gains = outside.laws(numbers)
-        recorded = ticks["wrench_on_tool"]
-        law = recorded
-        if parameters.has_law and parameters.law_evaluations == 1:
-            law = wrench_by_law(ticks, gains, parameters.period, motion)
+    def of(cls, block: AuditedBlock, events: RunEvents, delay: int) -> EnergyBalance:
+        """Computes the balance of a block; see ``energy_balances``."""
+        ticks, motion, parameters = block.ticks, block.motion, events.parameters
+        before, gains = block.state.sums, events.gains(ticks["tick"])
+        wrench = ticks["wrench_on_tool"]
         works = (
-            np.sum(recorded[:, :3] * motion.tool_step, axis=1),
-            np.sum(recorded[:, 3:] * motion.tool_turn, axis=1),
+            np.sum(wrench[:, :3] * motion.tool_step, axis=1),
+            np.sum(wrench[:, 3:] * motion.tool_turn, axis=1),
         )
         work = works[0] + works[1]
+        totals = {"throughput": _summed(np.abs(work), before["throughput"])}
         # with several laws per tick the mean wrench does not determine the summed work
-        coupling_work = (
-            ticks["coupling_work"]
-            if parameters.law_evaluations > 1
-            else summed(work, sums["coupling_work"])
-        )
-
-        sent = np.concatenate([before.sent[None], ticks["wrench_on_device"][:-1]])
-        sent[np.isin(numbers, outside.resumed)] = 0.0
-        device_step = steps(ticks["device_position"], before.device[:3])
-        device_turn = turns(ticks["device_quaternion"], before.device[3:])
-        device_work = np.sum(sent[:, :3] * device_step, axis=1)
-        device_work += np.sum(sent[:, 3:] * device_turn, axis=1)
-        device_energy = summed(device_work, sums["device_energy"])
-        later = _delayed_steps(ticks, following, late) if late else (device_step, device_turn)
-        given = np.sum(sent[:, :3] * later[0], axis=1) + np.sum(sent[:, 3:] * later[1], axis=1)
-
-        stored = ticks["kinetic"] + ticks["potential"] - before.start_energy
+        coupling_work = ticks["coupling_work"]
+        if parameters.law_evaluations == 1:
+            coupling_work = _summed(work, before["coupling_work"])
+        stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
         linear, angular = _slack_gains(parameters, gains)
         slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
-        slack = summed(slack, sums["slack"])
-        expected, guarded = before.guarded.after(ticks, outside, created - slack)
-        seen = expected.seen
-        kept, lost = coupling_work, created  # without a law, all energy stored in the scene
-        kept_sum = np.zeros(len(ticks))
-        turned = np.zeros(len(ticks))
+        totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
+        totals |= _device_energies(block, events, delay)
+        released, commanded = coupling_work, np.zeros(len(ticks))
+        totals["stored_in_coupling"] = np.zeros(len(ticks))
+        lost = created  # without a law, all energy stored in the scene counts
         if parameters.has_law:
-            around = outside.laws(numbers - 1), gains
-            pulled = motion.pulled, motion.turned
-            share_before = np.concatenate([[before.share], seen.share[:-1]])
-            turned = work_of_commands(parameters, around, pulled, share_before)
+            shares = transmitted_shares(ticks, parameters)
+            stretched = motion.stretched
+            paths = (
+                SpringPath(motion.pulled, motion.stretch, stretched[0], works[0], shares[0]),
+                SpringPath(motion.turned, motion.twist, stretched[1], works[1], shares[1]),
+            )
+            gains_before = events.gains(ticks["tick"] - 1)
+            commanded = work_of_commands(parameters, gains_before, gains, paths, block.share_before)
+            parts, held = stored_in_coupling(
+                parameters, gains, paths, block.is_start, block.share, block.share_before
+            )
+            kept = _summed(parts - commanded, before["stored_in_coupling"])
+            totals["stored_in_coupling"] = kept
+            # with a delay the device is elsewhere, and only the energy given so far counts
+            released = kept if delay else kept + held
             # The slack covers energy created by the environment, but a ramp or a limit passes only
             # a share of the slack. Counted here, it would blame a device that bears its coupling.
             lost = np.minimum(created, 0.0)
-            parts, held = stored_in_coupling(
-                parameters,
-                gains=around,
-                pulled=pulled,
-                stretch=(motion.stretch, motion.twist),
-                stretched=motion.stretched,
-                work=works,
-                passed=passed_shares(ticks, parameters),
-                since_start=seen.since_start,
-                share=seen.share,
-                share_before=before.share,
-                has_end=not late,
-            )
-            kept_sum = summed(parts, sums["kept"])
-            kept = kept_sum + held
-        burnt = np.zeros(len(ticks))
-        if parameters.device_damping is not None:
-            parts = burnt_by_damping(parameters, *later, seen.interval, ~seen.first)
-            burnt = summed(parts, sums["burnt"])
-        totals = {
-            "coupling_work": coupling_work,
-            "throughput": summed(np.abs(work), sums["throughput"]),
-            "device_energy": device_energy,
-            "device_throughput": summed(np.abs(device_work), sums["device_throughput"]),
-            "slack": slack,
-            "given": summed(given, sums["given"]),
-            "burnt": burnt,
-            "kept": kept_sum,
-            "commanded": summed(turned, sums["commanded"]),
-        }
-        last = ticks[-1]
+        totals["commanded"] = _summed(commanded, before["commanded"])
+        unpaid = np.zeros(len(ticks))
+        if parameters.device_damping is not None and (
+            not parameters.has_law or parameters.law_evaluations == 1
+        ):
+            unpaid = totals["energy_to_device"] - totals["device_dissipation"]
+            unpaid = unpaid + parameters.force_scale / parameters.scale * (lost + released)
         return cls(
-            wrench_on_tool=law,
-            wrench_on_device=expected.wrench,
-            injected_damping=expected.injected,
-            handle_position=expected.position,
-            handle_turn=np.linalg.norm(
-                turn_between(expected.orientation, ticks["handle_quaternion"]), axis=1
-            ),
             coupling_work=coupling_work,
             throughput=totals["throughput"],
-            device_energy=device_energy,
+            device_energy=totals["device_energy"],
             device_throughput=totals["device_throughput"],
             environment_energy=created,
             slack=totals["slack"],
-            kicked=_unpaid_energy(parameters, totals["given"], burnt, lost + kept),
+            unpaid_energy=unpaid,
             commanded=totals["commanded"],
-            reached=Reached(
-                handle=np.concatenate([last["handle_position"], last["handle_quaternion"]]),
-                tool=np.concatenate([last["tool_position"], last["tool_quaternion"]]),
-                device=np.concatenate([last["device_position"], last["device_quaternion"]]),
-                sent=last["wrench_on_device"].copy(),
-                start_energy=before.start_energy,
-                share=float(seen.share[-1]),
-                guarded=guarded,
-                sums={name: float(total[-1]) for name, total in totals.items()},
-            ),
+            sums={name: float(total[-1]) for name, total in totals.items()},
         )
+
+
+def _summed(values: Array, before: float) -> Array:
+    """Returns cumulative sums that start from an earlier sum.
+
+    Values are added one by one, so that sums over blocks equal those over the whole to the bit.
+    """
+    return np.cumsum(np.concatenate([[before], values]))[1:]
+
+
+def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict[str, Array]:
+    """Returns cumulative energies at the device port, by name, (n,) each in J."""
+    ticks, parameters, before = block.ticks, events.parameters, block.state.sums
+    rows = np.concatenate([block.state.row, ticks, block.following])
+    sent = rows["wrench_on_device"][: len(ticks)].copy()
+    sent[np.isin(ticks["tick"], events.resumed)] = 0.0
+    position, orientation = rows["device_position"], rows["device_quaternion"]
+    motions = np.diff(position, axis=0), turn_between(orientation[:-1], orientation[1:])
+    works, moved = [], []
+    for first in (0, delay):
+        moved = [motion[first : first + len(ticks)] for motion in motions]
+        # the motion after the last record is unknown and counts as none
+        moved = [np.concatenate([m, np.zeros((len(ticks) - len(m), 3))]) for m in moved]
+        linear, angular = sent[:, :3] * moved[0], sent[:, 3:] * moved[1]
+        works.append(np.sum(linear, axis=1) + np.sum(angular, axis=1))
+    dissipation = np.zeros(len(ticks))
+    if parameters.device_damping is not None:
+        interval, is_first = block.interval, block.is_first
+        parts = dissipated_by_damping(parameters, moved[0], moved[1], interval, ~is_first)
+        dissipation = _summed(parts, before["device_dissipation"])
+    return {
+        "device_energy": _summed(works[0], before["device_energy"]),
+        "device_throughput": _summed(np.abs(works[0]), before["device_throughput"]),
+        "energy_to_device": _summed(works[1], before["energy_to_device"]),
+        "device_dissipation": dissipation,
+    }
 
 
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
@@ -392,21 +298,39 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
     return share * linear, share * angular
 
 
-def _unpaid_energy(parameters: RunParameters, given: Array, burnt: Array, taken: Array) -> Array:
-    """Returns Σ w·δp − Σ b‖δp‖²/t + energy stored in scene and coupling, in the device's scale."""
-    if parameters.device_damping is None or (parameters.has_law and parameters.law_evaluations > 1):
-        return np.zeros(len(given))
-    return np.asarray(given - burnt + parameters.force_scale / parameters.scale * taken)
+def energy_balances(
+    blocks: Iterable[NDArray[np.void]], state: AuditState, events: RunEvents, delay: int = 0
+) -> Iterator[tuple[AuditedBlock, EnergyBalance]]:
+    """Yields the energy balance of a run, block by block.
+
+    Args:
+        blocks: Records without gaps; no block is empty.
+        state: State before the first of them.
+        events: External actions during the run.
+        delay: Delay in ticks: the wrench of row k acted on the motion between rows k + delay and
+            k + delay + 1.
+    """
+    waiting: deque[NDArray[np.void]] = deque()
+    for newest in chain(blocks, [None]):
+        if newest is not None:
+            waiting.append(newest)
+        while waiting and (newest is None or sum(map(len, waiting)) - len(waiting[0]) >= delay):
+            ticks = waiting.popleft()
+            following = np.concatenate([ticks[:0], *waiting])[:delay]
+            block = AuditedBlock.of(ticks, following, state, events)
+            balance = EnergyBalance.of(block, events, delay)
+            yield block, balance
+            state = block.state_after(balance.sums)
 
 
-def _delayed_steps(
-    ticks: NDArray[np.void], following: NDArray[np.void] | None, late: int
-) -> tuple[Array, Array]:
-    """Returns the device's steps and turns ``late`` rows later; zeros after the last record."""
-    rows = ticks if following is None else np.concatenate([ticks, following])
-    moved = []
-    for field, of in (("device_position", steps), ("device_quaternion", turns)):
-        change = of(rows[field], rows[field][0])[late : late + len(ticks)]
-        missing = np.zeros((len(ticks) - len(change), 3))
-        moved.append(np.concatenate([change, missing]))
-    return moved[0], moved[1]
+def energy_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[Deviation]:
+    """Yields the deviations of the recorded energies."""
+    ticks = block.ticks
+    for name, throughput in (
+        ("coupling_work", balance.throughput),
+        ("device_energy", balance.device_throughput),
+        ("environment_energy", balance.throughput),
+    ):
+        amount = np.abs(ticks[name] - getattr(balance, name))
+        allowed = TOLERANCE * (1 + throughput + np.abs(ticks["potential"]))
+        yield Deviation(name, amount, allowed, "J", "recorded poses and wrenches")

@@ -1,29 +1,32 @@
-"""External actions during a run, from its events.
+"""Parameters and external actions of a recorded run, from metadata and events.
 
-This is the second reading of the events: ``commands.change`` applies them one by one to the kernel;
-here they become arrays over ticks.
+This is the second reading of the events. ``commands.execution`` applies them one by one to the
+kernel; here they become arrays over ticks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import required_axis_damping
+from hapticbridge.certificate import delay_ticks, required_axis_damping
 from hapticbridge.commands.execution import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.rendering import Method
+from hapticbridge.recording import RecordingFile
+from hapticbridge.rendering import Method, method_named
+from hapticbridge.run_description import meta_start, parameters_of
 
 Array = NDArray[np.float64]
 
-_REACHES = 2**62
+_LATEST = 2**62
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +43,30 @@ class RunEvents:
 
     parameters: RunParameters
     home: Array
-    resumed: Array = field(default_factory=lambda: np.zeros(0))
-    resets: Array = field(default_factory=lambda: np.zeros(0))
-    couplings: tuple[Coupling, ...] = ()
-    _began: Array = field(default_factory=lambda: np.zeros(0))
-    _switched: tuple[Array, NDArray[np.int64]] = field(
-        default_factory=lambda: (np.zeros(0), np.zeros(0, np.int64))
-    )
+    resumed: Array
+    resets: Array
+    couplings: tuple[Coupling, ...]
+    _began: Array
+    _switched: tuple[Array, NDArray[np.int64]]
 
     @classmethod
-    def of(
-        cls, events: Iterable[Mapping[str, Any]], parameters: RunParameters, home: Array
-    ) -> RunEvents:
+    def of(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
         """Reads the events of a recording.
 
-        ``home`` is the tool pose (7,) before the first tick.
-
         Raises:
-            RecordingError: An event is damaged.
+            RecordingError: An event is damaged, or the metadata lack the tool's start.
         """
         by_name: dict[str, list[Mapping[str, Any]]] = {
             name: [] for name in ("resume", "reset", "coupling", "switch")
         }
-        for event in events:
+        home = np.array(meta_start(recording.meta, "tool_start"))
+        for event in recording.events:
             if event.get("event") in by_name:
                 by_name[str(event["event"])].append(event)
-        ticks = {name: np.array([_tick(e) for e in of], float) for name, of in by_name.items()}
+        ticks = {
+            name: np.array([_tick(event) for event in events], float)
+            for name, events in by_name.items()
+        }
         return cls(
             parameters=parameters,
             home=home,
@@ -82,83 +83,125 @@ class RunEvents:
             ),
         )
 
-    def laws(self, numbers: NDArray[np.int64]) -> Array:
-        """Returns K, B', K_r, B'_r in some ticks, (n, 4)."""
-        goals = np.array([_gains(c) for c in (self.parameters.coupling, *self.couplings[1:])])
+    def gains(self, numbers: NDArray[np.int64]) -> Array:
+        """Returns K, B', K_r and B'_r in some ticks, (n, 4); a command changes them linearly."""
+        goals = np.array([_gains(coupling) for coupling in self.couplings])
         length = tuning_ticks(self.parameters.period)
-        value, gone = np.tile(goals[0], (len(numbers), 1)), goals[0]
+        value, start = np.tile(goals[0], (len(numbers), 1)), goals[0]
         for index, (begin, goal) in enumerate(zip(self._began, goals[1:], strict=True)):
-            later = self._began[index + 1] if index + 1 < len(self._began) else _REACHES
+            later = self._began[index + 1] if index + 1 < len(self._began) else _LATEST
             share = np.clip((numbers - begin + 1.0) / length, 0.0, 1.0)[:, None]
-            value = np.where(share > 0, gone + share * (goal - gone), value)
-            gone = gone + min(max((later - begin) / length, 0.0), 1.0) * (goal - gone)
+            value = np.where(share > 0, start + share * (goal - start), value)
+            start = start + min(max((later - begin) / length, 0.0), 1.0) * (goal - start)
         return value
 
     def buttons(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """Returns the bits of ``buttons`` that commands set in some ticks."""
-        at, bits = self._switched
-        last = np.searchsorted(at, numbers, side="right") - 1
-        return np.concatenate([[0], bits])[last + 1]
+        ticks, bits = self._switched
+        return np.concatenate([[0], bits])[np.searchsorted(ticks, numbers, side="right")]
+
+    def is_first(self, ticks: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Returns True for each record at a start or after a pause without force."""
+        return np.asarray((ticks["tick"] == 0) | np.isin(ticks["tick"], self.resumed))
 
     def is_reset(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns True for each tick that began with a reset."""
         return np.isin(numbers, self.resets)
 
-    def sentences(self, given: float | None = None) -> tuple[str, ...]:
+    def sentences(self, added: float | None = None) -> tuple[str, ...]:
         """Describes changes of the coupling; empty without any.
 
-        ``given`` is the energy that they added to the effective coupling, in J; None if not yet
-        known.
+        ``added`` is the energy that they added to the effective coupling, in J; None if unknown.
         """
-        count = len(self.couplings) - 1
-        if count < 1:
+        first, last = self.couplings[0], self.couplings[-1]
+        if last is first:
             return ()
-        began, last = self.couplings[0], self.couplings[-1]
-        turning = (
-            ""
-            if last.rotational_stiffness == began.rotational_stiffness
-            else (f", K_r = {last.rotational_stiffness:g} N m/rad")
-        )
+        turning = ""
+        if last.rotational_stiffness != first.rotational_stiffness:
+            turning = f", K_r = {last.rotational_stiffness:g} N m/rad"
+        energy = "" if added is None else f", which gave the coupling {added:.3g} J"
         return (
-            f"so it began; commands changed the coupling {count} times, last to K = "
-            f"{last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used"
-            + ("" if given is None else f", which gave the coupling {given:.3g} J"),
+            f"so it began; commands changed the coupling {len(self.couplings) - 1} times, last to "
+            f"K = {last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used{energy}",
         )
 
-    def worst(self, info: DeviceInfo, method: Method) -> RunParameters:
-        """Returns the run's parameters with the most demanding coupling, per kind of axis.
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """Device, method, parameters and events of a recorded run.
+
+    Attributes:
+        info: The device.
+        method: The rendering method.
+        parameters: Run parameters, with the device's damping.
+        events: External actions.
+    """
+
+    info: DeviceInfo
+    method: Method
+    parameters: RunParameters
+    events: RunEvents
+
+    @classmethod
+    def of(cls, recording: RecordingFile) -> RecordedRun:
+        """Reads metadata and events.
+
+        Raises:
+            RecordingError: They are damaged or do not describe a run.
+        """
+        meta, parameters = recording.meta, parameters_of(recording.meta)
+        try:
+            info = DeviceInfo.from_json(meta.get("device", ""))
+            limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))
+            method = method_named(meta.get("method", ""))
+        except HapticBridgeError as error:
+            raise RecordingError(f"the metadata do not describe a run: {error}") from None
+        if meta.get("discretization") != method.discretization:
+            raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
+        linear, angular = info.burning_damping
+        parameters = replace(parameters, device_damping=linear, device_rotational_damping=angular)
+        return cls(info, method, parameters, RunEvents.of(recording, parameters))
+
+    @property
+    def worst(self) -> RunParameters:
+        """Run parameters with the most demanding coupling, per kind of axis.
 
         The required damping is convex in the coupling, so no intermediate coupling needs more.
         """
-        parameters = self.parameters
-        if len(self.couplings) < 2:
-            return parameters
+        run, couplings = self.parameters, self.events.couplings
+        if len(couplings) == 1:
+            return run
         needs = [
             required_axis_damping(
-                info,
+                self.info,
                 coupling,
-                parameters.period,
-                parameters.scale,
-                parameters.force_scale,
-                parameters.law_evaluations,
-                method,
+                run.period,
+                run.scale,
+                run.force_scale,
+                run.law_evaluations,
+                self.method,
             )
-            for coupling in self.couplings
+            for coupling in couplings
         ]
         linear, angular = (
-            self.couplings[int(np.argmax([need[axis] for need in needs]))] for axis in (0, 1)
+            couplings[int(np.argmax([need[axis] for need in needs]))] for axis in (0, 1)
         )
         coupling = replace(
             linear,
             rotational_stiffness=angular.rotational_stiffness,
             rotational_damping=angular.rotational_damping,
         )
-        return replace(parameters, coupling=coupling)
+        return replace(run, coupling=coupling)
+
+    @property
+    def delay(self) -> int:
+        """Delay in ticks from a sample to the wrench that answers it; 0 if unknown."""
+        return delay_ticks(self.info, self.parameters.period) or 0
 
 
 def _tick(event: Mapping[str, Any]) -> int:
     tick = event.get("tick")
-    if not isinstance(tick, int) or isinstance(tick, bool) or not 0 <= tick < _REACHES:
+    if not isinstance(tick, int) or isinstance(tick, bool) or not 0 <= tick < _LATEST:
         raise RecordingError(
             f"event '{event.get('event')}' has tick {tick!r}; it must be a whole number >= 0"
         )

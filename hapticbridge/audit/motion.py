@@ -1,4 +1,4 @@
-"""Coupling law at recorded poses."""
+"""Motion and coupling wrench, from recorded poses alone."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.record import TickFlag
+from hapticbridge.audit.state import AuditState
+from hapticbridge.record import TickFlag, has_flag
 
-# Steps, turns and sums over whole arrays.
+Array = NDArray[np.float64]
+
+
+# Steps and rotations over rows.
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
@@ -36,53 +40,41 @@ def turn_between(a: Array, b: Array) -> Array:
     return np.asarray(factor * q[..., 1:])
 
 
-def steps(values: Array, before: Array) -> Array:
-    """Returns v_k − v_{k−1} over rows, with v_{−1} = before."""
-    return np.diff(values, axis=0, prepend=before[None])
-
-
-def turns(values: Array, before: Array) -> Array:
-    """Returns the rotation vector from each orientation's predecessor to it."""
-    return turn_between(np.concatenate([before[None], values[:-1]]), values)
-
-
-def summed(values: Array, before: float) -> Array:
-    """Returns cumulative sums that start from an earlier sum.
-
-    Values are added one by one, so that sums over blocks equal those over the whole to the bit.
-    """
-    return np.cumsum(np.concatenate([[before], values]))[1:]
-
-
 def rotate(q: Array, v: Array) -> Array:
     """Returns R(q) v over rows, q (n, 4) and v (n, 3)."""
     pure = np.concatenate([np.zeros((len(v), 1)), v], axis=1)
     return quaternion_product(quaternion_product(q, pure), conjugate(q))[:, 1:]
 
 
-Array = NDArray[np.float64]
+def pose_of(ticks: NDArray[np.void], body: str) -> Array:
+    """Returns the poses of ``device``, ``handle`` or ``tool``, (n, 7)."""
+    return np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of handle and tool, (n, 3) each, in m and as rotation vectors in rad.
+    """Motion of handle and tool in each tick, in m and as rotation vectors in rad.
+
+    Arrays are (n, 3) unless stated. The jump of a reset is no motion.
 
     Attributes:
         handle_step: h_k − h_{k−1}.
+        handle_turn: Rotation of the handle.
         tool_step: x_k − x_{k−1}.
-        handle_turn: Rotation of the handle in each tick.
-        tool_turn: Rotation of the tool in each tick.
-        stretch: h − x.
+        tool_turn: Rotation of the tool.
+        stretch: e = h − x.
         twist: Rotation from the tool to the handle.
         twist_before: Rotation from the tool to the handle in the previous tick.
         pulled: h_k − x_{k−1}, the stretch after the handle's step and before the tool's.
         turned: Rotation from the previous tick's tool to the handle.
         carried: Rotation of the tool in each tick as quaternions, (n, 4).
+        handle_before: Handle pose in the previous tick, (n, 7).
+        tool_before: Tool pose in the previous tick, (n, 7).
     """
 
     handle_step: Array
-    tool_step: Array
     handle_turn: Array
+    tool_step: Array
     tool_turn: Array
     stretch: Array
     twist: Array
@@ -90,28 +82,31 @@ class Motion:
     pulled: Array
     turned: Array
     carried: Array
+    handle_before: Array
+    tool_before: Array
 
     @classmethod
-    def of(cls, ticks: NDArray[np.void], handle: Array, tool: Array, outside: RunEvents) -> Motion:
-        """Computes the motion of consecutive records.
-
-        ``handle`` and ``tool`` are the poses (7,) before the first record. The jump of a reset is
-        no motion.
-        """
-        handle_before = poses_before(ticks, "handle", handle, outside)
-        tool_before = poses_before(ticks, "tool", tool, outside)
-        handles, tools = ticks["handle_quaternion"], ticks["tool_quaternion"]
+    def of(cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents) -> Motion:
+        """Computes the motion of consecutive records."""
+        rows = np.concatenate([state.row, ticks])
+        is_reset = events.is_reset(ticks["tick"])[:, None]
+        handle, tool = pose_of(rows, "handle"), pose_of(rows, "tool")
+        handle_before = np.where(is_reset, events.home, handle[:-1])
+        tool_before = np.where(is_reset, events.home, tool[:-1])
+        handle, tool = handle[1:], tool[1:]
         return cls(
-            handle_step=ticks["handle_position"] - handle_before[:, :3],
-            tool_step=ticks["tool_position"] - tool_before[:, :3],
-            handle_turn=turn_between(handle_before[:, 3:], handles),
-            tool_turn=turn_between(tool_before[:, 3:], tools),
-            stretch=ticks["handle_position"] - ticks["tool_position"],
-            twist=turn_between(tools, handles),
+            handle_step=handle[:, :3] - handle_before[:, :3],
+            handle_turn=turn_between(handle_before[:, 3:], handle[:, 3:]),
+            tool_step=tool[:, :3] - tool_before[:, :3],
+            tool_turn=turn_between(tool_before[:, 3:], tool[:, 3:]),
+            stretch=handle[:, :3] - tool[:, :3],
+            twist=turn_between(tool[:, 3:], handle[:, 3:]),
             twist_before=turn_between(tool_before[:, 3:], handle_before[:, 3:]),
-            pulled=ticks["handle_position"] - tool_before[:, :3],
-            turned=turn_between(tool_before[:, 3:], handles),
-            carried=quaternion_product(tools, conjugate(tool_before[:, 3:])),
+            pulled=handle[:, :3] - tool_before[:, :3],
+            turned=turn_between(tool_before[:, 3:], handle[:, 3:]),
+            carried=quaternion_product(tool[:, 3:], conjugate(tool_before[:, 3:])),
+            handle_before=handle_before,
+            tool_before=tool_before,
         )
 
     @property
@@ -130,7 +125,7 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
     force = k * motion.stretch + b / period * step
     torque = k_r * motion.twist + b_r / period * turn
-    is_midpoint = (ticks["flags"] & int(TickFlag.MIDPOINT)) != 0
+    is_midpoint = has_flag(ticks, TickFlag.MIDPOINT)
     if np.any(is_midpoint):
         # quantities of the previous tick are rotated with the tool's turn
         carried = motion.carried
@@ -139,13 +134,3 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
         midpoint = k_r * spring + (b_r / period + 0.5 * k_r) * midway
         torque = np.where(is_midpoint[:, None], midpoint, torque)
     return np.concatenate([force, torque], axis=1)
-
-
-def poses_before(ticks: NDArray[np.void], body: str, before: Array, outside: RunEvents) -> Array:
-    """Returns the pose before each tick, (n, 7).
-
-    ``before`` is the pose (7,) of the body (``handle`` or ``tool``) before the first record.
-    """
-    poses = np.concatenate([ticks[f"{body}_position"], ticks[f"{body}_quaternion"]], axis=1)
-    poses = np.concatenate([before[None], poses[:-1]])
-    return np.where(outside.is_reset(ticks["tick"])[:, None], outside.home, poses)

@@ -1,4 +1,4 @@
-"""Re-simulation of a recorded run, compared in every number."""
+"""Re-simulation of a recorded run, compared with the recording in every number."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.structure import first_row
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import EventApplier
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -35,7 +36,7 @@ from hapticbridge.run_description import (
     versions,
 )
 
-# Checks of the attached scene against the metadata.
+# Attached scene.
 
 FOREIGN_TOLERANCE = 1e-9
 """Allowed difference on another processor, relative to a field's largest value; other vector
@@ -112,7 +113,7 @@ def is_same_processor(recording: RecordingFile) -> bool:
         return True
 
 
-# Re-simulation of a recorded run with its whole scene.
+# Re-simulation.
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
 """Packages whose versions must match for a repetition to the bit."""
@@ -124,7 +125,7 @@ _CHANGES = ("input", "resume", *COMMANDED)
 class Resimulator:
     """Simulation of a recorded device motion in the attached scene.
 
-    The recording must have no ``obstacle``. Its events are applied when due; ``note`` adds more.
+    The recording must have no ``obstacle``. Its events are applied when due.
 
     Attributes:
         model: The attached scene.
@@ -138,16 +139,17 @@ class Resimulator:
     """
 
     def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
-        self._changes: deque[Mapping[str, Any]] = deque()
-        self._resumed: list[Any] = []
-        for event in recording.events:
-            self.note(event)
+        events = recording.events
+        self._changes = deque(event for event in events if event.get("event") in _CHANGES)
+        self._resumed: list[Any] = [
+            event.get("tick") for event in events if event.get("event") == "resume"
+        ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
         self.model = model = attached_model(recording, parameters)
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
-        self._start = start = recording.attachments[STATE_ATTACHMENT]
+        start = recording.attachments[STATE_ATTACHMENT]
         method = method_named(recording.meta.get("method", ""))
         restore_state(model, data, start)
         method.step(model, data)
@@ -160,13 +162,6 @@ class Resimulator:
     def slack(self) -> float:
         """Energy that the environment may have created so far, in J."""
         return self.binding.slack
-
-    def note(self, event: Mapping[str, Any]) -> None:
-        """Adds an event of a running run; events without effect on the simulation are ignored."""
-        if event.get("event") in _CHANGES:
-            self._changes.append(event)
-        if event.get("event") == "resume":
-            self._resumed.append(event.get("tick"))
 
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
@@ -193,8 +188,6 @@ class Resimulator:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            if end < done:  # during a live run, events may arrive after records
-                raise RecordingError(f"an event before tick {self.done + done} came after it")
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
             count = simulate_recorded(
                 state, samples[part], outside[part], elapsed[part], row, rows[part]
@@ -262,16 +255,16 @@ def obstacle(recording: RecordingFile) -> str:
     return f"the file has no attachment '{missing[0]}'" if missing else ""
 
 
+# Comparison.
+
 NOT_RUN = "not re-simulated"
 
-_OUTSIDE = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
+_EXTERNAL = int(TickFlag.OVERRUN | TickFlag.DROPPED_BEFORE | TickFlag.STALE_SAMPLE)
 """Flags set by clock, recorder and device instead of the simulation."""
-
-_COMPARED = tuple(name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS)
 
 
 @dataclass(frozen=True, slots=True)
-class Replay:
+class ReplayOutcome:
     """Outcome of a re-simulation.
 
     Attributes:
@@ -298,72 +291,42 @@ class Replay:
         return self.tick is not None
 
 
-class Resimulation:
-    """Re-simulation of the recorded device motion, block by block.
-
-    All fields except the clock's are compared; ``outcome`` returns the result.
+def compare_resimulation(recording: RecordingFile, parameters: RunParameters) -> ReplayOutcome:
+    """Simulates the recorded device motion again and compares every number except times.
 
     Raises:
-        RecordingError: The attachments contradict the metadata, so the file was changed.
+        RecordingError: The attachments contradict the metadata, or an event is damaged; the file
+            was changed.
     """
-
-    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
-        self._is_same_processor = is_same_processor(recording)
-        self._first: tuple[int, str, float] | None = None
-        self._off = dict.fromkeys(_COMPARED, 0.0)
-        self._largest = dict.fromkeys(_COMPARED, 0.0)
-        self._obstacle = obstacle(recording)
-        if not self._obstacle:
-            self._run = Resimulator(recording, parameters)
-
-    def add(self, ticks: NDArray[np.void]) -> None:
-        """Simulates the next records, ``TICK_DTYPE``, at least one.
-
-        Raises:
-            RecordingError: An event among them is damaged.
-        """
-        if self._obstacle or self._run.is_over:
-            return
-        start = self._run.done
-        again = self._run.add(ticks)
-        self._compare(ticks[: len(again)], again, start)
-
-    def outcome(self) -> Replay:
-        """Returns the agreement after the last record.
-
-        Raises:
-            RecordingError: An event after the last record is damaged.
-        """
-        if self._obstacle:
-            return Replay(f"{NOT_RUN}: {self._obstacle}")
-        self._run.finish()
-        off = max(self._off[name] / max(self._largest[name], 1.0) for name in _COMPARED)
-        if self._run.is_over and self._first is None:
-            return Replay("disagrees", self._run.done, "tool_position", float("nan"))
-        if self._first is None:
-            return Replay("bit for bit")
-        if not self._run.is_over and not self._is_same_processor and off <= FOREIGN_TOLERANCE:
-            return Replay("within 1e-9 (other processor)")
-        return Replay("disagrees", *self._first)
-
-    def _compare(
-        self, recorded_rows: NDArray[np.void], again: NDArray[np.void], start: int
-    ) -> None:
-        if not len(again):
-            return
-        first: tuple[int, str, float] | None = None
-        for name in _COMPARED:
-            recorded, simulated = recorded_rows[name], again[name]
+    if reason := obstacle(recording):
+        return ReplayOutcome(f"{NOT_RUN}: {reason}")
+    run = Resimulator(recording, parameters)
+    names = [name for name in recording.record.names or () if name not in CLOCK_FIELDS]
+    off, largest = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
+    first: tuple[int, str, float] | None = None
+    for ticks in recording.blocks():
+        start = run.done
+        again = run.add(ticks)
+        for name in names if len(again) else ():
+            recorded, simulated = ticks[name][: len(again)], again[name]
             if name == "flags":
-                recorded, simulated = recorded & ~_OUTSIDE, simulated & ~_OUTSIDE
-            self._largest[name] = max(self._largest[name], float(np.abs(simulated).max()))
-            unequal = (recorded != simulated).reshape(len(again), -1).any(axis=1)
-            if not unequal.any():
+                recorded, simulated = recorded & ~_EXTERNAL, simulated & ~_EXTERNAL
+            largest[name] = max(largest[name], float(np.abs(simulated).max()))
+            row = first_row((recorded != simulated).reshape(len(again), -1).any(axis=1))
+            if row is None:
                 continue
             difference = np.abs(recorded - simulated).reshape(len(again), -1).max(axis=1)
-            self._off[name] = max(self._off[name], float(difference.max()))
-            at = int(np.argmax(unequal))
-            if first is None or at < first[0]:
-                first = (at, name, float(difference[at]))
-        if first is not None and self._first is None:
-            self._first = (start + first[0], *first[1:])
+            off[name] = max(off[name], float(difference.max()))
+            if first is None or start + row < first[0]:
+                first = start + row, name, float(difference[row])
+        if run.is_over:
+            break
+    run.finish()
+    if first is None and run.is_over:
+        return ReplayOutcome("disagrees", run.done, "tool_position", float("nan"))
+    if first is None:
+        return ReplayOutcome("bit for bit")
+    worst = max(off[name] / max(largest[name], 1.0) for name in names)
+    if not run.is_over and not is_same_processor(recording) and worst <= FOREIGN_TOLERANCE:
+        return ReplayOutcome("within 1e-9 (other processor)")
+    return ReplayOutcome("disagrees", *first)

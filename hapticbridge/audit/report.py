@@ -36,7 +36,9 @@ class AuditReport:
         rendered: Sentences on effective and law coupling. They hold away from contact, or
             everywhere if the tool was never released.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
-            re-simulation such a recording is invalid instead of passive.
+            re-simulation a recording whose wrench is such a part is invalid instead of passive. Any
+            other then names the changes that would pass: those of ``wrench_on_device`` and
+            ``share`` that fit each other.
         damping_margin: Smallest share of the device's damping that the coupling leaves, 1 − needed
             / b over the kinds of axis. It is negative if more is needed than available; None if b
             is unknown or the motion prescribed.

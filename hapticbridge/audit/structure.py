@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.guard import Seen, Watch
+from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.guard import DEVICE_BUTTONS
-from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, RunParameters
+from hapticbridge.record import CLOCK_FIELDS, TickFlag, has_flag
 from hapticbridge.recording import RecordingFile
+
+Flags = NDArray[np.bool_]
 
 TOLERANCE = 1e-9
 """Tolerance between a recorded number and its second computation: relative, and absolute in SI
@@ -37,6 +39,57 @@ class Fault:
     tick: int | None = None
     port: str = ""
     joules: float = 0.0
+
+
+class Deviation(NamedTuple):
+    """Deviation of a recorded field from its second computation.
+
+    Attributes:
+        field: Field of the record.
+        amount: Size of the deviation in each tick, (n,).
+        allowed: Largest deviation by rounding, (n,) or one number.
+        unit: Unit of both.
+        source: Facts that the second computation is based on.
+    """
+
+    field: str
+    amount: NDArray[np.float64]
+    allowed: NDArray[np.float64] | float
+    unit: str
+    source: str
+
+    @classmethod
+    def between(
+        cls,
+        field: str,
+        recorded: NDArray[np.float64],
+        expected: NDArray[np.float64],
+        unit: str,
+        source: str,
+    ) -> Deviation:
+        """Returns the largest deviation over the components of vectors (n, m)."""
+        amount = np.abs(recorded - expected).max(axis=1)
+        allowed = TOLERANCE * (1 + np.abs(expected).max(axis=1))
+        return cls(field, amount, allowed, unit, source)
+
+    def fault(self, start: int) -> Fault | None:
+        """Returns the first deviation that is not rounding, or None; ``start`` is row 0's tick."""
+        row = first_row(~(self.amount <= self.allowed))  # True also for NaN from an overflow
+        if row is None:
+            return None
+        amount = float(self.amount[row])
+        return Fault(
+            f"{self.field} of tick {start + row} is {amount:.3g} {self.unit} off what "
+            f"{self.source} give".replace("  ", " "),
+            start + row,
+            self.field,
+            amount if self.unit == "J" else 0.0,
+        )
+
+
+def first_row(is_wrong: Flags) -> int | None:
+    """Returns the first row that is True, or None."""
+    return int(np.argmax(is_wrong)) if is_wrong.any() else None
 
 
 def file_fault(recording: RecordingFile) -> Fault | None:
@@ -63,53 +116,51 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     return None
 
 
-def structure_fault(
-    blocks: Iterable[NDArray[np.void]], parameters: RunParameters, outside: RunEvents
-) -> Fault | None:
+def structure_fault(blocks: Iterable[NDArray[np.void]], events: RunEvents) -> Fault | None:
     """Returns the first fault that makes records implausible, or None.
 
     Impossible numbers come before times, times before flags, each at its earliest tick. No block
     may be empty.
     """
     found: dict[int, Fault] = {}
-    before: NDArray[np.void] = np.zeros(0, TICK_DTYPE)
-    count, watch = 0, Watch.at_start(parameters)
+    before: NDArray[np.void] | None = None
+    count = 0
     for ticks in blocks:
-        seen, watch = watch.after(ticks, outside)
-        checks = chain(
-            _number_faults(ticks, count),
-            _time_faults(ticks, before, count, parameters),
-            _flag_faults(ticks, before, count, seen),
-            _command_faults(ticks, count, outside),
-        )
-        for rank, fault in enumerate(checks):
+        before = ticks[:0] if before is None else before
+        for rank, fault in enumerate(_faults(ticks, before, count, events)):
             if fault is not None:
                 found.setdefault(rank, fault)
         before, count = ticks[-1:], count + len(ticks)
     return found[min(found)] if found else None
 
 
-def _first(is_wrong: NDArray[np.bool_], start: int, text: str, port: str) -> Fault | None:
-    """Returns the fault of the first wrong record, or None.
-
-    ``text`` has ``{}`` for the tick.
-    """
-    if not is_wrong.any():
-        return None
-    tick = start + int(np.argmax(is_wrong))
-    return Fault(text.format(tick), tick, port)
-
-
-def _command_faults(
-    ticks: NDArray[np.void], count: int, outside: RunEvents
+def _faults(
+    ticks: NDArray[np.void], before: NDArray[np.void], count: int, events: RunEvents
 ) -> Iterator[Fault | None]:
-    wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != outside.buttons(ticks["tick"])
+    """Yields one result per check, in order of rank.
+
+    ``before`` is the record before these, or none; ``count`` is the number of earlier records.
+    """
+    yield from _number_faults(ticks, count)
+    yield _gap(ticks, before, count)
+    yield _wrong_deadline(ticks, before, count, events.parameters)
+    times = np.stack([ticks[name] for name in CLOCK_FIELDS], axis=1)
+    backwards = np.asarray(np.diff(times, axis=1).min(axis=1) < 0)
+    yield _first(backwards, count, "times of tick {} run backwards", "wake_ns")
+    yield from _flag_faults(ticks, before, count, events)
+    wrong = (ticks["buttons"] & ~DEVICE_BUTTONS) != events.buttons(ticks["tick"])
     text = "buttons of tick {} do not show what the events commanded"
     yield _first(wrong, count, text, "buttons")
 
 
+def _first(is_wrong: Flags, start: int, text: str, port: str) -> Fault | None:
+    """Returns the fault of the first wrong record, or None; ``text`` has ``{}`` for the tick."""
+    row = first_row(is_wrong)
+    return None if row is None else Fault(text.format(start + row), start + row, port)
+
+
 def _number_faults(ticks: NDArray[np.void], count: int) -> Iterator[Fault | None]:
-    for name in TICK_DTYPE.names or ():
+    for name in ticks.dtype.names or ():
         finite = np.isfinite(ticks[name]).reshape(len(ticks), -1).all(axis=1)
         yield _first(~finite, count, f"{name} of record {{}} is not finite", name)
     for name in ("device_quaternion", "handle_quaternion", "tool_quaternion"):
@@ -118,26 +169,17 @@ def _number_faults(ticks: NDArray[np.void], count: int) -> Iterator[Fault | None
         yield _first(off, count, f"{name} of tick {{}} is not a unit quaternion", name)
 
 
-def _time_faults(
-    ticks: NDArray[np.void], before: NDArray[np.void], count: int, parameters: RunParameters
-) -> Iterator[Fault | None]:
-    yield _gap(ticks, before, count)
-    yield _wrong_deadline(ticks, before, count, parameters)
-    times = np.stack([ticks[name] for name in CLOCK_FIELDS], axis=1)
-    backwards = np.asarray(np.diff(times, axis=1).min(axis=1) < 0)
-    yield _first(backwards, count, "times of tick {} run backwards", "wake_ns")
-
-
 def _gap(ticks: NDArray[np.void], before: NDArray[np.void], count: int) -> Fault | None:
-    gap = np.flatnonzero(ticks["tick"] != count + np.arange(len(ticks)))
-    if not gap.size:
+    row = first_row(ticks["tick"] != count + np.arange(len(ticks)))
+    if row is None:
         return None
-    at = int(gap[0])
-    last = int(np.concatenate([before, ticks])["tick"][at + before.size - 1]) if count + at else -1
+    last = (
+        int(np.concatenate([before, ticks])["tick"][row + before.size - 1]) if count + row else -1
+    )
     return Fault(
-        f"ticks are not contiguous: {last} is followed by {int(ticks['tick'][at])}, so the "
+        f"ticks are not contiguous: {last} is followed by {int(ticks['tick'][row])}, so the "
         "energy in between is unknown",
-        count + at,
+        count + row,
         "tick",
     )
 
@@ -148,37 +190,78 @@ def _wrong_deadline(
     period_ns = round(min(parameters.period * 1e9, 2.0**62))
     due_before = before["deadline_ns"] if before.size else np.zeros(1, np.int64)
     interval = np.diff(ticks["deadline_ns"], prepend=due_before)
-    has_skipped = (ticks["flags"] & int(TickFlag.OVERRUN)) != 0
+    has_skipped = has_flag(ticks, TickFlag.OVERRUN)
     is_multiple = (interval > period_ns) & (interval % max(period_ns, 1) == 0)
-    wrong = np.where(has_skipped, ~is_multiple, interval != period_ns)
-    if not wrong.any():
+    row = first_row(np.where(has_skipped, ~is_multiple, interval != period_ns))
+    if row is None:
         return None
-    at = int(np.argmax(wrong))
-    claim = "an overrun is flagged and " if has_skipped[at] else ""
+    claim = "an overrun is flagged and " if has_skipped[row] else ""
     return Fault(
-        f"{claim}tick {count + at} is due {int(interval[at])} ns after the one before, the period "
-        f"is {period_ns} ns",
-        count + at,
+        f"{claim}tick {count + row} is due {int(interval[row])} ns after the one before, the "
+        f"period is {period_ns} ns",
+        count + row,
         "deadline_ns",
     )
 
 
+def has_share(record: np.dtype[np.void]) -> bool:
+    """Returns True if records hold the transmitted share; those of earlier versions do not."""
+    return "share" in (record.names or ())
+
+
+def may_fade(ticks: NDArray[np.void]) -> Flags:
+    """Returns True for each record whose wrench may be fading.
+
+    It fades during a clutch, while the force is off, and after several old samples.
+    """
+    is_off = (ticks["buttons"] & FORCE_OFF) != 0
+    return np.asarray(is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE))
+
+
+def _is_released(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
+    """Returns True for each record in which the handle does not follow the device."""
+    guarding, buttons = parameters.guarding, ticks["buttons"]
+    is_released = (buttons & (guarding.clutch | CLUTCHED)) != 0
+    if guarding.dead_man:
+        is_released |= (buttons & guarding.dead_man) == 0
+    is_out = np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
+    return np.asarray(is_released | is_out)
+
+
 def _flag_faults(
-    ticks: NDArray[np.void], before: NDArray[np.void], count: int, seen: Seen
+    ticks: NDArray[np.void], before: NDArray[np.void], count: int, events: RunEvents
 ) -> Iterator[Fault | None]:
-    """Compares flags with the fields that imply them."""
-    expected = {
-        TickFlag.DROPPED_BEFORE: np.zeros(len(ticks), bool),  # the ticks are contiguous
-        TickFlag.CONTACT: ticks["contacts"] > 0,
-        **seen.flags,
-    }
-    for flag, is_due in expected.items():
-        wrong = ((ticks["flags"] & int(flag)) != 0) != is_due
+    """Compares flags with the fields that imply or exclude them."""
+    parameters = events.parameters
+    guarding = parameters.guarding
+    none, every = np.zeros(len(ticks), bool), np.ones(len(ticks), bool)
+    is_released = _is_released(ticks, parameters)
+    was_released = _is_released(before, parameters) if before.size else [guarding.dead_man != 0]
+    was_released = np.concatenate([was_released, is_released[:-1]])
+    is_touching = ticks["contacts"] > 0
+    is_anchored = ~is_released & (was_released | events.is_reset(ticks["tick"]))
+    may_anchor, ramps, may_ramp = ~is_released, none, every
+    if has_share(ticks.dtype):
+        may_ramp = ticks["share"] < 1
+        ramps = may_ramp & ~may_fade(ticks)
+        first_share = (1 + TOLERANCE) / (guarding.fade_ticks + 1)
+        may_anchor &= events.is_first(ticks) | (ticks["share"] <= first_share)
+    controls = guarding.controller == DAMPER
+    controls |= guarding.controller == ENVIRONMENT and parameters.has_law
+    for flag, is_due, is_possible in (
+        (TickFlag.DROPPED_BEFORE, none, none),  # the ticks are contiguous
+        (TickFlag.CONTACT, is_touching, is_touching),
+        (TickFlag.CLUTCH, is_released, is_released),
+        (TickFlag.RESEATED, is_anchored, may_anchor),
+        (TickFlag.RAMPING, ramps, may_ramp),
+        (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
+    ):
+        has = has_flag(ticks, flag)
         name = (flag.name or "").lower()
         text = f"flag '{name}' of tick {{}} contradicts the record"
-        yield _first(wrong, count, text, "flags")
+        yield _first((is_due & ~has) | (has & ~is_possible), count, text, "flags")
     rows = np.concatenate([before, ticks])
-    is_stale = (rows["flags"][1:] & int(TickFlag.STALE_SAMPLE)) != 0
+    is_stale = has_flag(rows[1:], TickFlag.STALE_SAMPLE)
     for field in ("device_position", "device_quaternion"):
         moved = is_stale & (rows[field][1:] != rows[field][:-1]).any(axis=1)
         text = f"tick {{}} says that the device had nothing new, and its {field} differs"

@@ -37,7 +37,7 @@ class Setting:
         """Device damping in N s/m required by the default method."""
         method = default_method(self.substeps)
         used = method.used(self.coupling, self.period / self.substeps)
-        return required_damping(used, self.period, method.laws(self.substeps))
+        return required_damping(used, self.period, method.law_evaluations(self.substeps))
 
 
 @dataclass(slots=True)

@@ -34,8 +34,6 @@ from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
 
-# How ``hapticbridge audit`` prints a table of many recordings.
-
 _VERDICT_COLOURS = {
     "passive": "green",
     "active": "red",
@@ -81,9 +79,6 @@ def _why(verdict: str, reason: str, certified: str) -> str:
     return plain(" ".join(reason.splitlines()))
 
 
-# How ``hapticbridge audit --what-if`` prints runs side by side.
-
-
 def print_what_if(found: WhatIf) -> None:
     """Prints what was changed, the runs side by side, and what to know of them."""
     for name, before, after in changes(found):
@@ -105,7 +100,7 @@ def print_what_if(found: WhatIf) -> None:
 
 
 SCENE_SIZE = 640, 400
-"""Of the scene's picture on a page, in pixels: some 150 kB of a page's megabyte."""
+"""Width and height of a page's picture in pixels. It takes 150 kB; a larger one delays the page."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
 _COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}

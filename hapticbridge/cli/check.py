@@ -53,10 +53,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# How ``hapticbridge check --lean`` looks for less, and says what it found.
-
 _HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
-"""Of the table; JND: felt error in just noticeable differences."""
+"""Headings of the table of trials. JND is the felt error in just noticeable differences."""
 
 _ROUNDING = 1e-9  # N and N m; what is below is how the computer adds
 
@@ -162,10 +160,8 @@ def _numbers(trial: VariantVerdict) -> list[str]:
     ]
 
 
-# How ``hapticbridge check`` says what it found.
-
 MOST_NAMED = 4
-"""How many things of a kind are named before the rest is counted."""
+"""Number of things of a kind that are named; the rest is counted."""
 
 _SHOWN = 0.01  # s/s; a stage that takes less of the tick is left out
 _GLUE = "\x00"  # in place of a space at which a line is not to end

@@ -25,7 +25,7 @@ class Devices:
     """
 
     udev_rules: bool = False
-    """Print the udev rules that let whoever sits at the machine open the devices, and no more."""
+    """Print udev rules by which the user at this machine may open the devices, and nothing else."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the lists as JSON."""
 

@@ -29,8 +29,6 @@ from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import draw_z_width, recommended
 from hapticbridge.units import format_si
 
-# What ``hapticbridge identify`` says of a device, and the couplings that follow.
-
 
 def safe_width(result: Identification) -> ZWidth | None:
     """Returns the couplings that are safe with the lower ends of what was measured."""
@@ -108,14 +106,14 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
 
 
 def why_none(result: Identification) -> str:
-    """Says why there is no safe coupling to name."""
+    """Returns the reason why no coupling is recommended."""
     if result.of_all("damping", turns=False) is None:
         return "none of x, y, z was measured: the stiffness that the device can show is not known"
     return "damping may be zero: no coupling is safe for any hand"
 
 
 def facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:
-    """Returns the same as ``print_result`` prints, for ``--json``."""
+    """Returns the facts that ``print_result`` prints, for ``--json``."""
     return {
         "device": result.info.name,
         "axes": {axis: asdict(fit) for axis, fit in result.fits.items()},
@@ -149,7 +147,7 @@ class Identify:
     device: tyro.conf.Positional[str]
     """As 'run --device' takes it."""
     axes: tuple[str, ...] = ()
-    """Which axes (x y z rx ry rz); by default all that the device has."""
+    """Axes to move (x y z rx ry rz); by default all that the device has."""
     duration: float | None = None
     """Seconds per axis; by default 12, more below 333 Hz."""
     travel: float = TRAVEL[0]

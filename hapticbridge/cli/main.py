@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -143,10 +144,10 @@ def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
     import tyro  # noqa: PLC0415
 
     description = inspect.getdoc(command) or ""
-    if "--help-all" in words:
+    if {"-h", "--help", "--help-all"} & set(words):
+        is_whole = "--help-all" in words
+        command, hidden = _with_first_options(command, is_whole=is_whole)
         words = ["--help"]
-    elif {"-h", "--help"} & set(words):
-        command, hidden = _with_first_options(command)
         if hidden:
             description += f"\n\n{hidden} more options: hapticbridge {name} --help-all"
     return tyro.cli(
@@ -162,10 +163,12 @@ def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
     )
 
 
-def _with_first_options(command: type[Any]) -> tuple[type[Any], int]:
-    """Returns a class whose help shows the command's ``FIRST_OPTIONS`` only, and the others' count.
+def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any], int]:
+    """Returns a class for the command's help alone, and the number of options that it hides.
 
-    A command without ``FIRST_OPTIONS`` has few options and shows all of them.
+    It shows the command's ``FIRST_OPTIONS``, or all options if it is whole or the command has few
+    and names none. A default of None or inf is not printed: the option's
+    description has it.
     """
     from dataclasses import fields, make_dataclass  # noqa: PLC0415 - for a command's help alone
     from typing import Annotated, get_type_hints  # noqa: PLC0415
@@ -173,13 +176,16 @@ def _with_first_options(command: type[Any]) -> tuple[type[Any], int]:
     import tyro  # noqa: PLC0415
 
     hints = get_type_hints(command, include_extras=True)
-    first = getattr(command, "FIRST_OPTIONS", hints)
-    hidden = [
-        (field.name, Annotated[hints[field.name], tyro.conf.Suppress], field)
-        for field in fields(command)
-        if field.name not in first
-    ]
-    return make_dataclass(command.__name__, hidden, bases=(command,), frozen=True), len(hidden)
+    first = hints if is_whole else getattr(command, "FIRST_OPTIONS", hints)
+    changed: list[tuple[str, Any, Any]] = []
+    for field in fields(command):
+        if field.name not in first:
+            changed.append((field.name, Annotated[hints[field.name], tyro.conf.Suppress], field))
+        elif field.default in (None, -math.inf, math.inf):
+            quiet = tyro.conf.arg(help_behavior_hint="")
+            changed.append((field.name, Annotated[hints[field.name], quiet], field))
+    count = sum(field.name not in first for field in fields(command))
+    return make_dataclass(command.__name__, changed, bases=(command,), frozen=True), count
 
 
 def _print_version() -> int:

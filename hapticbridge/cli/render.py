@@ -31,19 +31,19 @@ class Render:
     output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
     """The picture (.png), or the film (.mp4, extra 'view')."""
     at: float | None = None
-    """Of a picture: seconds from the start; by default the last tick."""
+    """Time of a picture in s from the start of the run; by default its last tick."""
     start: float = 0.0
-    """Of a film: where in the run it begins, in seconds."""
+    """Start of a film in s of the run."""
     stop: float | None = None
-    """Of a film: where in the run it ends; by default with the run."""
+    """End of a film in s of the run; by default the run's end."""
     speed: float = 1.0
-    """Of a film: 0.1 shows a second of the run in ten."""
+    """Speed of a film: 0.1 shows a second of the run in ten."""
     camera: str | None = None
     """A camera of the scene, by name; by default the free one, as the scene's file sets it."""
     width: int = 800
-    """In pixels, even."""
+    """Width in pixels, even."""
     height: int = 600
-    """In pixels, even."""
+    """Height in pixels, even."""
     fps: int = 30
     """Frames per second of a film."""
     overwrite: bool = False

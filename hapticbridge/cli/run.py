@@ -208,7 +208,7 @@ class Run:
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
     method: str | None = None
-    """How the tool is rendered: 'lossless' (half of the coupling inside MuJoCo's implicit step,
+    """Rendering method: 'lossless' (half of the coupling inside MuJoCo's implicit step,
     half carried over: second order away from contact; the default), 'implicit' (all of it inside
     the step, which adds K T to the damping that is felt; the default with substeps, which
     'lossless' does not take), 'compensated' (the same, with that K T taken off the coupling's
@@ -238,7 +238,7 @@ class Run:
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
-    """Rotational coupling damping in N m s/rad, likewise."""
+    """Rotational coupling damping in N m s/rad that is to be felt."""
     scale: float = 1.0
     """Handle motion per device motion."""
     force_scale: float | None = None
@@ -294,7 +294,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
-        refuse_simulated_time(self.device, clock)  # before anybody is asked to home it
+        refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
@@ -381,5 +381,5 @@ class Run:
         gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         chosen = {name: value for name, value in gains.items() if value is not None}
         method, period = options.rendering_method, period_of(options.rate)
-        laws, scales = method.laws(options.substeps), options.workspace.scales
+        laws, scales = method.law_evaluations(options.substeps), options.workspace.scales
         return replace(default_coupling(info, period, *scales, laws, method), **chosen)

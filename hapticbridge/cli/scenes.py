@@ -50,7 +50,7 @@ class Scenes:
 def _show(scene: str) -> int:
     """Prints what one scene is and what can be set in it."""
     path = scene_path(scene)
-    # a scene of the user's own may call its grip as it likes: nobody holds it here
+    # without load_scene, because the grip may have any name here
     model, parameters = plain_model(read_scene(path)), scene_parameters(path)
     hand = scene_hand(model, path)
     sentence, moving = custom_text(model, "about"), int((model.body_dofnum > 0).sum())

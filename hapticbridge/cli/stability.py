@@ -36,7 +36,7 @@ class Stability:
     points: int | None = None
     """About how many runs or points; by default the map's own number, for about a minute."""
     form: Annotated[Literal["csv", "parquet"], tyro.conf.arg(name="format")] = "csv"
-    """Of the table; parquet needs the extra 'tables'."""
+    """Format of the table; parquet needs the extra 'tables'."""
     scheduler: str | None = None
     """Address of a dask.distributed scheduler to compute on (extra 'cluster')."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False

@@ -1,4 +1,4 @@
-"""How the command line speaks: one console for results, one for everything else."""
+"""Consoles of the command line: one for results, one for everything else."""
 
 from __future__ import annotations
 
@@ -75,13 +75,12 @@ def _show_warning(
 
 @contextmanager
 def progress(words: str) -> Iterator[Callable[..., None]]:
-    """Shows a bar on stderr while something runs; yields what tells it how far it is.
+    """Shows a bar on stderr; yields a function of the work done, the whole work and a name.
 
-    That takes what is done, what there is to do, and, where it changes, what is being done. Where
-    nobody looks there is no bar: rich would leave an empty line of it in a file.
+    Without a terminal there is no bar, because rich would leave an empty line of it in a file.
 
     Args:
-        words: What runs.
+        words: Description of the work.
     """
     from rich.progress import (  # noqa: PLC0415 - a run shows none
         BarColumn,

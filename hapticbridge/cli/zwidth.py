@@ -58,9 +58,9 @@ class Zwidth:
     """Try walls of rising stiffness on this device, as 'run --device' takes it, until its swing no
     longer dies down. Hold it as in use, or not at all; it is pushed with up to half its force."""
     axis: str | None = None
-    """Which axis --measure shakes: x, y or z; by default x."""
+    """Axis that --measure moves: x, y or z; by default x."""
     mass: float | None = None
-    """Mass of the device in kg; with it the line of a device that nobody holds is drawn too."""
+    """Mass of the device in kg; with it the limit without a hand is drawn too."""
     friction: float | None = None
     """Coulomb friction of the device in N."""
     resolution: float | None = None

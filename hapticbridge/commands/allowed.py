@@ -110,7 +110,7 @@ class AxisCouplingLimits:
         """
         linear, angular = assumed_damping(self.info)
         known = replace(self.info, damping=linear, rotational_damping=angular)
-        laws = self.method.laws(self.substeps)
+        laws = self.method.law_evaluations(self.substeps)
         is_linear = laws == 1 and not delay_ticks(known, self.period)
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
         ratios = self.period * np.array([0.0, *inner, _HIGHEST])

@@ -231,7 +231,7 @@ class Device(Protocol):
 
         class Rail:
             info = hb.DeviceInfo(
-                name="rail", axes=("x",), force_limit=10.0, mass=0.6, damping=2.0, is_real=False
+                name="rail", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
             )
 
             def start(self, period):

@@ -84,6 +84,7 @@ GUARD_DTYPE = np.dtype(
         ("ramp_length", "<i8"),
         ("ramp_progress", "<f8"),
         ("transmitted_share", "<f8"),
+        ("ramp_share", "<f8"),
         ("limited_wrench", "<f8", 6),
     ]
 )
@@ -91,8 +92,9 @@ GUARD_DTYPE = np.dtype(
 
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
-``time_since_sample`` in s; the ramp's start, length and progress in ticks; ``transmitted_share`` of
-the requested force; ``limited_wrench`` in N and N m, before ramp and fade."""
+``time_since_sample`` in s; the ramp's start, length and progress in ticks;
+``transmitted_share`` of the requested force, ``ramp_share`` of ramp and fade alone;
+``limited_wrench`` in N and N m, before ramp and fade."""
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that belong to the device; bits above them are commands."""
@@ -293,6 +295,7 @@ def limit_wrench(
     share = advance_ramp(s)
     if guard.fade_ticks_elapsed > 0:
         share *= max(0.0, 1.0 - guard.fade_ticks_elapsed / guard.fade_ticks)
+    guard.ramp_share = share
     if share != 1.0:
         force, torque = scaled(share, force), scaled(share, torque)
     guard.transmitted_share = min(norm(force) / requested, 1.0) if requested > 0.0 else share

@@ -174,7 +174,7 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
     Raises:
         HapticBridgeError: The message gives the reason.
     """
-    reasons = {
+    reasons: dict[int, str] = {
         Scheme.MASSLESS: "a tool without mass has no motion to divide",
         Scheme.MIDPOINT: "a lossless coupling carries half of a tick's wrench over to the next",
     }

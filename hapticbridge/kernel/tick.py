@@ -424,6 +424,7 @@ def _record(s: State, row: NDArray[np.void]) -> None:
     r.environment_energy, r.device_energy = energy.environment_energy, energy.device_energy
     r.injected_damping = s.observer.injected_damping
     r.injected_rotational_damping = s.observer.injected_rotational_damping
+    r.share = s.guard.ramp_share
 
 
 @compiled

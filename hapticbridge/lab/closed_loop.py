@@ -1,8 +1,8 @@
-"""Device, hand and scene in one compiled loop: what a bridge would do, as fast as it goes.
+"""Device, hand and scene in one compiled loop, without waiting for a clock.
 
 The loop inlines the functions of the live tick around MuJoCo's C symbol and the simulated device's
-exact step, and lets the interpreter lock go, so that threads run side by side. Record for record it
-is what ``Bridge.run`` writes for the same device.
+exact step. It releases the interpreter lock, so that threads run in parallel. Its records equal
+those of ``Bridge.run`` with the same device.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from hapticbridge.summary import Ledger
 from hapticbridge.theory.sampled_loop import decays
 
 PARTS = 16
-"""Parts of a period in which jitter is counted. The device is exact between any two of them; more
-parts resolve jitter finer and cost a device step each."""
+"""Number of parts of a period in which jitter is counted. The device is exact between any two of
+them. More parts resolve jitter finer and cost a device step each."""
 
 _TIMING_ARGUMENTS = Arguments(StudyError)
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """When ticks happen, as a share of the period and without unit.
+    """Timing errors of ticks, as shares of the period.
 
     Attributes:
-        jitter: Every tick is late by a random share in [0, jitter] of the period, 0 <= jitter < 1,
-            in whole sixteenths, of which every one up to jitter is equally likely; below 1/16 no
+        jitter: Largest lateness as a share of the period, 0 <= jitter < 1. Each tick is late by a
+            random number of whole sixteenths, all equally likely up to ``jitter``. Below 1/16 no
             tick is late.
-        drops: Share of ticks that are missed, 0 <= drops < 1: the wrench is held on.
-        seed: Of the random numbers.
+        drops: Share of ticks that are missed, 0 <= drops < 1. The last wrench is then held.
+        seed: Seed of the random numbers.
 
     Raises:
         StudyError: A value is no number or out of range.
@@ -68,7 +68,7 @@ class Timing:
 
     @property
     def is_even(self) -> bool:
-        """Whether every tick comes on time."""
+        """True if every tick comes on time."""
         return self.jitter < 1 / PARTS and self.drops == 0
 
     def intervals(self, ticks: int) -> NDArray[np.int64]:
@@ -80,45 +80,47 @@ class Timing:
 
 
 LEVER = 0.05
-"""Length in m that turns a torque into a force, so that one signal shows both diverge: half the
-width of a hand. It weighs the two against each other and decides nothing."""
+"""Length in m that converts a torque into a force, so that one signal shows both diverge. It is
+half the width of a hand. It weighs the two against each other and decides nothing."""
 
 HUGE = 1e5
-"""Signal in N at which a run has diverged beyond doubt and ends, before MuJoCo's own limit on
-accelerations (1e10 in SI units) warns and resets."""
+"""Signal in N at which a run counts as diverged and ends. It is reached before MuJoCo's own limit
+on accelerations (1e10 in SI units) warns and resets."""
 
 FLOOR = 1e-6
-"""Signal in N that counts as none: MuJoCo's solver leaves 3e-8 N on a free mass at its default
+"""Signal in N that counts as zero. MuJoCo's solver leaves 3e-8 N on a free mass at its default
 tolerance, whatever the motion."""
 
 LEAST_TICKS = 50
-"""Ticks of a run: a fifth of it is the window in which a decay is looked for, and ten samples are
-the fewest that show one."""
+"""Smallest number of ticks of a run. A fifth of it is the window in which a decay is looked for,
+and ten samples are the fewest that show one."""
 
 MOST_TICKS = 10**9
-"""Ticks of a run at most: beyond, its signal alone would not fit into memory."""
+"""Largest number of ticks of a run. Beyond it the signal alone would not fit into memory."""
 
 _ARGUMENTS = Arguments(StudyError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopOutcome:
-    """What a run in the closed loop came to.
+    """Outcome of a run in the closed loop.
 
     Attributes:
-        ticks: How many were done; fewer than asked where it diverged.
-        is_stable: Whether what a knock left falls from the fourth to the last fifth of the run. A
-            tool that was thrown out of contact decays too: ``fault`` tells of the energy it got.
+        ticks: Number of completed ticks; fewer than requested if the run diverged.
+        is_stable: True if the response to a knock falls from the fourth to the last fifth of the
+            run. A tool that was thrown out of contact decays too; ``fault`` names the energy it
+            received.
         environment: ``strict``, ``within slack`` or ``active``.
-        created: The largest Σ E_k so far at any tick, in J: > 0 where (14) is violated.
+        created: Largest Σ E_k so far at any tick, in J; > 0 where (14) is violated.
         slack_share: Largest share of the slack that was used, without unit.
         first_active: Tick of the first violation of the slack, −1 for none.
-        fault: Tick and port of the first fault, ``environment`` or ``device``; None if passive. The
-            device is metered only where no coupling law gives the wrench; else see ``is_stable``.
+        fault: Tick and port of the first fault, ``environment`` or ``device``; None if passive.
+            The device is metered only where no coupling law gives the wrench; else see
+            ``is_stable``.
         peak_force: Largest force on the tool in N.
         last_force: Largest signal in the last fifth, force and torque over ``LEVER``, in N.
-        device_energy: Given to the device in J.
-        records: ``TICK_DTYPE``, if they were asked for; else empty.
+        device_energy: Energy given to the device in J.
+        records: ``TICK_DTYPE`` if they were requested; else empty.
     """
 
     ticks: int
@@ -135,7 +137,7 @@ class LoopOutcome:
 
 
 class ClosedLoop:
-    """A scene of its own to run in; one per thread.
+    """A scene for runs of the closed loop; use one per thread.
 
     Args:
         scene: A loaded scene; copied, so that runs do not disturb it or each other.
@@ -161,16 +163,16 @@ class ClosedLoop:
         """Runs the loop from rest.
 
         Args:
-            device: Device and hand; started anew.
+            device: Device and hand; restarted.
             coupling: K and B.
-            method: How the tool is rendered.
+            method: Rendering method.
             period: T in s.
-            ticks: How many, >= 50.
+            ticks: Number of ticks, >= 50.
             substeps: MuJoCo steps per tick.
             knock: Displacement of the device before the first tick, shape (6,), in m and rad; no
                 number is beyond 1e30.
             timing: Late and missed ticks; None: every one on time.
-            keep_records: Whether to return the records.
+            keep_records: True returns the records.
 
         Raises:
             HapticBridgeError: A value is out of range, or the method cannot render the scene.
@@ -264,7 +266,7 @@ def _run(
 
 @cache
 def _machine_code() -> Callable[..., int]:
-    """Returns the compiled loop; found once, because looking up the types takes a millisecond."""
+    """Returns the compiled loop. It is cached, because looking up the types takes a millisecond."""
     none = np.zeros(0)
     return direct(
         _run,

@@ -13,7 +13,7 @@ def prepared_folder(folder: Path, names: Collection[str] = ()) -> Path:
     """Makes a folder, if there is none, and proves that it and its files can be written.
 
     Args:
-        folder: To write into.
+        folder: Folder to write into.
         names: Files in it that will be written; existing ones stay unchanged. Without names, any
             new file must be possible.
 

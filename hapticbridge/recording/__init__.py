@@ -6,40 +6,16 @@ events through a pipe. ``recorder`` is the loop's end of both, ``recorder_proces
 one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut.
 """
 
-from typing import TYPE_CHECKING
-
-from hapticbridge.lazy import lazy_exports
-
-if TYPE_CHECKING:
-    from hapticbridge.recording.format import Attachment as Attachment
-    from hapticbridge.recording.format import Timeline as Timeline
-    from hapticbridge.recording.format import due_times as due_times
-    from hapticbridge.recording.reader import Recording as Recording
-    from hapticbridge.recording.reader import RecordingFile as RecordingFile
-    from hapticbridge.recording.reader import open_recording as open_recording
-    from hapticbridge.recording.reader import read_recording as read_recording
-    from hapticbridge.recording.recorder import Recorder as Recorder
-    from hapticbridge.recording.repair import repair as repair
-    from hapticbridge.recording.ring import HEAD as HEAD
-    from hapticbridge.recording.ring import TAIL as TAIL
-    from hapticbridge.recording.ring import Ring as Ring
-    from hapticbridge.recording.writer import RecordingWriter as RecordingWriter
-else:
-    __getattr__, __dir__, __all__ = lazy_exports(
-        __name__,
-        {
-            "Attachment": "hapticbridge.recording.format",
-            "Timeline": "hapticbridge.recording.format",
-            "due_times": "hapticbridge.recording.format",
-            "Recording": "hapticbridge.recording.reader",
-            "RecordingFile": "hapticbridge.recording.reader",
-            "open_recording": "hapticbridge.recording.reader",
-            "read_recording": "hapticbridge.recording.reader",
-            "Recorder": "hapticbridge.recording.recorder",
-            "repair": "hapticbridge.recording.repair",
-            "HEAD": "hapticbridge.recording.ring",
-            "TAIL": "hapticbridge.recording.ring",
-            "Ring": "hapticbridge.recording.ring",
-            "RecordingWriter": "hapticbridge.recording.writer",
-        },
-    )
+from hapticbridge.recording.format import Attachment as Attachment
+from hapticbridge.recording.format import Timeline as Timeline
+from hapticbridge.recording.format import due_times as due_times
+from hapticbridge.recording.reader import Recording as Recording
+from hapticbridge.recording.reader import RecordingFile as RecordingFile
+from hapticbridge.recording.reader import open_recording as open_recording
+from hapticbridge.recording.reader import read_recording as read_recording
+from hapticbridge.recording.recorder import Recorder as Recorder
+from hapticbridge.recording.repair import repair as repair
+from hapticbridge.recording.ring import HEAD as HEAD
+from hapticbridge.recording.ring import TAIL as TAIL
+from hapticbridge.recording.ring import Ring as Ring
+from hapticbridge.recording.writer import RecordingWriter as RecordingWriter

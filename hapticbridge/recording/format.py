@@ -5,7 +5,8 @@ A recording is an MCAP file (https://mcap.dev/spec), zstd, chunks of 128 kB:
 - The metadata record ``hapticbridge`` and the attachments come before any chunk, so that a cut file
 still has them.
 - Topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
-and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding.
+and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding. Files of
+earlier versions may lack ``LATER_FIELDS``.
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
 ``time_ns`` (since the start of the run).
 - The metadata record ``hapticbridge.digest`` comes last, with ``sha256`` (see ``Digest``).
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.record import LATER_FIELDS, TICK_DTYPE
 
 # Due times of a run's ticks.
 
@@ -57,11 +58,12 @@ class Timeline:
 
     def __init__(self, blocks: Iterable[NDArray[np.void]], period: float) -> None:
         rows, times = list[int](), list[float]()
-        before, count = np.zeros(0, TICK_DTYPE), 0
+        before: list[NDArray[np.void]] = []
+        count = 0
         for block in blocks:
             if not len(block):
                 continue
-            part = np.concatenate([before, block])
+            part = np.concatenate([*before, block])
             due, first = due_times(part, period), count - len(before)
             # keep both sides of every step that is not one period, and the ends
             gaps = np.flatnonzero(np.abs(np.diff(due) - period) > 0.5 * period)
@@ -69,7 +71,7 @@ class Timeline:
             rows += [first + row for row in kept]
             times += due[kept].tolist()
             count += len(block)
-            before = part[-1:]
+            before = [part[-1:]]
         self._rows, self._times = np.array(rows, np.float64), np.array(times)
         self.duration = times[-1] if times else 0.0
 
@@ -103,9 +105,6 @@ largest loss if the recorder is killed."""
 CDR_HEADER = b"\x00\x01\x00\x00"
 """Header of little-endian CDR without options; the record after it starts at alignment 0."""
 
-PAYLOAD_DTYPE = np.dtype([("cdr", "V4"), ("record", TICK_DTYPE)])
-"""Payload of a message on ``/tick``."""
-
 _ROS_TYPES = {"<i8": "int64", "<f8": "float64"}
 
 
@@ -124,14 +123,28 @@ class Attachment:
     data: bytes
 
 
-def tick_schema() -> bytes:
-    """Returns the ROS 2 message definition of ``TICK_DTYPE``, one field per line."""
+def payload_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
+    """Returns the payload of a message on ``/tick`` that holds one record."""
+    return np.dtype([("cdr", "V4"), ("record", record)])
+
+
+def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
+    """Returns the ROS 2 message definition of a record, one field per line."""
     lines = []
-    for name in TICK_DTYPE.names or ():
-        field = TICK_DTYPE[name]
+    for name in record.names or ():
+        field = record[name]
         suffix = f"[{field.shape[0]}]" if field.shape else ""
         lines.append(f"{_ROS_TYPES[field.base.str]}{suffix} {name}\n")
     return "".join(lines).encode()
+
+
+def record_dtype(schema: bytes) -> np.dtype[np.void] | None:
+    """Returns the record that a schema of this or an earlier version describes, or None."""
+    lines = schema.decode(errors="replace").splitlines()
+    lacking = [name for name in LATER_FIELDS if f"float64 {name}" not in lines]
+    names = [name for name in TICK_DTYPE.names or () if name not in lacking]
+    record = np.dtype([(name, TICK_DTYPE[name]) for name in names])
+    return record if tick_schema(record) == schema else None
 
 
 def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:

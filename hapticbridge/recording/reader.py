@@ -20,7 +20,7 @@ from hapticbridge.recording.format import Attachment
 
 # Metadata, attachments, events and ticks of a container.
 
-_MESSAGE_DTYPE = np.dtype(
+_HEAD_DTYPE = np.dtype(
     [
         ("opcode", "u1"),
         ("length", "<u8"),
@@ -28,12 +28,10 @@ _MESSAGE_DTYPE = np.dtype(
         ("sequence", "<u4"),
         ("log_time", "<u8"),
         ("publish_time", "<u8"),
-        ("payload", layout.PAYLOAD_DTYPE),
     ]
 )
 _RECORD_HEAD = 9
-_MESSAGE_HEAD = _MESSAGE_DTYPE.fields["payload"][1]  # type: ignore[index]
-_TICK_LENGTH = _MESSAGE_DTYPE.itemsize - _RECORD_HEAD
+_MESSAGE_HEAD = _HEAD_DTYPE.itemsize
 _CDR = int.from_bytes(layout.CDR_HEADER, "little")
 
 
@@ -43,16 +41,18 @@ class Contents:
 
     Attributes:
         problems: Damage, one sentence each; appended to.
-        take: Called with each run of records, ``TICK_DTYPE``, in order.
+        take: Called with each run of records, in order.
+        record: Fields of a record; fewer than ``TICK_DTYPE`` in a file of an earlier version.
         events: Payload and JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
         digest: Digest stored in the file.
-        refusal: Reason why the records are not of this version; None if they are.
+        refusal: Reason why the records cannot be read; None if they can.
     """
 
     problems: list[str]
     take: Callable[[NDArray[np.void]], None]
+    record: np.dtype[np.void] = TICK_DTYPE
     events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
@@ -63,7 +63,7 @@ class Contents:
 
     @property
     def has_ticks(self) -> bool:
-        """True if there is a channel of records of this version."""
+        """True if there is a channel of records that can be read."""
         return layout.TICK_TOPIC in self._topics.values()
 
     def add_metadata(self, fields: Fields) -> None:
@@ -138,23 +138,29 @@ class Contents:
                 self.refusal = (
                     f"its topic {topic} has the schema '{name}', not '{layout.TICK_SCHEMA_NAME}'"
                 )
-            elif text != layout.tick_schema() or encoding != layout.TICK_ENCODING:
+                return
+            record = layout.record_dtype(text)
+            is_other = self.has_ticks and record != self.record
+            if record is None or is_other or encoding != layout.TICK_ENCODING:
                 self.refusal = (
-                    f"its schema {name} has other fields than this version of hapticbridge writes"
+                    f"its schema {name} has other fields than this version of hapticbridge reads"
                 )
-            else:
-                self._topics[channel] = topic
+                return
+            self.record, self._topics[channel] = record, topic
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
         """Adds the run of records that starts here; returns its end."""
-        size, count = _MESSAGE_DTYPE.itemsize, 16
+        message = np.dtype(
+            [*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(self.record))]  # packed
+        )
+        size, count = message.itemsize, 16
         start = position
         while True:
             count = min(count, (len(data) - position) // size)
-            rows = np.frombuffer(data, _MESSAGE_DTYPE, count, position)
+            rows = np.frombuffer(data, message, count, position)
             matches = (
                 (rows["opcode"] == Opcode.MESSAGE)
-                & (rows["length"] == _TICK_LENGTH)
+                & (rows["length"] == size - _RECORD_HEAD)
                 & (rows["channel"] == channel)
                 & (rows["payload"]["cdr"].view("<u4") == _CDR)
             )
@@ -189,6 +195,7 @@ class RecordingFile:
 
     Attributes:
         path: The file.
+        record: Fields of a record; fewer than ``TICK_DTYPE`` in a file of an earlier version.
         count: Number of records.
         last_tick: Number of the last record's tick; -1 without records.
         flags: Union of all records' flags.
@@ -204,6 +211,7 @@ class RecordingFile:
     """
 
     path: Path
+    record: np.dtype[np.void] = TICK_DTYPE
     count: int
     last_tick: int
     flags: int
@@ -216,7 +224,7 @@ class RecordingFile:
     problems: tuple[str, ...]
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
-        """Yields the records in order, ``TICK_DTYPE``, in blocks of equal size (the last: shorter).
+        """Yields the records in order, in blocks of equal size (the last: shorter).
 
         The caller may keep a block. ``size`` is the number of records per block, ``BLOCK`` by
         default.
@@ -229,12 +237,12 @@ class RecordingFile:
         found = 0
         for _ in _read_parts(self.path, runs.append):
             while sum(run.size for run in runs) >= size:
-                block, runs[:] = _split(runs, size)
+                block, runs[:] = _split(runs, size, self.record)
                 found += size
                 yield block
         if runs:
             found += sum(run.size for run in runs)
-            yield _join(runs)
+            yield _join(runs, self.record)
         if found != self.count:
             raise RecordingError(f"the recording {self.path} was changed while it was read")
 
@@ -244,7 +252,7 @@ class Recording(RecordingFile):
     """A recording with all ticks in memory.
 
     Attributes:
-        ticks: Records in order, shape (n,), ``TICK_DTYPE``.
+        ticks: Records in order, shape (n,).
     """
 
     ticks: NDArray[np.void]
@@ -259,7 +267,7 @@ def read_recording(path: str | Path) -> Recording:
 
     Raises:
         RecordingError: The file does not exist, cannot be read, or is not a recording of this
-            version.
+            or an earlier version.
     """
     return read_with_attachments(Path(path))[0]
 
@@ -281,7 +289,7 @@ def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
     facts, attachments = _read_through(path, runs, keeps=True)
-    return Recording(**facts, ticks=_join(runs)), attachments
+    return Recording(**facts, ticks=_join(runs, facts["record"])), attachments
 
 
 def _read_through(
@@ -317,6 +325,7 @@ def _read_through(
         digest.add_event(payload)
     facts = {
         "path": path,
+        "record": contents.record,
         "count": count,
         "last_tick": last,
         "flags": flags,
@@ -360,9 +369,9 @@ def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
         contents.problems.append(f"{kind} is damaged: {error}")
 
 
-def _join(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
+def _join(runs: list[NDArray[np.void]], record: np.dtype[np.void] = TICK_DTYPE) -> NDArray[np.void]:
     """Joins runs into one array and empties the list, so that memory never holds both."""
-    gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
+    gathered = np.empty(sum(run.size for run in runs), record)
     stop = gathered.size
     while runs:
         run = runs.pop()
@@ -372,7 +381,7 @@ def _join(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def _split(
-    runs: list[NDArray[np.void]], size: int
+    runs: list[NDArray[np.void]], size: int, record: np.dtype[np.void]
 ) -> tuple[NDArray[np.void], list[NDArray[np.void]]]:
     """Returns the first ``size`` records of runs as one array, and the remaining runs."""
     left, head = size, []
@@ -381,5 +390,5 @@ def _split(
         left -= head[-1].size
         if not left:
             rest = [run[head[-1].size :], *runs[index + 1 :]]
-            return _join(head), [each for each in rest if each.size]
+            return _join(head, record), [each for each in rest if each.size]
     raise AssertionError("fewer records than asked for")

@@ -27,7 +27,9 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.ring import TAIL, Ring
+from hapticbridge.recording.writer import RecordingWriter, check_contents
 
 # Second reader of a run.
 
@@ -71,9 +73,6 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     Returns:
         The outcome, as a clause.
     """
-    from hapticbridge.recording.reader import read_with_attachments  # noqa: PLC0415 - imports mcap
-    from hapticbridge.recording.writer import RecordingWriter  # noqa: PLC0415
-
     beside = path.with_name(path.name + ".salvaged")
     try:
         recording, attachments = read_with_attachments(path)
@@ -152,8 +151,6 @@ class Recorder:
     ) -> None:
         if ring.name is None:
             raise RecordingError("the recorder needs a shared ring, not a local one")
-        from hapticbridge.recording.writer import check_contents  # noqa: PLC0415 - imports mcap
-
         check_contents(metadata, attachments)
         configuration = {
             "ring": ring.name,

@@ -38,6 +38,7 @@ def repair(path: str | Path, output: str | Path) -> Recording:
         attachments,
         int(epoch) if epoch.isascii() and epoch.isdigit() and len(epoch) < 20 else 0,
         exclusive=True,
+        record=recording.record,
     )
     try:
         _rewrite(writer, recording)

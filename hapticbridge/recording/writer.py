@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 
@@ -202,6 +203,7 @@ class RecordingWriter:
         attachments: Files to carry, with different names.
         epoch_ns: Unix time of the run's start in ns.
         exclusive: True refuses an existing file.
+        record: Fields of a record; those of an earlier version for a repair of its file.
 
     Raises:
         RecordingError: The file cannot be written, or metadata or attachments are not valid.
@@ -215,8 +217,10 @@ class RecordingWriter:
         epoch_ns: int,
         *,
         exclusive: bool = False,
+        record: np.dtype[np.void] = TICK_DTYPE,
     ) -> None:
         self.path = Path(path)
+        self._record = record
         self._epoch = int(epoch_ns)
         meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
         check_contents(meta, attachments)
@@ -253,7 +257,7 @@ class RecordingWriter:
                 self._epoch, self._epoch, item.name, item.media_type, item.data
             )
         tick_schema = self._mcap.register_schema(
-            layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema()
+            layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema(self._record)
         )
         event_schema = self._mcap.register_schema(
             layout.EVENT_SCHEMA_NAME, layout.EVENT_SCHEMA_ENCODING, layout.EVENT_SCHEMA
@@ -271,15 +275,15 @@ class RecordingWriter:
         return self._output.is_full
 
     def write_ticks(self, rows: NDArray[np.void]) -> None:
-        """Appends records, shape (n,), ``TICK_DTYPE``.
+        """Appends records, shape (n,), with the fields that the writer was given.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
         """
-        payloads = np.empty(rows.size, layout.PAYLOAD_DTYPE)
+        payloads = np.empty(rows.size, layout.payload_dtype(self._record))
         payloads["cdr"] = np.void(layout.CDR_HEADER)
         payloads["record"] = rows
-        packed, size = payloads.tobytes(), layout.PAYLOAD_DTYPE.itemsize
+        packed, size = payloads.tobytes(), payloads.itemsize
         # an impossible deadline (before 1970, after 2554) must not stop the recorder
         times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
         self._digest.add_ticks(rows)

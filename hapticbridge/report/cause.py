@@ -280,8 +280,8 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     )
     if info.friction is not None and info.friction >= rub:
         return ""
-    span = slice(window.start, max(window.stop, int(np.argmax(evidence.kicked)) + 1))
-    gained = np.diff(evidence.kicked, prepend=0.0)[span].clip(min=0.0)
+    span = slice(window.start, max(window.stop, int(np.argmax(evidence.unpaid)) + 1))
+    gained = np.diff(evidence.unpaid, prepend=0.0)[span].clip(min=0.0)
     steps = _largest_steps(evidence.ticks["device_position"], span) / info.resolution
     total = float(gained.sum())
     share = float(gained[steps <= COUNTED].sum()) / total if total > 0 else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
-from hapticbridge.audit.energy import EnergyBalance, Reached
-from hapticbridge.audit.events import RunEvents
-from hapticbridge.certificate import delay_ticks
+from hapticbridge.audit.energy import energy_balances
+from hapticbridge.audit.events import RecordedRun
+from hapticbridge.audit.state import AuditState
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -23,7 +22,7 @@ from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.recording import Recording, due_times
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, method_named
-from hapticbridge.run_description import MODEL_ATTACHMENT, STARTS, meta_start, parameters_of
+from hapticbridge.run_description import MODEL_ATTACHMENT, parameters_of
 from hapticbridge.summary import coupling_sentences, was_always_held
 
 if TYPE_CHECKING:
@@ -171,8 +170,8 @@ class Evidence:
         time: Due time of each tick in s on the clock of the events, (n,).
         created: Energy that the environment has created so far, (n,) in J.
         allowed: Slack: energy that the environment may have created so far, (n,) in J.
-        kicked: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
-            (``EnergyBalance.kicked``).
+        unpaid: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
+            (``EnergyBalance.unpaid_energy``).
         model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
     """
 
@@ -184,7 +183,7 @@ class Evidence:
     time: Array
     created: Array
     allowed: Array
-    kicked: Array
+    unpaid: Array
     model: mujoco.MjModel | None
 
     @property
@@ -223,7 +222,7 @@ class Evidence:
         The verdict must be ``active``.
         """
         if report.port == "device":
-            return self.kicked, np.zeros_like(self.kicked)
+            return self.unpaid, np.zeros_like(self.unpaid)
         # a strict audit grants no slack
         is_slack_used_up = report.environment == "active"
         return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
@@ -239,53 +238,30 @@ class Evidence:
         if not len(ticks) or not all((np.abs(ticks[name]) < DRAWABLE).all() for name in fields):
             return None
         try:
-            parameters = parameters_of(recording.meta)
-            info = DeviceInfo.from_json(recording.meta.get("device", ""))
-            method = method_named(recording.meta.get("method", ""))
-            linear, rotational = info.burning_damping
-            parameters = replace(
-                parameters, device_damping=linear, device_rotational_damping=rotational
-            )
-            home = np.array(meta_start(recording.meta, "tool_start"))
-            outside = RunEvents.of(recording.events, parameters, home)
-            worst = outside.worst(info, method)
+            run = RecordedRun.of(recording)
+            worst = run.worst
+            state = AuditState.at_start(recording, run.parameters)
+            # by blocks, because the whole run at once would need much more memory
+            blocks = (ticks[begin : begin + BLOCK] for begin in range(0, len(ticks), BLOCK))
+            balances = energy_balances(blocks, state, run.events, run.delay)
             energies = np.concatenate(
-                [
-                    (each.environment_energy, each.slack, each.kicked)
-                    for each in _balances(recording, parameters, info, outside)
-                ],
+                [(each.environment_energy, each.slack, each.unpaid_energy) for _, each in balances],
                 axis=1,
             )
         except HapticBridgeError:
             return None
         return cls(
             recording=recording,
-            parameters=parameters,
+            parameters=run.parameters,
             worst=worst,
-            info=info,
-            method=method,
-            time=due_times(ticks, parameters.period),
+            info=run.info,
+            method=run.method,
+            time=due_times(ticks, run.parameters.period),
             created=energies[0],
             allowed=energies[1],
-            kicked=energies[2],
+            unpaid=energies[2],
             model=_model(recording),
         )
-
-
-def _balances(
-    recording: Recording, parameters: RunParameters, info: DeviceInfo, outside: RunEvents
-) -> Iterator[EnergyBalance]:
-    """Yields the energy balance by blocks; the whole run at once would need much more memory."""
-    starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
-    ticks, late = recording.ticks, delay_ticks(info, parameters.period) or 0
-    energy = float(starts["start_kinetic"][0] + starts["start_potential"][0])
-    reached = Reached.at_start(parameters, starts["handle_start"], starts["tool_start"], energy)
-    for begin in range(0, len(ticks), BLOCK):
-        end = begin + BLOCK
-        following = ticks[end : end + late]
-        balance = EnergyBalance.of(ticks[begin:end], parameters, reached, outside, late, following)
-        reached = balance.reached
-        yield balance
 
 
 def _model(recording: Recording) -> mujoco.MjModel | None:

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
-from hapticbridge.audit.guard import Flags, has_flag, run_lengths
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.plotting import new_figure
-from hapticbridge.record import TickFlag
+from hapticbridge.record import TickFlag, has_flag
 from hapticbridge.report.evidence import AXES, COLOURS, Evidence, decimated, finish
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ _PORTS = (
 def draw_energies(evidence: Evidence) -> Figure:
     """Draws the energy of each port, and the bounds of environment and device."""
     ticks, time = evidence.ticks, evidence.time
-    is_watched = bool(evidence.kicked.any())
+    is_watched = bool(evidence.unpaid.any())
     figure = new_figure(8, 6.6 if is_watched else 4.8)
     panels = figure.subplots(3 if is_watched else 2, 1, sharex=True)
     ports, bound = panels[:2]
@@ -90,7 +89,7 @@ def draw_energies(evidence: Evidence) -> Figure:
     bounded(bound, time, evidence.created, evidence.allowed, "created by the environment")
     if is_watched:
         free = np.zeros_like(time)
-        bounded(panels[2], time, evidence.kicked, free, "given to the device, beyond what is paid")
+        bounded(panels[2], time, evidence.unpaid, free, "given to the device, beyond what is paid")
     for axes in panels:
         finish(axes)
     panels[-1].set_xlabel("time (s)")
@@ -182,14 +181,16 @@ FLAGS = (
 """Flags shown over time, and their labels."""
 
 
-def activities(evidence: Evidence) -> list[tuple[str, Flags]]:
+def activities(evidence: Evidence) -> list[tuple[str, NDArray[np.bool_]]]:
     """Returns labels, and the ticks in which each was on, (n,)."""
     ticks, guarding = evidence.ticks, evidence.parameters.guarding
     found = [(name, has_flag(ticks, flag)) for flag, name in FLAGS]
     is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
     fades = np.zeros_like(is_stale)
     if guarding.stale_ticks:
-        fades = run_lengths(is_stale, 0) > guarding.stale_ticks
+        row = np.arange(len(ticks))
+        newest = np.maximum.accumulate(np.where(is_stale, -1, row))
+        fades = row - newest > guarding.stale_ticks
     trips = [event.get("tick") for event in evidence.events if event.get("event") == "trip"]
     # the tick that trips is often not recorded; the last recorded one stands for it
     is_tripped = np.zeros_like(is_stale)

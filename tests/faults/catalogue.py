@@ -88,24 +88,38 @@ def corrupting(change: Callable[[int, NDArray[np.void]], int | None]) -> Callabl
     return do
 
 
-def _nan(_since: int, sample: NDArray[np.void]) -> None:
-    sample["position"][0, 0] = np.nan
+def added(name: str, *change: float) -> Callable[[Rig], None]:
+    """Returns a fault that adds something to one field of the samples from the cause on."""
 
+    def change_it(_since: int, sample: NDArray[np.void]) -> None:
+        sample[name] += change
 
-def _infinite(_since: int, sample: NDArray[np.void]) -> None:
-    sample["quaternion"][0, 1] = np.inf
-
-
-def _jump(_since: int, sample: NDArray[np.void]) -> None:
-    sample["position"][0, 0] += 0.06
-
-
-def _half_turn(_since: int, sample: NDArray[np.void]) -> None:
-    sample["quaternion"][0] = (0.0, 0.0, 1.0, 0.0)
+    return corrupting(change_it)
 
 
 def _other_sign(_since: int, sample: NDArray[np.void]) -> None:
-    sample["quaternion"][0] *= -1.0
+    sample["quaternion"] *= -1.0
+
+
+def at_the_cause(act: Callable[[Rig], None]) -> Callable[[Rig], None]:
+    """Returns a fault that does something when the sample of the cause is read."""
+
+    def do(rig: Rig) -> None:
+        corrupting(lambda since, _sample: act(rig) if since == 0 else None)(rig)
+
+    return do
+
+
+def _read_fails(_rig: Rig) -> None:
+    raise DeviceError("the device reports a fault of its own (code 8)")
+
+
+def keep_up(bridge: Bridge) -> None:
+    """Lets the recorder write what there is, as it does in real time; until it is dead."""
+    recorder, cursors = bridge.session.stream.recorder, bridge.session.stream.cursors
+    assert recorder is not None
+    while cursors[TAIL] < cursors[HEAD] and recorder.is_alive():
+        time.sleep(1e-3)
 
 
 def _frozen(rig: Rig) -> None:
@@ -153,24 +167,6 @@ def _write_blocks(rig: Rig) -> None:
     rig.device.refuse = refuse
 
 
-def _backwards(rig: Rig) -> None:
-    def corrupt(tick: int, _sample: NDArray[np.void]) -> int:
-        if tick == CAUSE:
-            rig.clock.set_back(0.5)
-        return 0
-
-    rig.device.corrupt = corrupt
-
-
-def _read_fails(rig: Rig) -> None:
-    def corrupt(tick: int, _sample: NDArray[np.void]) -> int:
-        if tick == CAUSE:
-            raise DeviceError("the device reports a fault of its own (code 8)")
-        return 0
-
-    rig.device.corrupt = corrupt
-
-
 def _write_fails(rig: Rig) -> None:
     def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
         if tick >= CAUSE:
@@ -199,16 +195,9 @@ def acting(act: Callable[[Bridge], None], at: int = CAUSE) -> Callable[[Rig], No
     return do
 
 
-def _bad_velocity(bridge: Bridge) -> None:
-    bridge.scene.data.qvel[:] = 2e10
-
-
-def _bad_acceleration(bridge: Bridge) -> None:
-    bridge.scene.data.qfrc_applied[:] = 1e11
-
-
-def _diverge(bridge: Bridge) -> None:
-    bridge.scene.data.qvel[:] = np.nan
+def filled(field: str, value: float) -> Callable[[Rig], None]:
+    """Returns a fault that overwrites an array of the scene's state."""
+    return acting(lambda bridge: getattr(bridge.scene.data, field).fill(value))
 
 
 def _raise(_bridge: Bridge) -> None:
@@ -289,19 +278,13 @@ def _fill_disk(rig: Rig) -> None:
     """From the cause on the recorder's file may not grow, as on a disk that is full."""
 
     def fill(bridge: Bridge, tick: int) -> None:
-        recorder, path, cursors = (
-            bridge.session.stream.recorder,
-            bridge.output.path,
-            bridge.session.stream.cursors,
-        )
+        recorder, path = bridge.session.stream.recorder, bridge.output.path
         assert recorder is not None and path is not None
         if tick == CAUSE:
             size = path.stat().st_size + 1000
             resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (size, size))
-        while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
-            if not recorder.is_alive():
-                break
-            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+        if tick > CAUSE and tick % 50 == 0:
+            keep_up(bridge)
 
     rig.on_tick = fill
 
@@ -320,9 +303,8 @@ def _full_tmpfs(rig: Rig) -> None:
             with (disk / "rubbish").open("wb", buffering=0) as file, suppress(OSError):
                 while True:
                     file.write(bytes(4096))
-        cursors = bridge.session.stream.cursors
-        while tick > CAUSE and tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
-            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+        if tick > CAUSE and tick % 50 == 0:
+            keep_up(bridge)
 
     rig.around, rig.on_tick = around, fill
     rig.recording = disk / "run.mcap"
@@ -335,15 +317,15 @@ def _full_ring(rig: Rig) -> None:
         stack.enter_context(patch("hapticbridge.recording.recorder.RING_SECONDS", 0.2))
 
     def act(bridge: Bridge, tick: int) -> None:
-        recorder, cursors = bridge.session.stream.recorder, bridge.session.stream.cursors
+        recorder = bridge.session.stream.recorder
         assert recorder is not None
         if CAUSE <= tick < CAUSE + 1000:
             if tick == CAUSE:
                 os.kill(recorder.pid, signal.SIGSTOP)
             return
         os.kill(recorder.pid, signal.SIGCONT)
-        while tick % 50 == 0 and cursors[TAIL] < cursors[HEAD]:
-            time.sleep(1e-3)  # the recorder keeps up, as it does in real time
+        if tick % 50 == 0:
+            keep_up(bridge)
 
     rig.around, rig.on_tick, rig.duration = around, act, 3.0
     rig.clock.is_lossless = False
@@ -436,25 +418,32 @@ PUSHED = 566
 """The tick whose sample shows that the motor gave the hand more than the energy limit."""
 
 FAULTS = (
-    Fault("pose that is no number", corrupting(_nan), "trip", "pose is not finite"),
-    Fault("infinite quaternion", corrupting(_infinite), "trip", "pose is not finite"),
-    Fault("60 mm jump", corrupting(_jump), "trip", "jumped", UNGUARDED),
-    Fault("half a turn in a tick", corrupting(_half_turn), "trip", "jumped", NO_TRIPS),
+    Fault("pose that is no number", added("position", np.nan, 0, 0), "trip", "pose is not finite"),
+    Fault(
+        "infinite quaternion", added("quaternion", 0, np.inf, 0, 0), "trip", "pose is not finite"
+    ),
+    Fault("60 mm jump", added("position", 0.06, 0, 0), "trip", "jumped", UNGUARDED),
+    Fault("half a turn in a tick", added("quaternion", -1, 0, 1, 0), "trip", "jumped", NO_TRIPS),
     Fault("quaternion of the other sign", corrupting(_other_sign), "goes on"),
     Fault("no news for 0.3 s", _frozen, "fades", "", {"stale_ticks": 0}, within=32),
     Fault("half the sample rate", corrupting(lambda k, _s: STALE * (k % 2)), "goes on"),
     Fault("20 % of samples lost", _every(0.2), "goes on"),
     Fault("50 % of samples lost", _every(0.5), "goes on"),
     Fault("stall of 0.2 s, 20 mm deeper", _stall, "re-seats", "", {"longest_stall": np.inf}),
-    Fault("time runs backwards", _backwards, "trip", "time ran backwards"),
-    Fault("read fails", _read_fails, "trip", "fault of its own"),
+    Fault(
+        "time runs backwards",
+        at_the_cause(lambda rig: rig.clock.set_back(0.5)),
+        "trip",
+        "time ran backwards",
+    ),
+    Fault("read fails", at_the_cause(_read_fails), "trip", "fault of its own"),
     Fault("read blocks for 1 s", _read_blocks, "re-seats", "", {"longest_stall": np.inf}),
     Fault("write fails", _write_fails, "trip", "is gone"),
     Fault("write blocks for 1 s", _write_blocks, "re-seats", "", {"longest_stall": np.inf}),
     Fault("write is cut short", _write_is_cut, "trip", "16 of 48 bytes"),
-    Fault("MuJoCo warns: bad velocity", acting(_bad_velocity), "trip", "diverged"),
-    Fault("MuJoCo warns: bad acceleration", acting(_bad_acceleration), "trip", "diverged"),
-    Fault("scene diverges", acting(_diverge), "trip", "diverged"),
+    Fault("MuJoCo warns: bad velocity", filled("qvel", 2e10), "trip", "diverged"),
+    Fault("MuJoCo warns: bad acceleration", filled("qfrc_applied", 1e11), "trip", "diverged"),
+    Fault("scene diverges", filled("qvel", np.nan), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=PUSHED),
     Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),

@@ -178,16 +178,13 @@ class Rig:
                 bridge.setup = replace(bridge.setup, guard=guard)
                 with bridge:
                     try:
-                        bridge.run(self.duration, self.on_tick and (lambda k: self._act(bridge, k)))
+                        act = self.on_tick or (lambda _bridge, _tick: None)
+                        bridge.run(self.duration, lambda tick: act(bridge, tick))
                     finally:
                         ticks_done = bridge.session.tick
             except (HapticBridgeError, ZeroDivisionError) as raised:
                 error = f"{type(raised).__name__}: {raised}"
             return Outcome.of(self, path, cause, error, ticks_done)
-
-    def _act(self, bridge: Bridge, tick: int) -> None:
-        if self.on_tick is not None:
-            self.on_tick(bridge, tick)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What a physics engine is to the study: it opens a task, and the simulation can be stepped."""
+"""Interface of a physics engine: it opens a task, and the simulation is stepped."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _STDOUT = 1
 
 @contextmanager
 def caught_prints(told: Callable[[str], None]) -> Iterator[None]:
-    """Catches everything that is printed on stdout inside, from C too, and tells it afterwards.
+    """Captures all that is printed on stdout inside, from C too, and reports it afterwards.
 
-    PyBullet prints two lines whenever a world is opened; between braces of JSON they would be the
-    end of it. Each line is told once, however often it was printed.
+    PyBullet prints two lines whenever a world is opened, which would break JSON on stdout. Each
+    line is reported once, however often it was printed.
 
     Args:
-        told: Called with each different line, in the order of their first appearance.
+        told: Called with each different line, in the order of first appearance.
     """
     try:
         kept = os.dup(_STDOUT)
@@ -79,13 +79,14 @@ def _lines(file: BinaryIO) -> list[str]:
 
 Kind = Literal["box", "sphere", "capsule", "mesh"]
 SIZES = {"box": 3, "sphere": 1, "capsule": 2, "mesh": 0}
-"""How many numbers the size of a shape has."""
+"""Count of numbers in a shape's size, by kind."""
 
 NORM_TOLERANCE = 1e-9
-"""How far a quaternion's norm may be from 1, without unit: rounding, and no scaling by mistake."""
+"""Largest deviation of a quaternion's norm from 1. It admits rounding and refuses a wrong
+scaling."""
 
 MOST_STEPS = 10**8
-"""Longest run in steps: a day at 1 kHz."""
+"""Largest number of steps in a run: a day at 1 kHz."""
 
 _ARGUMENTS = Arguments(StudyError)
 
@@ -112,7 +113,7 @@ def check_pose(name: str, pose: Pose) -> None:
     """Refuses a pose that is not finite or whose quaternion is not of norm 1 within 1e-9.
 
     Raises:
-        StudyError: It is so.
+        StudyError: The pose is not finite or not of unit norm.
     """
     _vector(f"{name} position", pose.position, "m")
     quaternion = _ARGUMENTS.numbers(f"{name} quaternion", pose.quaternion)
@@ -147,12 +148,12 @@ class Shape:
 
     Attributes:
         kind: ``box``, ``sphere``, ``capsule`` or ``mesh``.
-        size: In m: half edges of a box; radius of a sphere; radius and half length of a capsule's
-            cylinder, which lies along its z axis; nothing for a mesh.
-        position: Of its centre, in m.
-        quaternion: Of its axes.
-        vertices: Of a mesh, in its own frame, in m, shape (n, 3), n >= 4: the shape is their convex
-            hull.
+        size: Half edges of a box; radius of a sphere; radius and half length of a capsule's
+            cylinder, which lies along its z axis; all in m. Empty for a mesh.
+        position: Position of its centre, in m.
+        quaternion: Orientation of its axes.
+        vertices: Vertices of a mesh in its own frame, in m, shape (n, 3), n >= 4. The shape is
+            their convex hull.
 
     Raises:
         StudyError: A value is not finite, out of range or mis-shaped.
@@ -185,7 +186,7 @@ class Shape:
 
     @property
     def pose(self) -> Pose:
-        """Position and axes as one."""
+        """Position and orientation as a pose."""
         return Pose(self.position, self.quaternion)
 
 
@@ -194,10 +195,10 @@ class Body:
     """The tool: one rigid body, free in space.
 
     Attributes:
-        mass: In kg, > 0.
+        mass: Mass in kg, > 0.
         inertia: Principal moments in kg m², > 0, none larger than the sum of the other two.
         inertia_frame: Centre of mass and principal axes in the body's frame.
-        shapes: In the body's frame; may be empty.
+        shapes: Shapes in the body's frame; may be empty.
         friction: Coulomb's coefficient of every contact, without unit, >= 0.
 
     Raises:
@@ -225,18 +226,18 @@ class Body:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """What an engine has to simulate: a free tool among fixed shapes, moved by the coupling.
+    """A task for an engine: a free tool among fixed shapes, moved by the coupling.
 
     Attributes:
-        name: For tables and messages.
+        name: Name in tables and messages.
         body: The tool.
         fixed: The fixed shapes, in the world frame.
-        gravity: In m/s².
-        coupling: Between handle and grip; None leaves the tool alone.
+        gravity: Gravity in m/s².
+        coupling: Coupling between handle and grip; None leaves the tool alone.
         grip: Pose of the grip in the body's frame.
         start: Pose of the body's frame at the start.
-        start_velocity: Of its centre of mass, and about it.
-        handle: Poses of the handle in the world frame over time; None: it stays at the grip's pose
+        start_velocity: Velocity of its centre of mass and angular velocity at the start.
+        handle: Poses of the handle in the world frame over time. None keeps it at the grip's pose
             at the start.
 
     Raises:
@@ -285,7 +286,7 @@ def check_timestep(timestep: float) -> float:
     """Returns a timestep in s, one finite number > 0.
 
     Raises:
-        StudyError: It is not.
+        StudyError: It is not finite or not > 0.
     """
     return _ARGUMENTS.number("timestep", timestep, "s", least=0, is_open=True)
 
@@ -298,10 +299,10 @@ class Wrench(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """The contacts of one step as the engine tells of them.
+    """Contacts of one step as the engine reports them.
 
     Attributes:
-        points: Points (or, where an engine has contact patches, patches) that touch.
+        points: Number of touching points, or of patches in an engine with contact patches.
         depth: Deepest penetration in m, >= 0; 0 without contact.
     """
 
@@ -310,13 +311,13 @@ class Contacts(NamedTuple):
 
     @classmethod
     def of(cls, depths: Iterable[float]) -> Contacts:
-        """Returns what points of these depths in m, negative where they are apart, come to."""
+        """Returns the contacts with these depths in m; a negative depth is a gap."""
         touching = [depth for depth in depths if depth >= 0]
         return cls(len(touching), max(touching, default=0.0))
 
 
 class Setting(NamedTuple):
-    """One setting of an engine: what it is set to, and the page of its documentation for it."""
+    """One setting of an engine: its value, and the page of its documentation that advises it."""
 
     value: str
     source: str
@@ -326,13 +327,13 @@ class Simulation(Protocol):
     """A task in an engine, at some step. Step 0 is the start."""
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
-        """Goes from step k − 1 to step k, at whose end the handle is at h_k.
+        """Advances from step k − 1 to step k, at whose end the handle is at h_k.
 
         A held coupling acts on the tool during the step with f_{k−1}; f_k is computed at its end.
         """
 
     def advance(self, force: Vector, torque: Vector) -> None:
-        """Sets a force in N and a torque in N m at the centre of mass and steps: what is timed."""
+        """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
 
     def pose(self) -> Pose:
         """Returns the pose of the body's frame."""
@@ -347,7 +348,7 @@ class Simulation(Protocol):
         """Returns the contacts of the last step."""
 
     def close(self) -> None:
-        """Gives back what the engine holds. Closing twice is allowed."""
+        """Releases the resources of the engine. Closing twice is allowed."""
 
 
 class Engine(Protocol):
@@ -355,7 +356,7 @@ class Engine(Protocol):
 
     @property
     def name(self) -> str:
-        """What ``--engines`` calls it."""
+        """Name for ``--engines``."""
 
     @property
     def version(self) -> str:
@@ -363,10 +364,10 @@ class Engine(Protocol):
 
     @property
     def settings(self) -> Mapping[str, Setting]:
-        """Every setting that was made, and where its documentation advises it."""
+        """Settings with the pages of the documentation that advise them."""
 
     def open(self, task: Task, timestep: float) -> Simulation:
-        """Sets a task up, with steps of ``timestep`` in s.
+        """Opens a task with steps of ``timestep`` in s.
 
         Raises:
             StudyError: The engine cannot describe the task, or the timestep is out of range.
@@ -386,16 +387,16 @@ ENGINES = {
     "drake_point": "drake",
     "drake_hydroelastic": "drake",
 }
-"""In which module an engine is: each has ``engines()``, and cannot be imported, or raises
-StudyError there, where its library is not installed."""
+"""Module of each engine. It has ``engines()``; where its library is not installed, the import fails
+or ``engines()`` raises StudyError."""
 
 
 class Engines(NamedTuple):
-    """The engines of this installation.
+    """Engines of this installation.
 
     Attributes:
-        available: By name.
-        missing: By name, a sentence that says what is not installed and how to get it.
+        available: Engines by name.
+        missing: By name, a sentence that names the missing library and the way to install it.
     """
 
     available: Mapping[str, Engine]
@@ -403,7 +404,7 @@ class Engines(NamedTuple):
 
 
 def available_engines() -> Engines:
-    """Imports every engine and says which are there."""
+    """Imports every engine and returns those that are available and missing."""
     available: dict[str, Engine] = {}
     missing: dict[str, str] = {}
     for name in ENGINES:
@@ -418,14 +419,15 @@ def open_engine(name: str) -> Engine:
     """Imports one engine.
 
     Raises:
-        StudyError: There is none of that name, or its library is not installed; says how to get it.
+        StudyError: The name is unknown, or its library is not installed; the message tells how to
+            install it.
     """
     if name not in ENGINES:
         raise StudyError(f"no engine '{name}'; engines: {choices(ENGINES)}")
     try:
         module = import_module(f"{_PACKAGE}.{ENGINES[name]}")
     except ImportError as error:
-        # what a library needs of the system (as libGL) may be missing where it is installed
+        # a system library (such as libGL) may be missing although the package is installed
         raise StudyError(
             f"engine '{name}' is not installed ({error}): pip install hapticbridge[peers]"
         ) from None

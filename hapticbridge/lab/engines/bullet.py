@@ -19,25 +19,25 @@ from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Quaternion, Vector
 
 SLOP = 1e-7
-"""Depth in m that a contact keeps under sequential impulses. Bullet's own 1e-5 m is what a settled
-tool is wrong by; at 0 its contacts come and go, and some poses chatter by 5 to 16 µm."""
+"""Depth in m that a contact keeps under sequential impulses. A settled tool is wrong by Bullet's
+own 1e-5 m. At 0 its contacts come and go, and some poses chatter by 5 to 16 µm."""
 
 ERP = 0.2
-"""Share of a penetration that a step takes back, without unit: Bullet's own for joints. At 0.8 a
+"""Share of a penetration that a step corrects, without unit: Bullet's own for joints. At 0.8 a
 settled tool chatters."""
 
 ITERATIONS = 200
-"""Of sequential impulses at most. Its own 50 are too few for the twelve contacts of a peg that lies
-flat in its hole."""
+"""Largest number of iterations of sequential impulses. Bullet's own 50 are too few for the twelve
+contacts of a peg that lies flat in its hole."""
 
 RESIDUAL = 1e-7
-"""Change of velocity in m/s at which the iterations end before: Bullet's own, and the least that
-the guide names. A settled peg is wrong by 0.2 to 0.6 µm, worst where it lies on the bottom; at
-1e-10 by 0.07 to 0.3 µm, at 1.4 times the cost."""
+"""Change of velocity in m/s below which the iterations end: Bullet's own, and the least in its
+guide. A settled peg is wrong by 0.2 to 0.6 µm, worst where it lies on the bottom. At 1e-10 the
+error is 0.07 to 0.3 µm, at 1.4 times the cost."""
 
 CFM = 1e-8
-"""Constraint force mixing of the direct solver: at 0 redundant contacts make its matrix singular
-and a settled tool chatters by 40 µm; at 1e-6 it sinks by 0.03 µm."""
+"""Constraint force mixing of the direct solver. At 0 redundant contacts make its matrix singular
+and a settled tool chatters by 40 µm. At 1e-6 the tool sinks by 0.03 µm."""
 
 _GUIDE = "PyBullet Quickstart Guide"
 _PARAMETERS = f"{_GUIDE}: setPhysicsEngineParameter"
@@ -65,7 +65,7 @@ class PybulletEngine:
     version = version("pybullet")
 
     def __init__(self, name: str, parameters: Mapping[str, float], solver: str) -> None:
-        """Takes its name, what ``setPhysicsEngineParameter`` is given, and the solver's name."""
+        """Takes its name, options of ``setPhysicsEngineParameter`` and the solver's name."""
         self.name = name
         self._parameters = dict(parameters)
         given = {key: base.Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
@@ -76,12 +76,12 @@ class PybulletEngine:
         }
 
     def open(self, task: base.Task, timestep: float) -> PybulletSimulation:
-        """Sets a task up; see ``Engine.open``."""
+        """Opens a task; see ``Engine.open``."""
         return PybulletSimulation(task, timestep, self._parameters)
 
 
 class PybulletSimulation(HeldSimulation):
-    """A task in a Bullet world of its own."""
+    """A task in its own Bullet world."""
 
     def __init__(self, task: base.Task, timestep: float, parameters: Mapping[str, float]) -> None:
         super().__init__(task, timestep)
@@ -125,7 +125,7 @@ class PybulletSimulation(HeldSimulation):
         self._begin(task)
 
     def _set_dynamics(self, body: int, task: base.Task, **more: Any) -> None:
-        """Takes out what Bullet adds to a body, and sets its friction."""
+        """Removes Bullet's default damping of a body, and sets its friction."""
         has_mesh = any(shape.kind == "mesh" for shape in (*task.body.shapes, *task.fixed))
         if has_mesh:
             more["collisionMargin"] = 0.0
@@ -145,7 +145,7 @@ class PybulletSimulation(HeldSimulation):
         )
 
     def _collision(self, placed: Sequence[tuple[base.Shape, base.Pose]]) -> int:
-        """Makes one shape of several, and returns its number; −1 of nothing."""
+        """Makes one shape of several, and returns its number; −1 for an empty list."""
         if not placed:
             return -1
         shapes = [shape for shape, _ in placed]

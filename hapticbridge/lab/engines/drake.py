@@ -34,12 +34,12 @@ from hapticbridge.lab.engines.from_scene import HeldSimulation
 from hapticbridge.pose import Vector
 
 POINT_STIFFNESS = 1e7
-"""Of a point contact in N/m: so stiff that what is left of the error is that Drake has one point
-for two boxes. 1e6 is worse by a fifth, 1e8 no better."""
+"""Stiffness of a point contact in N/m. The remaining error stems from Drake's single point for two
+boxes. 1e6 is worse by a fifth, 1e8 no better."""
 
 MODULUS = 1e9
-"""Hydroelastic modulus in Pa of the tool, that of a hard plastic. A settled peg is wrong by 0.06 to
-27 µm; at 1e10 by less, but it flew out of the hole as soon as there was friction."""
+"""Hydroelastic modulus of the tool in Pa, that of a hard plastic. A settled peg is wrong by 0.06 to
+27 µm. At 1e10 the error is smaller, but with friction the peg flew out of the hole."""
 
 RESOLUTION = 0.1
 """Edge of the tessellation of round shapes as a share of their radius, without unit."""
@@ -69,14 +69,14 @@ class DrakeEngine:
         self.settings: Mapping[str, base.Setting] = {**_SHARED, **settings}
 
     def open(self, task: base.Task, timestep: float) -> DrakeSimulation:
-        """Sets a task up; see ``Engine.open``."""
+        """Opens a task; see ``Engine.open``."""
         return DrakeSimulation(task, timestep, self._contact_model)
 
 
 class DrakeSimulation(HeldSimulation):
     """A task in Drake.
 
-    Drake refuses to go on from a state that is not finite: from then on the pose is nan.
+    Drake refuses to continue from a state that is not finite; from then on the pose is nan.
     """
 
     def __init__(self, task: base.Task, timestep: float, contact_model: str) -> None:
@@ -129,7 +129,7 @@ class DrakeSimulation(HeldSimulation):
         if not self._is_finite:
             return
         self._input.GetMutableData().get_mutable_value().SetFromVector((*torque, *force))
-        # the plant steps at 0, T, 2T, …: half way between, no rounding can leave one out
+        # the plant steps at 0, T, 2T, …; a target half way between is safe from rounding
         try:
             self._simulator.AdvanceTo((self._steps + 0.5) * self._timestep)
         except RuntimeError:
@@ -151,7 +151,7 @@ class DrakeSimulation(HeldSimulation):
         return base.Velocity((x, y, z), (a, b, c))
 
     def contacts(self) -> base.Contacts:
-        """Returns the contacts of the pose now; a hydroelastic patch has no depth."""
+        """Returns the contacts at the present pose; a hydroelastic patch has no depth."""
         if not self._is_finite:
             return base.Contacts(0, 0.0)
         found = self._plant.get_contact_results_output_port().Eval(self._context)
@@ -162,7 +162,7 @@ class DrakeSimulation(HeldSimulation):
         return points._replace(points=points.points + found.num_hydroelastic_contacts())
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Does nothing: Drake holds no resources."""
 
 
 def _material(task: base.Task, relaxation_time: float) -> Any:
@@ -190,7 +190,7 @@ def _geometry(shape: base.Shape) -> Any:
 
 def _transform(pose: base.Pose) -> Any:
     quaternion = np.array(pose.quaternion)
-    # Drake takes no norm that is wrong in its last digits
+    # Drake refuses a quaternion whose norm is wrong in its last digits
     turn = Turn(quaternion / np.linalg.norm(quaternion))
     return RigidTransform(turn, np.array(pose.position))
 

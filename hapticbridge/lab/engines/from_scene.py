@@ -52,16 +52,16 @@ def task_from_scene(
     of geoms, as MuJoCo takes it the larger of the two.
 
     Args:
-        scene: Its start is described; it is put there.
-        motion: Of the handle, counted from its first pose as ``check.motion_for`` returns it; it
-            begins where the grip is at the start. None: the handle rests there.
-        coupling: Between handle and grip; None leaves the tool alone.
+        scene: Scene to describe; it is reset to its start.
+        motion: Motion of the handle relative to its first pose, as ``check.motion_for`` returns it.
+            It begins at the grip's pose at the start. None: the handle rests there.
+        coupling: Coupling between handle and grip; None leaves the tool alone.
 
     Raises:
-        StudyError: It is none that other engines share. One body moves, on a free joint without
-            damping, armature or friction, and no other body is fixed to it; the geoms that touch
-            are boxes, spheres, capsules or convex meshes, each of the tool's against each of the
-            fixed, without margin and with one friction for sliding alone; there are no
+        StudyError: Other engines cannot represent the scene. One body moves, on a free joint
+            without damping, armature or friction, and no other body is fixed to it; the geoms that
+            touch are boxes, spheres, capsules or convex meshes, each of the tool's against each of
+            the fixed, without margin and with one friction for sliding alone; there are no
             constraints, tendons, fluid, or actuators of the scene's own.
     """
     scene.reset()
@@ -102,7 +102,7 @@ def task_from_scene(
 
 
 def _fault(model: mujoco.MjModel) -> str:
-    """Returns why other engines cannot be given a model; empty where they can."""
+    """Returns the reason why other engines cannot represent a model; empty where they can."""
     free = int(mujoco.mjtJoint.mjJNT_FREE)
     if model.njnt != 1 or model.jnt_type[0] != free:
         return f"it has {model.njnt} joint(s), and it must have a free joint and no other"
@@ -186,7 +186,7 @@ def _shape(model: mujoco.MjModel, geom_id: int, pose: base.Pose) -> base.Shape:
 
 
 def _from(grip: base.Pose, motion: Motion) -> Motion:
-    """Returns a motion that is counted from its first pose, begun at the grip."""
+    """Returns a motion relative to its first pose, moved to begin at the grip."""
     table = motion.table
     turned = [product(_four(row[4:]), grip.quaternion) for row in table]
     return Motion(table[:, 0], table[:, 1:4] + np.asarray(grip.position), turned)
@@ -213,28 +213,28 @@ def _quaternion(matrix: Array) -> Array:
 
 
 Frame = tuple[Vector, Quaternion]
-"""Position in m and orientation, as the compiler takes them."""
+"""Position in m and orientation, as the compiler stores them."""
 
 _AT_ORIGIN = (ZERO_VECTOR, (1.0, 0.0, 0.0, 0.0))
 
 
 class HeldSimulation(ABC):
-    """A simulation whose coupling is a force and a torque that the engine is given every step.
+    """A simulation whose coupling is a force and a torque, applied to the engine every step.
 
         f_k = K e_k + (B/T)(e_k − e_{k−1}),    e = h − x
         τ_k = K_r φ_k + (B_r/T)(δφ_h − δφ_x),  φ = log(R_h R_xᵀ)
 
-    with the handle h and the grip x at the end of step k; step k + 1 is done under (f_k, τ_k),
-    moved to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has
-    not moved before step 0.
+    with the handle h and the grip x at the end of step k; step k + 1 runs under (f_k, τ_k), moved
+    to the centre of mass. This is ``theory.drive_mass``'s scheme ``held``. The handle has not moved
+    before step 0.
 
-    Engines know a body by its centre of mass: here a child's body is the frame of the principal
-    axes of inertia, for which ``_principal`` and ``_shape_pose`` translate. A child sets its engine
-    up in ``__init__`` after that of this class, and calls ``_begin`` last.
+    Engines describe a body by its centre of mass. A child's body is therefore the frame of the
+    principal axes of inertia; ``_principal`` and ``_shape_pose`` convert to it. A child opens its
+    engine in ``__init__`` after that of this class, and calls ``_begin`` last.
     """
 
     def __init__(self, task: base.Task, timestep: float) -> None:
-        """Takes the task.
+        """Stores the task and computes the poses of the handle.
 
         Raises:
             StudyError: The timestep is not finite and positive.
@@ -276,12 +276,12 @@ class HeldSimulation(ABC):
         return base.composed(self._body_in_principal, shape.pose)
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
-        """Goes one step under the wrench of the last, and computes the next."""
+        """Advances one step under the wrench of the last step, and computes the next wrench."""
         self._couple((handle_position, handle_quaternion))
         self._measure((handle_position, handle_quaternion))
 
     def _couple(self, _handle: Frame) -> None:
-        """Does the step; a child whose engine has a spring of its own aims it at the handle."""
+        """Advances the engine; a child whose engine has its own spring aims it at the handle."""
         self.advance(*self._at_centre)
 
     def wrench(self) -> base.Wrench:
@@ -325,7 +325,7 @@ class HeldSimulation(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Gives back what the engine holds."""
+        """Releases the resources of the engine."""
 
 
 @compiled

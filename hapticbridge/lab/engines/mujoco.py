@@ -1,4 +1,4 @@
-"""MuJoCo as a peer would use it: the coupling is a held force, as in every other engine here.
+"""MuJoCo as a peer engine: the coupling is a held force, as in every other engine here.
 
 References:
     MuJoCo documentation, https://mujoco.readthedocs.io
@@ -26,13 +26,13 @@ _TYPES = {
 }
 
 STIFFNESS_TIME = 2.0
-"""Time constant of a contact in timesteps: the smallest that MuJoCo holds to be stable. Penetration
-grows with its square."""
+"""Time constant of a contact in timesteps: the smallest that MuJoCo documents as stable.
+Penetration grows with its square."""
 
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
-"""Of a contact: ``solimp``. A settled peg is wrong by 3 to 10 µm, with MuJoCo's own 0.9 and 0.95 by
-5 to 20 µm, with 0.99 and 0.999 by 0.5 to 2 µm, but in two of six poses it then chatters by 10 to 40
-µm."""
+"""Impedance ``solimp`` of a contact. A settled peg is wrong by 3 to 10 µm, with MuJoCo's own 0.9
+and 0.95 by 5 to 20 µm, with 0.99 and 0.999 by 0.5 to 2 µm. With the last pair it then chatters in
+two of six poses by 10 to 40 µm."""
 
 
 class MujocoEngine:
@@ -53,7 +53,7 @@ class MujocoEngine:
     }
 
     def open(self, task: base.Task, timestep: float) -> MujocoSimulation:
-        """Sets a task up; see ``Engine.open``."""
+        """Opens a task; see ``Engine.open``."""
         return MujocoSimulation(task, timestep)
 
 
@@ -99,7 +99,7 @@ class MujocoSimulation(HeldSimulation):
     def _add(
         self, body: mujoco.MjsBody, shape: base.Shape, friction: float, own: int, other: int
     ) -> None:
-        """Adds a geom that touches only the other side's."""
+        """Adds a geom that touches only geoms of the other side."""
         geom = body.add_geom(
             type=_TYPES[shape.kind], pos=shape.position, quat=shape.quaternion, mass=0
         )
@@ -143,7 +143,7 @@ class MujocoSimulation(HeldSimulation):
         return base.Contacts.of(-float(distance) for distance in distances)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Does nothing: MuJoCo holds no resources."""
 
 
 def engines() -> tuple[base.Engine, ...]:

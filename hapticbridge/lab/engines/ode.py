@@ -41,7 +41,7 @@ MISSING = (
 )
 
 MOST_CONTACTS = 8
-"""Contacts of one pair of geoms: as many as two boxes can have in ODE."""
+"""Largest number of contacts of one pair of geoms: as many as two boxes can have in ODE."""
 
 APPROXIMATE_FRICTION = 0x7000
 """``dContactApprox1``: friction in proportion to the normal force, not a constant box."""
@@ -137,12 +137,12 @@ _SIGNATURES: dict[str, tuple[Any, ...]] = {
     "dJointSetAMotorAngle": (None, _ID, _INT, _REAL),
     "dJointSetAMotorParam": (None, _ID, _INT, _REAL),
 }
-"""Type of the result, and of the arguments."""
+"""Types of the result and of the arguments."""
 
 
 @cache
 def library() -> Any:
-    """Returns ODE's library, initialised, its functions' types declared.
+    """Loads ODE's library, initialises it and declares the types of its functions.
 
     Raises:
         StudyError: It is not installed, or was built in single precision.
@@ -162,17 +162,17 @@ def library() -> Any:
     if b"ODE_double_precision" not in found.dGetConfiguration().split():
         raise StudyError("the installed ODE was built in single precision; double is needed")
     found.dInitODE2(0)
-    # it reports on a degenerate step, which is then done anyway
+    # ODE reports a degenerate step, which it then performs anyway
     found.dSetMessageHandler(ctypes.cast(_SILENT, c_void_p))
     return found
 
 
 def _silence(_number: int, _text: bytes, _arguments: int) -> None:
-    """Takes what ODE would print."""
+    """Discards a message of ODE."""
 
 
 _SILENT = ctypes.CFUNCTYPE(None, c_int, c_char_p, c_void_p)(_silence)
-"""Kept here for as long as ODE may call it."""
+"""Reference that keeps the callback alive for as long as ODE may call it."""
 
 _POINTER, _WHOLE, _DOUBLE, _NOTHING = types.intp, types.int32, types.float64, types.void
 _collide: Any = types.ExternalFunction(
@@ -202,14 +202,14 @@ def step(
         ids: World, body and group of joints.
         pairs: Geoms that may touch, the tool's first, shape (n, 2).
         contacts: Address of an array of ``MOST_CONTACTS`` contacts with their surfaces filled in,
-            size of one, where in it the geometry is, and where in that the depth is, in bytes.
-        timestep: In s.
-        force: At the centre of mass in N.
-        torque: In N m.
-        depths: Is filled with the contacts' depths in m.
+            size of one, offset of the geometry in it, and offset of the depth in that, in bytes.
+        timestep: Timestep in s.
+        force: Force at the centre of mass in N.
+        torque: Torque in N m.
+        depths: Output, filled with the contacts' depths in m.
 
     Returns:
-        How many contacts there were.
+        The number of contacts.
     """
     world, body, group = ids
     address, size, geometry, depth = contacts
@@ -229,13 +229,13 @@ def step(
 
 
 LAYER = 1e-7
-"""Depth in m that a contact keeps. At 0 a settled tool's contacts come and go, and in two of six
-poses of the peg in its hole it chattered by 9 to 50 µm; the pose is wrong by about this depth."""
+"""Depth in m that a contact keeps; the pose is wrong by about this depth. At 0 a settled tool's
+contacts come and go. In two of six poses of the peg in its hole it chattered by 9 to 50 µm."""
 
 CFM = 1e-7
-"""Constraint force mixing of the contacts in 1/kg times s: 1e-10, the default, leaves the equations
-of redundant contacts so near to singular that the solver stops early; at 1e-5 the peg sinks by
-0.1 µm."""
+"""Constraint force mixing of the contacts in 1/kg times s. At the default of 1e-10 the equations of
+redundant contacts are so near to singular that the solver stops early. At 1e-5 the peg sinks by 0.1
+µm."""
 
 _MANUAL = "ODE Manual"
 
@@ -259,11 +259,11 @@ class OdeEngine:
 
     @property
     def version(self) -> str:
-        """ODE does not tell its own version, only how it was built."""
+        """Build configuration of ODE, which does not report its version."""
         return str(library().dGetConfiguration().decode())
 
     def open(self, task: base.Task, timestep: float) -> OdeSimulation:
-        """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
+        """Opens a task; see ``Engine.open``. Convex meshes are not supported."""
         return OdeSimulation(task, timestep)
 
 
@@ -361,7 +361,7 @@ class OdeSimulation(HeldSimulation):
         return base.Contacts.of(self._depths[: self._touching].tolist())
 
     def close(self) -> None:
-        """Gives back what ODE holds."""
+        """Releases ODE's world."""
         if self._world:
             for geom in self._geoms:
                 self._ode.dGeomDestroy(geom)
@@ -377,7 +377,7 @@ def _array(quaternion: Quaternion) -> ctypes.Array[ctypes.c_double]:
 # dParamLoStop, dParamHiStop, dParamCFM, dParamStopERP, dParamStopCFM and dParamERP
 _LOW, _HIGH, _CFM, _STOP_ERP, _STOP_CFM, _ERP = 0, 1, 8, 9, 10, 13
 _GROUP = 0x100
-"""Between the parameters of an angular motor's axes."""
+"""Offset between the parameters of an angular motor's axes."""
 
 
 class OdeSpringEngine(OdeEngine):
@@ -393,14 +393,14 @@ class OdeSpringEngine(OdeEngine):
     }
 
     def open(self, task: base.Task, timestep: float) -> OdeSimulation:
-        """Sets a task up; see ``Engine.open``. It knows no convex meshes."""
+        """Opens a task; see ``Engine.open``. Convex meshes are not supported."""
         return OdeSpringSimulation(task, timestep)
 
 
 class OdeSpringSimulation(OdeSimulation):
     """A task in ODE whose coupling is implicit in position and velocity.
 
-    A joint with CFM 1/(T K + B) and ERP 1 whose target is y off pulls with
+    A joint with CFM 1/(T K + B) and ERP 1 whose target is y away pulls with
 
         λ = (T K + B)(y/T − v),    y = T (K (h_k − x_{k−1}) + B δh/T) / (T K + B)
 

@@ -35,28 +35,31 @@ with warnings.catch_warnings():
 
 
 POSITION_ITERATIONS = 20
-"""Of the solver: at PhysX's own 4 a settled tool is wrong by 0.1 µm more; 50 change nothing."""
+"""Iterations of the solver. At PhysX's own 4 a settled tool is wrong by 0.1 µm more; 50 change
+nothing."""
 
 CONTACT_OFFSET = 1e-3
-"""Distance in m at which contacts are made: some steps' motion, small against the parts."""
+"""Distance in m at which contacts are made. It covers the motion of some steps and is small against
+the parts."""
 
 LENGTH, SPEED = 1e-4, 1.0
-"""``PxTolerancesScale``: a length in m and a speed in m/s, of the whole process. The manifold of
+"""``PxTolerancesScale``: a length in m and a speed in m/s, for the whole process. The manifold of
 two shapes keeps its normal until they have moved by a share of their size or of this length. At the
-default of 1 m a peg that leans on its hole's edge by 19 mrad still has the normal from when it
-stood upright, and rests 31 µm away; at 1 mm 0.7 µm; at 0.1 mm, half the peg's clearance, 0.5 µm, as
-where its manifolds are made in place. The steps take as long. The manual advises the size of the
-objects; 10 mm changes nothing here. The speed enters only bouncing and sleep, which are off."""
+default of 1 m a peg that leans on its hole's edge by 19 mrad still has the normal of its upright
+pose, and rests 31 µm away. At 1 mm the error is 0.7 µm. At 0.1 mm, half the peg's clearance, it is
+0.5 µm, as with manifolds that are made in place. The time per step is equal. The manual advises the
+size of the objects; 10 mm changes nothing here. The speed enters only bouncing and sleep, which are
+off."""
 
 _GUIDE = "PhysX 5 User's Guide"
 _DYNAMICS = f"{_GUIDE}: Rigid Body Dynamics"
 _COLLISION = f"{_GUIDE}: Advanced Collision Detection"
 SLERP = 4.0
-"""A slerp drive is a quarter as stiff as it is told, without unit: it acts on half the angle
-(measured under a torque: 4.00)."""
+"""Ratio of the nominal to the actual stiffness of a slerp drive, without unit. The drive acts on
+half the angle (measured under a torque: 4.00)."""
 
 _X_TO_Z: Quaternion = (math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0)
-"""A capsule lies along x in PhysX."""
+"""Rotation for capsules, which lie along x in PhysX and along z in a ``Shape``."""
 
 
 class SapienEngine:
@@ -88,17 +91,17 @@ class SapienEngine:
     }
 
     def open(self, task: base.Task, timestep: float) -> SapienSimulation:
-        """Sets a task up; see ``Engine.open``."""
+        """Opens a task; see ``Engine.open``."""
         return SapienSimulation(task, timestep)
 
 
 class SapienSimulation(HeldSimulation):
-    """A task in a PhysX scene of its own."""
+    """A task in its own PhysX scene."""
 
     def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         _physx()
-        # SAPIEN has these for the whole process, and reads them when something is made
+        # SAPIEN keeps these for the whole process, and reads them when an object is made
         scene_config = physx.PhysxSceneConfig()
         scene_config.gravity = np.array(task.gravity)
         scene_config.enable_tgs = scene_config.enable_pcm = True
@@ -155,8 +158,8 @@ class SapienSimulation(HeldSimulation):
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start.
 
-        PhysX stops what would touch within the step, and leaves gaps of less than a nanometre: what
-        pushes touches, too.
+        PhysX stops shapes that would touch within the step, and leaves gaps of less than a
+        nanometre. A point that carries a force therefore counts as touching.
         """
         points = [point for contact in self._system.get_contacts() for point in contact.points]
         return base.Contacts.of(
@@ -165,7 +168,7 @@ class SapienSimulation(HeldSimulation):
         )
 
     def close(self) -> None:
-        """Lets go of the scene; PhysX takes it back with its last reference."""
+        """Releases the scene; PhysX frees it with its last reference."""
         self._body = self._system = self._scene = None
 
 
@@ -181,15 +184,16 @@ class SapienSpringEngine(SapienEngine):
     }
 
     def open(self, task: base.Task, timestep: float) -> SapienSimulation:
-        """Sets a task up; see ``Engine.open``."""
+        """Opens a task; see ``Engine.open``."""
         return SapienSpringSimulation(task, timestep)
 
 
 class SapienSpringSimulation(SapienSimulation):
     """A task in PhysX whose coupling is a drive from the world to the grip.
 
-    Its target is h_k, its target velocity the handle's over the step. The solver's iterations are
-    parts of the step here, so that it is less damped than the implicit scheme of one step.
+    Its target is h_k; its target velocity is the handle's over the step. The solver's iterations
+    are parts of the step here. The coupling is therefore less damped than the implicit scheme of
+    one step.
     """
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -224,7 +228,7 @@ class SapienSpringSimulation(SapienSimulation):
 
 @cache
 def _physx() -> Any:
-    """Starts PhysX with its tolerances; SAPIEN takes what is there, and else starts its own."""
+    """Starts PhysX with these tolerances; otherwise SAPIEN would start its own."""
     return physx.PhysxEngine(LENGTH, SPEED)
 
 

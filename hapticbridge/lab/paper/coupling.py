@@ -1,4 +1,4 @@
-"""Equations (2) and (4) to (7): what a coupling asks of the device."""
+"""Equations (2) and (4) to (7): device damping that a coupling requires."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hapticbridge.theory.spectrum import (
 from hapticbridge.theory.transfer import angles, coupling_transfer
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 COUPLING = Coupling(stiffness=1000.0, damping=2.0, rotational_stiffness=0.0, rotational_damping=0.0)
 K, B = COUPLING.stiffness, COUPLING.damping
@@ -42,12 +42,12 @@ def spring_with(damping: float) -> Coupling:
 
 
 def low_passed(z: _Complex) -> _Complex:
-    """C of a spring and a low-passed damper, written in z."""
+    """Transfer function C of a spring and a low-passed damper, in z."""
     return np.asarray(K + B * (1 - 1 / z) / (PERIOD + TAU * (1 - 1 / z)))
 
 
 def delayed(z: _Complex) -> _Complex:
-    """C of the spring and damper, one sample late."""
+    """Transfer function C of the spring and damper, delayed by one sample."""
     return np.asarray((K + B / PERIOD * (1 - 1 / z)) / z)
 
 
@@ -149,7 +149,7 @@ def discretizations() -> Section:
         ("(5) Tustin", tustin, "C3"),
     )
     for name, transfer, colour in named:
-        inner = slice(None, -1)  # (5) has no value at Nyquist
+        inner = slice(None, -1)  # (5) is undefined at Nyquist
         size.semilogy(HERTZ[inner], np.abs(transfer[inner]), color=colour, label=name)
         phase.plot(HERTZ[inner], np.degrees(np.angle(transfer[inner])), color=colour)
     size.set(ylabel="|C| (N/m)", ylim=(500, 1e5))
@@ -215,15 +215,15 @@ def discretizations() -> Section:
 
 
 CONTACT = 1e4
-"""K_c in N/m: a stiff contact, so that a peg of a few centimetres is at the limit."""
+"""Contact stiffness K_c in N/m: so stiff that a peg of a few centimetres is at the limit."""
 DEVICE = 2e-3
-"""b_θ in N m s/rad, the simulated device's."""
+"""Rotational damping b_θ of the simulated device in N m s/rad."""
 BEHIND = Coupling(stiffness=2.4, damping=5e-4, rotational_stiffness=0, rotational_damping=0)
-"""The coupling that the comparison puts in between, as one axis: 2.4 N m/rad, 5e-4 N m s/rad."""
+"""Coupling inserted by the comparison, as one axis: 2.4 N m/rad and 5e-4 N m s/rad."""
 
 
 def _contact_hessian(length: float) -> NDArray[np.float64]:
-    """Second differences of the energy of two contact springs, over (x, y, angle)."""
+    """Returns second differences of the energy of two contact springs, over (x, y, angle)."""
 
     def energy(pose: NDArray[np.float64]) -> float:
         x, _, angle = pose
@@ -244,7 +244,7 @@ def _contact_hessian(length: float) -> NDArray[np.float64]:
 
 
 def _needed_behind(stiffness: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Worst damping over frequency for a massless tool between the coupling and a spring."""
+    """Returns the largest required damping for a massless tool between coupling and spring."""
     theta = angles(np.linspace(1e-3, np.pi, 2000) / PERIOD, PERIOD)
     k, b = np.asarray(BEHIND.stiffness), np.asarray(BEHIND.damping)
     coupling = coupling_transfer(k, b, PERIOD, theta, "backward", 0.0)
@@ -387,10 +387,10 @@ def identity_residual(period: float) -> float:
 
 
 SHORT = 1e-3
-"""How far before Nyquist (7) is looked at, in rad."""
+"""Distance in rad below Nyquist at which (7) is evaluated."""
 
 STIFF, LIGHT = Coupling(4000.0, 0.5, 0.0, 0.0), 0.05
-"""A coupling and a mass in kg with which Tustin's damper needs far more than (6)."""
+"""Coupling and mass in kg for which Tustin's damper needs far more than (6)."""
 
 
 def backward_difference() -> Section:
@@ -580,7 +580,7 @@ FILTER_TIMES = (0.0, 2e-3)
 """Grid of the checks: T in s, samples of delay, time constant of the low-pass in s."""
 
 TICKS = 3000
-"""Of a run with MuJoCo in the loop: 3 s, in which a force that decays is gone."""
+"""Ticks of a run with MuJoCo in the loop: 3 s, in which a force that decays vanishes."""
 
 
 def _in_mujoco(share: float) -> NDArray[np.float64]:

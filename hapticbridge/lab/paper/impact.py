@@ -1,4 +1,4 @@
-"""Section 4 of the paper: why an impact law must be chosen with care."""
+"""Section 4 of the paper: energy that impact laws create."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from hapticbridge.lab.paper.section import Check, Section, Table, explained, pan
 from hapticbridge.theory.impact import Impact, ImpactBody, Law, resolve_impact
 
 ROD = ImpactBody(1.0, 1 / 12, np.array([-0.5, -0.5]) / np.sqrt(2))
-"""A uniform rod of 1 kg and 1 m at 45°, hit at its lower tip."""
+"""Uniform rod of 1 kg and 1 m at 45°, hit at its lower tip."""
 VELOCITY = np.array([0.8, -1.0])
-"""Of the tip before the impact, tangential and normal, in m/s."""
+"""Velocity of the tip before the impact, tangential and normal, in m/s."""
 FRICTION, RESTITUTION = 0.75, 0.9
-"""μ and e, without unit."""
+"""Coefficients of friction μ and of restitution e, without unit."""
 
 KNOWN: dict[Law, tuple[float, float, float]] = {
     "newton": (0.8875, 0.2125, 0.040625),
     "poisson": (0.6175, 0.0505, -0.144055),
     "stronge": (0.703360, 0.102016, -0.097975),
 }
-"""P_n and P_t in N s, change of kinetic energy in J."""
+"""Impulses P_n and P_t in N s, and change of kinetic energy in J."""
 
 IMPACTS = 200_000
-"""Random rods that are drawn and judged per law."""
+"""Number of random rods that are drawn and judged per law."""
 GAINING = 0.01088
-"""Share of random rods that gain energy under Newton's law, of 5 million drawn like those here from
-25 other seeds."""
+"""Share of random rods that gain energy under Newton's law, from 5 million rods with 25 other
+seeds."""
 COLOURS: dict[Law, str] = {"newton": "C3", "poisson": "C0", "stronge": "C2"}
 
 _Array = NDArray[np.float64]
 
 
 def _stepped(law: Law, steps: int = 20_000) -> float:
-    """Follows Coulomb's law of friction in small steps of P_n; returns the energy change in J."""
+    """Integrates Coulomb's law in small steps of P_n; returns the energy change in J."""
     a, d, g = (float(value) for value in ROD.compliance())
     v_t, v_n = VELOCITY
     impulse = compression = work = taken = energy = 0.0
@@ -60,7 +60,7 @@ def _stepped(law: Law, steps: int = 20_000) -> float:
 
 
 def _path() -> tuple[_Array, _Array]:
-    """Routh's path of the rod in the plane of impulses, by the printed rules."""
+    """Returns Routh's path of the rod in the plane of impulses, by the printed rules."""
     a, _, g = (float(value) for value in ROD.compliance())
     normal = np.linspace(0, 1, 200)
     corner = VELOCITY[0] / (FRICTION * a + g)
@@ -69,7 +69,7 @@ def _path() -> tuple[_Array, _Array]:
 
 
 def _random_gains() -> dict[Law, _Array]:
-    """Energy change over kinetic energy at the contact, for random rods."""
+    """Returns the energy change over the kinetic energy at the contact, for random rods."""
     rng = np.random.default_rng(4)
     angle = rng.uniform(0, np.pi / 2, IMPACTS)
     arm = -0.5 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -84,7 +84,7 @@ def _random_gains() -> dict[Law, _Array]:
 
 
 def _drawn(impacts: dict[Law, Impact], gains: dict[Law, _Array], share: dict[Law, float]) -> Figure:
-    """Draws the rod's impulses by law, and what random rods gain."""
+    """Draws the rod's impulses by law, and the energy gain of random rods."""
     figure, (path, histogram) = panels(1, height=4.2, columns=2)
     normal, tangential = _path()
     path.plot(normal, tangential, color="k", lw=1, label="Routh's path")
@@ -115,7 +115,7 @@ def _drawn(impacts: dict[Law, Impact], gains: dict[Law, _Array], share: dict[Law
 
 
 def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
-    """Holds a law's impact of the rod against kept numbers, small steps (J) and velocities."""
+    """Compares a law's impact of the rod with kept numbers, small steps (J) and velocities."""
     got = float(impact.energy_change)
     is_rational = law != "stronge"
     names = ("P_n", "N s"), ("P_t", "N s"), ("change of kinetic energy", "J")
@@ -152,7 +152,7 @@ def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
 
 
 def _checks_of_random_rods(share: dict[Law, float]) -> list[Check]:
-    """Holds the shares of random rods that gain energy against 0, and Newton's against its own."""
+    """Compares the shares of rods that gain energy with 0, and Newton's with its kept value."""
     checks = [
         Check(
             equation="§4",
@@ -238,7 +238,7 @@ def section() -> Section:
 
 
 def _by_velocities(impulse: _Array) -> float:
-    """Kinetic energy of the rod after minus before, for a rod that does not turn before."""
+    """Returns the change of the rod's kinetic energy if the rod does not turn before the impact."""
     before = np.array([*VELOCITY, 0.0])
     after = before + ROD.velocity_change(impulse)
     inertia = np.array([1.0, 1.0, 1 / 12])

@@ -25,8 +25,8 @@ HEAVY = 1e9
 """Mass in kg of a tool that stands for a wall. A wall of 1e9 kg moves by 1e-12 of the handle."""
 
 TICKS = 3000
-"""Ticks of a run that must grow or decay. At Nyquist a device 0.1 % short of the bound grows by
-e^6 in them."""
+"""Ticks of a run that must grow or decay. At Nyquist a device 0.1 % below the bound grows by e^6 in
+them."""
 
 KICK = 1e-3
 """First displacement of the handle in m; the loop is linear, so it only scales what follows."""
@@ -35,15 +35,15 @@ DIVERGED = 1e6
 """Force in N at which a run ends as unstable: a billion times what the kick causes."""
 
 DECAYED = 1e-7
-"""Share of its largest value below which a force has decayed beyond doubt, without unit. MuJoCo's
-step with a free light tool keeps about 3e-8 N alive, which neither grows nor falls."""
+"""Share of its largest value below which a force counts as decayed, without unit. MuJoCo's step
+with a free light tool keeps about 3e-8 N alive, which neither grows nor falls."""
 
 TOLERANCE = 1e-4
-"""Relative width at which a bisection ends: less than what ``TICKS`` let one tell."""
+"""Relative width at which a bisection ends. It is below the resolution of ``TICKS``."""
 
 Hand = Callable[[float], float]
-"""Takes the force on the device in N that is held from now on, returns the handle's next step in
-m/s of mean velocity."""
+"""Function from the held force on the device in N to the handle's next step, in m/s of mean
+velocity."""
 
 
 class ImplicitMass:
@@ -52,7 +52,7 @@ class ImplicitMass:
     Args:
         coupling: K and B; the rotation is not excited.
         period: T in s.
-        mass: Of the tool in kg.
+        mass: Mass of the tool in kg.
     """
 
     def __init__(self, coupling: Coupling, period: float, mass: float) -> None:
@@ -85,7 +85,7 @@ class ImplicitMass:
         return row
 
     def force(self, handle: float) -> float:
-        """As ``tick``, and returns the force on the tool along x in N."""
+        """Runs ``tick`` and returns the force on the tool along x in N."""
         return float(self.tick(handle)["wrench_on_tool"][0, 0])
 
 
@@ -95,7 +95,7 @@ class AppliedForceMass:
     Args:
         coupling: K and B.
         period: T in s.
-        mass: In kg.
+        mass: Mass in kg.
     """
 
     def __init__(self, coupling: Coupling, period: float, mass: float) -> None:
@@ -110,7 +110,7 @@ class AppliedForceMass:
 
     @property
     def motion(self) -> tuple[float, float]:
-        """Position in m and velocity in m/s now."""
+        """Present position in m and velocity in m/s."""
         return float(self._data.qpos[0]), float(self._data.qvel[0])
 
     def force(self, handle: float) -> float:
@@ -132,12 +132,12 @@ def drive(mass: ImplicitMass, handle: _Array) -> NDArray[np.void]:
 
 
 def hold(felt: Callable[[float], float], hand: WorstHand, ticks: int) -> _Array:
-    """Lets the worst hand hold what is felt, from a displaced handle.
+    """Runs an environment with the worst hand, from a displaced handle.
 
     Args:
-        felt: The force on the tool in N for the handle's next position in m.
+        felt: Returns the force on the tool in N for the handle's next position in m.
         hand: Device and hand.
-        ticks: How many; fewer where the force exceeds a million newtons.
+        ticks: Number of ticks; fewer where the force exceeds a million newtons.
 
     Returns:
         The force on the tool in N, one per tick.
@@ -156,7 +156,7 @@ def hold(felt: Callable[[float], float], hand: WorstHand, ticks: int) -> _Array:
 
 
 def decays(force: _Array, ticks: int) -> bool:
-    """Returns whether a run of so many ticks went to its end with a falling force."""
+    """Returns True if a run reached its last tick with a falling force."""
     if force.size < ticks:
         return False
     third = ticks // 3
@@ -167,12 +167,12 @@ def decays(force: _Array, ticks: int) -> bool:
 def limit_of(
     felt: Callable[[], Callable[[float], float]], hand: Callable[[float], WorstHand]
 ) -> float:
-    """Finds the device damping at which a loop begins to be stable.
+    """Finds the smallest device damping at which a loop is stable.
 
     Powers of ten from 1 N s/m on enclose it, so that no bound of the theory enters the search.
 
     Args:
-        felt: Makes a fresh environment.
+        felt: Makes a new environment.
         hand: The worst hand for a device damping in N s/m.
 
     Returns:

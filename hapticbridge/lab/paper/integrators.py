@@ -1,4 +1,4 @@
-"""Equations (11), (13) and (14): what it means that a simulation is passive."""
+"""Equations (11), (13) and (14): passivity of a simulation, and its integrators."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from hapticbridge.theory.transfer import CouplingGrid
 from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 MASS = 0.05
-"""Of the particle in kg."""
+"""Mass of the particle in kg."""
 
 NAMES: dict[Scheme, str] = {
     "explicit": "explicit Euler (17), j = 2",
@@ -44,7 +44,7 @@ _Array = NDArray[np.float64]
 
 
 def _swinging(scheme: Scheme) -> ParticleMotion:
-    """A mass that a sinusoidal force stops and turns 20 times; it starts with 0.3 m/s."""
+    """Inputs of a mass that a sinusoidal force stops and turns 20 times; it starts with 0.3 m/s."""
     turn = 2 * np.pi * 20 * PERIOD
     k = np.arange(round(1 / PERIOD) + 1)
     force = -MASS * 0.3 * turn / PERIOD * np.sin(turn * k)
@@ -52,21 +52,21 @@ def _swinging(scheme: Scheme) -> ParticleMotion:
 
 
 def under_random_force(scheme: Scheme) -> ParticleMotion:
-    """Moves the particle for 2 s under forces of 1 N, one and the same row for every scheme."""
+    """Moves the particle for 2 s under forces of 1 N; every scheme gets equal forces."""
     force = np.random.default_rng(16).normal(size=2001)
     return integrate_particle(MASS, force, PERIOD, scheme, velocity=0.2)
 
 
 def _taken_out(motion: ParticleMotion) -> _Array:
-    """−Σ f_i·(x_i − x_{i−1}) up to every sample."""
+    """Returns −Σ f_i·(x_i − x_{i−1}) up to every sample."""
     return np.asarray(-np.cumsum(motion.force[1:] * np.diff(motion.position)))
 
 
 def discrete_passivity_section() -> Section:
     """Walks through (11), (13) and (14).
 
-    E_k is what a step creates: storage gained beyond the work that the port put in. A discrete-
-    time passive simulation never gives out more than it held at the start.
+    E_k is the energy that a step creates: storage gained beyond the work through the port. A
+    discrete- time passive simulation never gives out more than it held at the start.
 
     Here a mass of {mass:g} kg with 0.3 m/s is stopped and turned 20 times a second by a
     sinusoidal force, so that its whole kinetic energy is asked for again and again.
@@ -155,22 +155,22 @@ def discrete_passivity_section() -> Section:
 
 
 INERTIA = (1.5e-3, 3.63e-3, 4.53e-3)
-"""A box of 15 cm in kg m², turned about its middle axis, which is the unstable one."""
+"""Inertia of a box of 15 cm in kg m²; it turns about its middle axis, which is unstable."""
 
 
 def explicit_euler_section() -> Section:
     """Walks through (17) and (18).
 
-    The position answers a force after two samples. (18) has no sign: whoever chooses the force
-    takes energy out. The implicit midpoint rule, which the paper does not have, neither creates
-    nor loses.
+    The position responds to a force after two samples. (18) has no definite sign: a suitable force
+    extracts energy. The implicit midpoint rule, which the paper does not have, neither creates nor
+    loses.
 
     The same four rules on a body that tumbles freely (no force, T = 1 ms, 10 rad/s about the
     middle axis): explicit rules gain, implicit Euler loses, midpoint keeps energy and momentum.
     """
     motion = under_random_force("explicit")
     v = motion.velocity
-    # v_{k+1} of the last sample is not known
+    # v_{k+1} of the last sample is unknown
     printed = 0.5 * MASS * (v[1:-1] + v[:-2]) ** 2 - MASS * v[:-2] * (v[:-2] + v[2:])
     gains = motion.energy_gain[:-1]
     figure, (particle, body) = panels(1, height=3.8, columns=2)
@@ -287,10 +287,10 @@ def explicit_euler_section() -> Section:
 
 
 IMPLICIT_COUPLING = Coupling(2000.0, 2.0, 0.0, 0.0)
-"""K and B of the runs with MuJoCo."""
+"""Coupling K and B of the runs with MuJoCo."""
 
 SECONDS = 2.0
-"""How long the handle moves."""
+"""Duration in s of the handle's motion."""
 
 
 def implicit_euler_section() -> Section:
@@ -398,9 +398,12 @@ def implicit_euler_section() -> Section:
 
 
 def _applied_force_gains(handle: _Array) -> tuple[float, _Array, _Array]:
-    """Runs the mass under an applied force; Σ E_k of (11), E_k by j = 1's storage, T²f²/(2m)."""
+    """Runs the mass under an applied force; returns Σ E_k of (11) and E_k with j = 1.
+
+    The storage for j = 1 includes T²f²/(2m).
+    """
     mass = AppliedForceMass(IMPLICIT_COUPLING, PERIOD, MASS)
-    # position and velocity at the samples, force at the sample that it was computed from
+    # position and velocity at the samples, force at the sample of its computation
     x, v, f = np.zeros((3, len(handle) + 1))
     for k, target in enumerate(handle, start=1):
         x[k], v[k] = mass.motion
@@ -422,7 +425,7 @@ def draw_least_mass(axes: Axes, stiffness: float, period: float) -> None:
     """Draws the mass that a tool must exceed, over the damper.
 
     Args:
-        axes: Where.
+        axes: Axes to draw into.
         stiffness: K in N/m.
         period: T in s.
     """
@@ -453,7 +456,7 @@ def draw_least_mass(axes: Axes, stiffness: float, period: float) -> None:
 
 
 def least_stable_mass(coupling: Coupling, period: float, integrator: Integrator) -> float:
-    """Finds the mass in kg at which the loop with the handle held still begins to decay."""
+    """Finds the mass in kg above which the loop decays while the handle is held still."""
     samples = 20_000
 
     def does_decay(mass: float) -> bool:
@@ -477,16 +480,16 @@ KEPT: dict[float, tuple[float, float, float]] = {
     0.01: (2.2222, 2.8571, 2.2222),
     0.05: (2.4390, 2.5641, 2.4390),
 }
-"""Damping needed in N s/m for j = 0, 1, 2 by mass in kg, kept to four decimals: a change of the
+"""Required damping in N s/m for j = 0, 1, 2 by mass in kg, kept to four decimals. A change of the
 closed form shows even if the loop changed with it."""
 
 _FOUR_DECIMALS = 4e-5
-"""Relative: what rounding to four decimals leaves of the smallest, 5e-5 of 1.5385, and a little
-more."""
+"""Relative tolerance: slightly above the rounding to four decimals of the smallest, 5e-5 of
+1.5385."""
 
 
 def _swept(mass: float, delay: int) -> float:
-    """The inequality as it stands on the page, at 20 000 angles."""
+    """Evaluates the printed inequality at 20 000 angles."""
     theta = np.linspace(1e-3, np.pi, 20_000)
     sine = np.sin(theta / 2)
     transfer = K + B / PERIOD * (1 - np.exp(-1j * theta))

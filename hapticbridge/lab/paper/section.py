@@ -17,28 +17,28 @@ from hapticbridge.errors import HapticBridgeError
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 
 Relation = Literal["equals", "at most", "at least"]
-"""How the number that was got must stand to the expected one."""
+"""Relation between the number that was got and the expected one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """A number of the paper, got by two routes.
+    """A number of the paper, found by two routes.
 
-    The routes share as little as can be, and ``route`` says what was done. A closed form and its
-    sweep over frequency have only the coupling in common. A time-domain loop takes its worst hand
-    from the theory, and finds the limit itself. Where only a kept value stands against the code,
-    ``route`` says that too.
+    The routes share as little as possible; ``route`` describes both. A closed form and its sweep
+    over frequency have only the coupling in common. A time-domain loop takes its worst hand from
+    the theory, and finds the limit itself. If only a kept value is compared with the code,
+    ``route`` states that.
 
     Attributes:
-        equation: Which equation it belongs to, as the paper numbers it: ``(6)``.
-        quantity: What the number is.
-        route: How ``got`` was found, against how ``expected`` was.
-        expected: What the equation says.
-        got: What the other route says.
+        equation: Number of the equation in the paper: ``(6)``.
+        quantity: Name of the number.
+        route: Origin of ``got``, against that of ``expected``.
+        expected: Value from the equation.
+        got: Value from the other route.
         tolerance: Largest deviation that passes, relative to ``expected``, or in the number's own
             unit where ``expected`` is 0.
-        unit: Of both numbers.
-        relation: ``equals``, or which bound ``expected`` is for ``got``.
+        unit: Unit of both numbers.
+        relation: ``equals``, or the kind of bound that ``expected`` is for ``got``.
     """
 
     equation: str
@@ -52,8 +52,8 @@ class Check:
 
     @property
     def deviation(self) -> float:
-        """How far ``got`` is on the wrong side, relative unless ``expected`` is 0; nan is kept."""
-        if self.got == self.expected:  # two infinities have no difference
+        """Deviation to the wrong side, relative unless ``expected`` is 0; nan is kept."""
+        if self.got == self.expected:  # the difference of two infinities is undefined
             return 0.0
         difference = self.got - self.expected
         if self.relation == "equals":
@@ -66,7 +66,7 @@ class Check:
 
     @property
     def has_passed(self) -> bool:
-        """Whether the deviation is within the tolerance; never for nan."""
+        """True if the deviation is within the tolerance; never for nan."""
         return self.deviation <= self.tolerance
 
 
@@ -76,7 +76,7 @@ class Table:
 
     Attributes:
         head: One heading per column, with unit.
-        rows: Cells as they are shown.
+        rows: Cells as text.
     """
 
     head: tuple[str, ...]
@@ -85,17 +85,18 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """What the page says about one equation, or a few that belong together.
+    """A section of the page: one equation, or a few that belong together.
 
-    Formulas are HTML of the package's own; nothing of a user's may enter them.
+    Formulas are the package's own HTML; text from a user must not enter them.
 
     Attributes:
-        equation: Their numbers in the paper, ``(15), (16)``; empty for what the paper only names.
-        title: What they are about.
+        equation: Their numbers in the paper, ``(15), (16)``; empty for a subject without
+            equation.
+        title: Subject.
         formulas: The equations, one line each.
-        paragraphs: What they mean and how they are checked here.
+        paragraphs: Their meaning, and the method of the check.
         name: Name of the figure's file, without ending.
-        caption: What the figure shows, one or two sentences.
+        caption: Content of the figure, in one or two sentences.
         figure: The drawing.
         checks: Numbers by two routes.
         table: Numbers side by side, if any.
@@ -123,7 +124,7 @@ def panels(rows: int, *, height: float, columns: int = 1) -> tuple[Figure, tuple
 
     Args:
         rows: Panels above each other.
-        height: Of the figure in inches.
+        height: Height of the figure in inches.
         columns: Panels beside each other.
     """
     figure = new_figure(8, height)
@@ -134,7 +135,7 @@ def panels(rows: int, *, height: float, columns: int = 1) -> tuple[Figure, tuple
 
 
 PAGE = "brown_colgate_1997.html"
-"""Name of the page; the figures lie beside it as PNG."""
+"""File name of the page; the figures lie beside it as PNG."""
 
 
 def number(value: float) -> str:
@@ -145,14 +146,14 @@ def number(value: float) -> str:
 
 
 def deviation(check: Check) -> str:
-    """Formats a check's deviation with the tolerance that it is held against."""
+    """Formats a check's deviation and its tolerance."""
     got = f"{check.deviation:.1e}" if check.deviation else "0"
     allowed = f"{check.tolerance:.0e}" if check.tolerance else "0"
     return f"{got} (≤ {allowed})".replace("-", "−")
 
 
 def passed(sections: Sequence[Section]) -> bool:
-    """Returns whether every check passed."""
+    """Returns True if every check passed."""
     return all(check.has_passed for section in sections for check in section.checks)
 
 
@@ -160,8 +161,8 @@ def write_walk(sections: Sequence[Section], folder: Path) -> Path:
     """Writes the page and the figures.
 
     Args:
-        sections: What to write, in the order of the page.
-        folder: Where; it exists.
+        sections: Sections in the order of the page.
+        folder: Existing folder to write into.
 
     Returns:
         The page's path.
@@ -171,7 +172,7 @@ def write_walk(sections: Sequence[Section], folder: Path) -> Path:
     """
     for section in sections:
         write_picture(section.figure, folder / f"{section.name}.png")
-        # the places just found serve the page too; finding them takes half of the drawing
+        # the layout found here serves the page too; finding it takes half of the drawing
         section.figure.set_layout_engine("none")
     environment = Environment(
         loader=PackageLoader("hapticbridge", "templates"), autoescape=select_autoescape()

@@ -15,26 +15,26 @@ from hapticbridge.theory.transmission_line import (
 )
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 IMPEDANCE = 2.0
-"""Z in N s/m: as much as the simulated device's damping."""
+"""Impedance Z in N s/m, equal to the simulated device's damping."""
 BESIDE = 0.5
-"""B in N s/m of the spring and damper that are drawn beside the line."""
+"""Damping B in N s/m of the spring and damper that are drawn beside the line."""
 ROUND_TRIPS = (1, 2, 4)
-"""Samples that a wave takes there and back."""
+"""Numbers of samples that a wave takes there and back."""
 THETA = np.linspace(1e-3, np.pi, 2000)
 SAMPLES = 6000
-"""Length of a run, 6 s: growth shows between its last two thirds."""
+"""Ticks of a run, 6 s: growth shows between its last two thirds."""
 
 DIVERGED = 1e6
-"""Force in N at which a run has grown beyond doubt: a billion times what starts it."""
+"""Force in N at which a run counts as growing: a billion times the initial force."""
 TURN = 2.0
-"""Angle in rad at which the loop is tried; the need is the same at all."""
+"""Angle in rad at which the loop is tried; the requirement is equal at all angles."""
 
 
 def _rings(damping: float, trip: int) -> bool:
-    """Returns whether a line before a wall, held by the worst hand at TURN, grows."""
+    """Returns True if a line before a wall, held by the worst hand at TURN, grows."""
     turn = np.exp(1j * TURN)
     response = 2 * IMPEDANCE / PERIOD * (1 - 1 / turn) * turn ** (1 - trip) / (1 - turn**-trip)
     hand = WorstHand(damping, TURN / PERIOD, PERIOD, complex(response))
@@ -65,7 +65,7 @@ def _samples(count: int) -> str:
 
 
 def _static(trip: int) -> float:
-    """Mean force per displacement of a handle that was pushed once, over whole round trips."""
+    """Returns the mean force per displacement of a handle pushed once, over whole round trips."""
     push = 1e-3
     sent = np.zeros(20 * trip)
     sent[0] = IMPEDANCE * push / PERIOD
@@ -77,7 +77,7 @@ def _static(trip: int) -> float:
 
 
 def _spring_per_damping() -> float:
-    """Stiffness of a spring over the damping at which it is stable, in 1/s."""
+    """Returns the stiffness of a spring over the damping at which it is stable, in 1/s."""
     stiffness = 1000.0
     return stiffness / stability_limit(SampledLoop(Coupling(stiffness, 0, 0, 0), PERIOD))
 

@@ -1,4 +1,4 @@
-"""The walk from the first equation to the last."""
+"""Steps of the walk, from the first equation to the last."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ STEPS: tuple[tuple[str, Callable[[], Section]], ...] = (
     ("the worst hand", coupling.worst_hand_section),
     ("the transmission line", transmission_line.section),
 )
-"""What is computed, in the paper's order, with a name for the progress display. Each step takes
-under 2 s once the kernel is compiled."""
+"""Steps in the paper's order, each with a name for the progress display. A step takes under 2 s
+once the kernel is compiled."""
