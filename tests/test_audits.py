@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib
 import json
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from audit_cases import recorded, rewritten, tapped
 from cli_cases import Called
-from sweep_runs import is_same
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.batch import (
@@ -145,12 +143,6 @@ def test_the_table_is_sorted_by_margin_and_hides_nothing(runs: Path) -> None:
         assert report == alone
 
 
-def test_any_executor_gives_the_same_table(runs: Path) -> None:
-    files = find_recordings([runs])
-    with ThreadPoolExecutor(2) as pool:
-        assert is_same(audit_all(files, executor=pool), audit_all(files, jobs=1))
-
-
 def test_a_worker_that_fails_is_a_row_and_no_end(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,29 +183,6 @@ def test_the_command_prints_a_line_each_and_the_worst_exit_code(
     assert (code, len(json.loads(out)), err.count("error:")) == (2, 5, 1)
     code, _, err = call("audit", runs, "--what-if", "rate=500")
     assert (code, "one recording at a time" in err) == (2, True)
-
-
-def test_ctrl_c_leaves_the_table_of_what_was_judged(
-    runs: Path, call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(path: str, *, strict: bool) -> AuditReport:
-        if path.endswith("stiff.mcap"):  # the last of six
-            raise KeyboardInterrupt
-        return audit(path, strict=strict)
-
-    monkeypatch.setattr(batch, "audit", interrupted)
-    target = tmp_path / "all.json"
-    code, out, err = call("audit", runs, "--jobs", 1, "--table", target)
-    assert code == 130
-    assert "5 recordings: 3 passive, 1 invalid, 1 unreadable" in out
-    assert "incomplete: 1 of 6 recordings were not judged" in err
-    assert err.rstrip().endswith("interrupted")
-    rows = json.loads(target.read_text())
-    assert [Path(row["file"]).name for row in rows[:2]] == ["foreign.mcap", "changed.mcap"]
-    assert len(rows) == 5
-    # before anything was judged there is nothing to tell
-    code, out, err = call("audit", runs / "stiff.mcap", runs / "cut.mcap", "--jobs", 1)
-    assert (code, out, err.strip()) == (130, "", "interrupted")
 
 
 def test_a_table_that_cannot_be_written_is_refused_before_anything_is_audited(

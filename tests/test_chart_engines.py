@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from itertools import count
 
 import numpy as np
 import pytest
-from engine_stand_in import StandIn
+from chart_cases import FakeRun
 from engine_tasks import engine_or_skip
 
 from hapticbridge.errors import StudyError
@@ -24,7 +25,7 @@ from hapticbridge.lab.chart.output import (
     summary_of,
 )
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import PeerWork, Score, Workload
+from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines.base import (
     ENGINES,
     Engine,
@@ -35,6 +36,7 @@ from hapticbridge.lab.engines.base import (
 )
 from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.pose import Vector
 
 GRID, FINE = 4e-3, 1e-3
 
@@ -46,20 +48,44 @@ def workload(name: str) -> Workload:
 
 
 class Altered:
-    """MuJoCo as a peer, with a mistake planted into its task."""
+    """MuJoCo as a peer, with mistakes planted into its task and its steps.
+
+    Args:
+        factor: Of the mass.
+        friction: Factor of the friction.
+        fails_at: Step in which it raises, at the finer timestep only; never, if None.
+        error: What it raises.
+    """
 
     name = "altered"
     version = "0"
     settings: Mapping[str, EngineSetting] = {}
 
-    def __init__(self, factor: float, friction: float = 1.0) -> None:
+    def __init__(
+        self,
+        factor: float = 1.0,
+        friction: float = 1.0,
+        *,
+        fails_at: int | None = None,
+        error: type[Exception] = RuntimeError,
+    ) -> None:
         self._inner, self._factor, self._friction = open_engine("mujoco"), factor, friction
+        self._fails_at, self._error = fails_at, error
 
     def open(self, task: Task, timestep: float) -> Simulation:
         """Opens the task with another mass and another friction."""
         mass, friction = self._factor * task.body.mass, self._friction * task.body.friction
         body = replace(task.body, mass=mass, friction=friction)
-        return self._inner.open(replace(task, body=body), timestep)
+        simulation = self._inner.open(replace(task, body=body), timestep)
+        advance, steps = simulation.advance, count(1)
+
+        def failing(force: Vector, torque: Vector) -> None:
+            if next(steps) == self._fails_at and timestep < GRID:
+                raise self._error("no\nconvergence")
+            advance(force, torque)
+
+        simulation.advance = failing  # type: ignore[method-assign]
+        return simulation
 
 
 def score(engine: Engine, name: str, period: float) -> float:
@@ -94,24 +120,6 @@ def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: s
 
 
 NAN = float("nan")
-
-
-class Rounds:
-    """A run that takes these times."""
-
-    seconds = 1.0
-    chosen: Mapping[str, str | int] = {}
-
-    def __init__(self, *spent: float) -> None:
-        self._spent = iter(spent)
-
-    def go(self) -> float:
-        """Takes the next."""
-        return next(self._spent)
-
-    def scores(self) -> Mapping[str, Score]:
-        """Is not judged."""
-        return {}
 
 
 def test_engine_that_throws_the_tool_away_has_diverged_and_is_timed_as_far_as_it_came() -> None:
@@ -207,10 +215,10 @@ def chart_with(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> Chart:
 def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    engine = StandIn(fails_at=301, fails_below=2 * FINE, error=error)
+    engine = Altered(fails_at=301, error=error)
     chart = chart_with(engine, monkeypatch)
     assert chart.skipped == {}
-    whole, broken = (each for each in chart.measurements if each.setting.engine == "stand_in")
+    whole, broken = (each for each in chart.measurements if each.setting.engine == "altered")
     assert (whole.setting.period, whole.score.verdict, whole.score.reason) == (
         GRID,
         "not metered",
@@ -227,12 +235,12 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
 
 def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
     setting = Setting(METHODS["explicit"], FINE)
-    run = EngineRun(StandIn(), workload("point_mass").peer_work(), setting)
+    run = EngineRun(Altered(), workload("point_mass").peer_work(), setting)
     run.scores()
     assert run.go() > 0
-    run.engine = StandIn(fails_at=10)
+    run.engine = Altered(fails_at=10)
     assert np.isnan(run.go())
-    never, sound, sometimes = Rounds(NAN, NAN, NAN), Rounds(2, 4, 2), Rounds(NAN, 8, 5)
+    never, sound, sometimes = FakeRun(NAN, NAN, NAN), FakeRun(2, 4, 2), FakeRun(NAN, 8, 5)
     lost, kept, some = interleaved_costs([never, sound, sometimes], 1, repeats=3)
     assert np.isnan([lost.median, lost.low, lost.high, lost.ratio]).all()
     assert (kept.median, kept.ratio) == (2, 1)
@@ -242,7 +250,7 @@ def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
 
 def test_point_that_diverged_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     # a mass far below what a held force can carry
-    chart = chart_with(StandIn(1e-3), monkeypatch)
-    found = [each.score for each in chart.measurements if each.setting.engine == "stand_in"]
+    chart = chart_with(Altered(1e-3), monkeypatch)
+    found = [each.score for each in chart.measurements if each.setting.engine == "altered"]
     assert [each.verdict for each in found] == ["diverged", "diverged"]
     assert all(each.reason.startswith("the tool was 10 m away after 0.") for each in found)

@@ -23,18 +23,7 @@ from hapticbridge.lab.engines.base import (
 )
 
 PACKAGE = "hapticbridge.lab.engines."
-LIBRARIES = (
-    "pybullet",
-    "sapien",
-    "pydrake.common.eigen_geometry",
-    "pydrake.geometry",
-    "pydrake.math",
-    "pydrake.multibody.math",
-    "pydrake.multibody.plant",
-    "pydrake.multibody.tree",
-    "pydrake.systems.analysis",
-    "pydrake.systems.framework",
-)
+LIBRARIES = ("pybullet", "sapien")
 SHAPE, HEIGHT = RESTING["box"]
 TASK = Task(
     "rest",
@@ -50,10 +39,6 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, MagicMock]]
     """Stands in for every library, and lets the engines' modules be imported anew with them."""
     mocks = {name: MagicMock(name=name) for name in LIBRARIES}
     for name, mock in mocks.items():
-        parent = name
-        while "." in parent:
-            parent = parent.rpartition(".")[0]
-            monkeypatch.setitem(sys.modules, parent, MagicMock(name=parent))
         monkeypatch.setitem(sys.modules, name, mock)
     pybullet = mocks["pybullet"]
     pybullet.CONSTRAINT_SOLVER_LCP_SI, pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG = 1, 3

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kernel_runs import (
-    DEFAULT,
     FREE_BALL,
     IDENTITY,
     T,
@@ -32,7 +31,6 @@ from kernel_runs import (
 from mujoco.introspect import ast_nodes, structs
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel import mujoco_c as native
 from hapticbridge.kernel.codes import BAD_RESULT, BAD_SAMPLE, OK
@@ -380,19 +378,6 @@ def test_described_layout_is_that_of_the_library() -> None:
     assert (native.floats(force, data.nefc) == data.efc_force).all()
 
 
-def test_contacts_lie_one_described_size_apart() -> None:
-    scene = load_scene("peg_in_hole")
-    motion = np.zeros((600, 3))
-    motion[:, 2], motion[:, 0] = -0.06 * np.arange(600) / 600, 0.002
-    run = live(scene, samples_of(motion))
-    layout, data = native.contact_layout(), run.scene.data
-    assert data.ncon > 1
-    first = native.pointer_at(native.field_address(data, "contact"))
-    for i in range(data.ncon):
-        point = native.floats(first + i * layout["size"] + layout["point"], 3)
-        assert (point == data.contact[i].pos).all()
-
-
 @pytest.mark.parametrize(
     ("kind", "message"),
     [("mjtNum", "lays out mjData differently"), ("mjtNew", "uses a type 'mjtNew'")],
@@ -465,14 +450,3 @@ def test_a_run_starts_from_the_keyframe_with_its_energy_as_the_zero() -> None:
     go_on(run, at_rest(1))
     # the first tick's E is that of one implicit step, not the whole stored energy
     assert abs(run.ticks["environment_energy"][0]) < 0.01 * expected
-
-
-def test_coupling_gains_reach_the_actuators_without_compiling() -> None:
-    scene = load(FREE_BALL)
-    soft = fast(scene, samples_of(sines(100)), Coupling(100, 0.1, 1, 1e-4))
-    model = scene.model
-    hard = fast(scene, samples_of(sines(100)), DEFAULT)
-    assert scene.model is model
-    error = [np.abs(r.ticks["handle_position"] - r.ticks["tool_position"]) for r in (soft, hard)]
-    assert error[0].max() > 3 * error[1].max()
-    assert hard.parameters.period == T

@@ -28,7 +28,6 @@ from hapticbridge.lab.maps.contact_rigs import (
     PERIOD,
     SHIPPED,
     TREATMENTS,
-    ContactRun,
     Treatment,
     peg_device,
     peg_runs,
@@ -169,10 +168,6 @@ def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() 
     assert abs(felt.slack_share / lossless.slack_share - 1) > 0.02
 
 
-def of(environment: str, depth: float, *, created: float = 0.0, first: int = -1) -> ContactRun:
-    return ContactRun(environment, created, 10 * created, first, 1e3 * depth, depth)
-
-
 def test_a_mass_set_before_leaves_no_trace_in_a_run() -> None:
     (alone,) = peg_runs(Treatment(), 1000.0, LIGHT)
     list(peg_runs(Treatment(), 1000.0, [(0.1, 0.0, 1), (0.37, 0.0, 1)]))
@@ -186,7 +181,6 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     def few(treatment: Treatment, stiffness: float, *_: Any) -> Any:
         return peg_runs(treatment, stiffness, LIGHT)
 
-    monkeypatch.setattr(contact, "peg_runs", few)
     monkeypatch.setattr(contact, "peg_runs", few)
     names = (SHIPPED, "damped: 0.0005 8")
     monkeypatch.setattr(contact, "HANDS", 1)

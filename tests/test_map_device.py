@@ -8,10 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_tables import Row
 
-from hapticbridge.coupling import Coupling
-from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps.base import Point, run_map
 from hapticbridge.lab.maps.device import DAMPERS as DAMPING
@@ -23,14 +20,11 @@ from hapticbridge.lab.maps.device import (
     QUANTUM,
     RESOLUTION,
     STIFFNESS,
-    friction_needed,
     friction_to_rest,
     region_of,
     settle,
     shaken,
 )
-from hapticbridge.lab.methods import METHODS
-from hapticbridge.theory.device_limits import quantization_limit
 
 
 @pytest.mark.parametrize(
@@ -100,16 +94,6 @@ def test_a_shaken_device_needs_the_friction_of_abbott_and_okamura(
     assert shaken(name, damping) == pytest.approx(needed, rel=1e-6)
 
 
-def test_the_friction_of_a_method_is_that_of_the_law_it_uses() -> None:
-    damping = np.array([0.0, 0.7, 1.4, 3.0])
-    device = SimulatedDevice(damping=5.0, friction=1.0, resolution=RESOLUTION).info
-    for name in METHODS_SHOWN:
-        for b, needed in zip(damping, friction_needed(name, damping), strict=True):
-            used = METHODS[name].used(Coupling(STIFFNESS, float(b), 0.0, 0.0), PERIOD)
-            told = quantization_limit(device, used, PERIOD).friction_needed
-            assert needed == pytest.approx(told / QUANTUM)
-
-
 @pytest.mark.parametrize("name", METHODS_SHOWN)
 def test_a_pressed_device_rests_from_half_a_step_of_force_on(name: str) -> None:
     assert settle(1.0, 0.48, 0.0, 0.0, name)[0] == "cycle"
@@ -146,37 +130,6 @@ def test_without_a_damper_the_methods_have_one_law_and_their_runs_are_one(
 )
 def test_regions_follow_from_what_the_runs_did(small: str, large: str, region: str) -> None:
     assert region_of(small, large) == region
-
-
-def cell(beta: float, sigma: float, small: str, large: str, size: float) -> Row:
-    point: Point = {"what": "cell", "method": "implicit", "beta": beta, "sigma": sigma}
-    return point | {"damping": 0.0}, {
-        "small": small,
-        "large": large,
-        "region": region_of(small, large),
-        "cycle": size,
-        "last_range": 0.0,
-        "ticks": 6000,
-        "device_energy": 0.0,
-    }
-
-
-def damper(
-    damping: float, needed_shaken: float, needed_at_rest: float, name: str = "implicit"
-) -> Row:
-    point: Point = {"what": "friction", "method": name, "beta": 0.0, "sigma": 0.0}
-    return point | {"damping": damping}, {
-        "needed_shaken": needed_shaken,
-        "needed_at_rest": needed_at_rest,
-    }
-
-
-DAMPERS = [
-    damper(0.0, 0.5, 0.4),  # theory: 0.5
-    damper(1.0, 1.1, 0.6),  # theory: 1
-    damper(1.0, 0.5, 0.45, "lossless"),  # theory: 0.5
-    damper(2.0, 1.3, 0.7, "lossless"),  # theory: 1
-]
 
 
 def few(count: int) -> list[Point]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from map_tables import Row
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.lab.closed_loop import PARTS, Timing
@@ -96,13 +95,6 @@ def test_what_is_taken_off_the_damper_leaves_a_limit_at_low_frequency(
     assert wall_limit(name, 1e-3, delay) * 1e-3 == pytest.approx(slow, rel=1e-4)
 
 
-def test_without_delay_what_takes_its_lag_off_bears_twice_what_implicit_does() -> None:
-    # at K = 2b/T nothing is left of B', and (6) is b = K T/2
-    for name, of_most in (("implicit", 0.5), ("compensated", 1.0), ("lossless", 1.0)):
-        limit = wall_limit(name, 2e-3, 0)
-        assert limit == pytest.approx(of_most * 2 * DEVICE_DAMPING / 2e-3, rel=1e-4)
-
-
 def test_a_search_finds_the_bound() -> None:
     for name, delay in (("implicit", 2), ("compensated", 1), ("lossless", 0)):
         found = evaluate(point(name, 1e-3, delay))
@@ -165,16 +157,6 @@ def wall() -> Scene:
     set_tool_mass(scene.model, "tool", WALL_MASS)
     mujoco.mj_setConst(scene.model, scene.data)
     return scene
-
-
-def even(period: float, delay: int, limit: float, name: str = "implicit") -> Row:
-    return point(name, period, delay), {"limit": limit} | unevenness([period])
-
-
-def uneven(what: str, hand: str, share: float, limit: float) -> Row:
-    at: Point = {"what": what, "method": "implicit", "hand": hand, "period": UNEVEN_PERIOD}
-    told = {"mean": 1e-3, "balanced": (1 + share) * 1e-3, "longest": 4e-3}
-    return at | {"delay": 0, "share": share}, {"limit": limit} | told
 
     # K T/(2b): 0.55 and 1.1, their mean; theory at a delay of 5 is 0.526
 

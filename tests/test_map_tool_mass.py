@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_tables import Row
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
@@ -166,18 +165,6 @@ def test_where_no_mass_is_stable_theory_has_no_limit() -> None:
     assert np.isnan(nowhere["limit"])
 
 
-def cell(name: str, stiffness: float, *, held: bool, worst: bool, created: float = 0.0) -> Row:
-    point: Point = {"what": "cell", "method": name, "stiffness": stiffness, "mass": 0.01}
-    return point, {
-        "stable_held_still": held,
-        "stable_worst_hand": worst,
-        "environment": "strict",
-        "created": created,
-        "slack_share": 0.0,
-        "first_active": -1,
-    }
-
-
 def few(count: int) -> list[Point]:
     """Returns the whole grid, and of the searches one method's behind a handle held still."""
     return [
@@ -198,8 +185,6 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     assert methods["explicit"]["unstable_held_still"] > 0
 
 
-def test_bad_values_are_refused() -> None:
+def test_a_method_without_theory_is_refused() -> None:
     with pytest.raises(StudyError, match="no theory for method 'weld'"):
         least_mass("weld", 1000.0, 1.0, 1e-3)
-    with pytest.raises(StudyError, match="mass is nan kg"):
-        worst_angle("explicit", 1000.0, 1.0, float("nan"), 1e-3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import runpy
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from hapticbridge.lab.paper.walk import STEPS
 from hapticbridge.theory.sampled_loop import stability_limit
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"
+Change: TypeAlias = Callable[[Any], Any]
 EQUATIONS = (1, 2, 4, 5, 6, 7, 11, 13, 14, 15, 16, 17, 18, 19)
 
 
@@ -55,70 +56,40 @@ def test_page_walks_through_every_equation_with_its_picture(walk: tuple[int, Pat
     assert len(list(walk[1].glob("*.png"))) == len(STEPS)
 
 
-def scaled(function: Callable[..., Any], factor: float) -> Callable[..., Any]:
-    return lambda *arguments, **options: factor * np.asarray(function(*arguments, **options))
+def scaled(factor: float) -> Change:
+    return lambda function: lambda *given, **named: factor * np.asarray(function(*given, **named))
 
 
-def with_scheme(function: Callable[..., Any], scheme: str) -> Callable[..., Any]:
-    return lambda mass, force, period, _, **options: function(
-        mass, force, period, scheme, **options
+def heavier(factor: float) -> Change:
+    return lambda function: lambda mass, *given, **named: function(factor * mass, *given, **named)
+
+
+def explicit(function: Any) -> Any:
+    return lambda mass, force, period, _, **named: function(
+        mass, force, period, "explicit", **named
     )
-
-
-def heavier(function: Callable[..., Any], factor: float) -> Callable[..., Any]:
-    return lambda mass, *arguments, **options: function(factor * mass, *arguments, **options)
 
 
 @pytest.mark.parametrize(
     ("module", "section", "name", "broken", "equation"),
     [
-        (coupling, "direct_section", "maximum_stiffness", lambda f: scaled(f, 1.001), "(1)"),
-        (coupling, "backward_difference", "damping_spectrum", lambda f: scaled(f, 1 + 1e-8), "(6)"),
-        (coupling, "backward_difference", "wall_limit", lambda f: scaled(f, 1.003), "(6)"),
-        (
-            integrators,
-            "discrete_passivity_section",
-            "integrate_particle",
-            lambda f: with_scheme(f, "explicit"),
-            "(13)",
-        ),
-        (
-            integrators,
-            "implicit_euler_section",
-            "integrate_particle",
-            lambda f: heavier(f, 1.01),
-            "(16)",
-        ),
-        (
-            integrators,
-            "explicit_euler_section",
-            "integrate_particle",
-            lambda f: heavier(f, 1.01),
-            "(18)",
-        ),
-        (integrators, "virtual_mass_section", "_in_mujoco", lambda f: scaled(f, 1.003), "(19)"),
+        (coupling, "direct_section", "maximum_stiffness", scaled(1.001), "(1)"),
+        (coupling, "backward_difference", "damping_spectrum", scaled(1 + 1e-8), "(6)"),
+        (coupling, "backward_difference", "wall_limit", scaled(1.003), "(6)"),
+        (integrators, "discrete_passivity_section", "integrate_particle", explicit, "(13)"),
+        (integrators, "implicit_euler_section", "integrate_particle", heavier(1.01), "(16)"),
+        (integrators, "explicit_euler_section", "integrate_particle", heavier(1.01), "(18)"),
+        (integrators, "virtual_mass_section", "_in_mujoco", scaled(1.003), "(19)"),
         (
             integrators,
             "virtual_mass_section",
             "environment_minimum_damping",
-            lambda f: scaled(f, 1.0001),
+            scaled(1.0001),
             "(19)",
         ),
         (impact, "section", "RESTITUTION", lambda e: e + 1e-6, "§4"),
-        (
-            coupling,
-            "worst_hand_section",
-            "minimum_damping",
-            lambda f: scaled(f, 1.002),
-            "worst hand",
-        ),
-        (
-            transmission_line,
-            "section",
-            "transmission_line_stiffness",
-            lambda f: scaled(f, 1.001),
-            "future",
-        ),
+        (coupling, "worst_hand_section", "minimum_damping", scaled(1.002), "worst hand"),
+        (transmission_line, "section", "transmission_line_stiffness", scaled(1.001), "future"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -126,7 +97,7 @@ def test_a_wrong_number_is_reported(
     module: Any,
     section: str,
     name: str,
-    broken: Callable[[Any], Any],
+    broken: Change,
     equation: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -141,7 +112,7 @@ def test_a_wrong_number_is_reported(
 def test_script_fails_and_names_what_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(coupling, "stability_limit", scaled(stability_limit, 1.01))
+    monkeypatch.setattr(coupling, "stability_limit", scaled(1.01)(stability_limit))
     names = script()
     monkeypatch.setitem(names["computed"].__globals__, "STEPS", (STEPS[0],))
     assert names["main"]([str(tmp_path)]) == 1

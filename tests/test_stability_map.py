@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from map_tables import without_rows, written
 from matplotlib.figure import Figure
 
 from hapticbridge.cli import main
@@ -26,7 +25,7 @@ from hapticbridge.lab.maps.base import (
     verdict_numbers,
 )
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep.results import Outcome, Table, table_of
 
 calls: list[Point] = []
 
@@ -117,20 +116,8 @@ def test_a_file_that_cannot_be_written_is_noticed_before_the_sweep(tmp_path: Pat
     assert not (tmp_path / "squares.csv").exists()
 
 
-def unknown_numbers(_table: Table) -> Mapping[str, Any]:
-    return {"a": [float("nan"), 1.0], "b": {"c": float("inf")}}
-
-
 def fail_to_read(_table: Table) -> Mapping[str, Any]:
     raise ZeroDivisionError
-
-
-def test_json_has_none_for_what_is_no_number(tmp_path: Path) -> None:
-    unknown = replace(SQUARES, name="unknown", summarize=unknown_numbers)
-    with ThreadPoolExecutor(1) as pool:
-        files = run_map(unknown, tmp_path, executor=pool)
-    said = json.loads(files.boundary.read_text(encoding="utf-8"))
-    assert said["boundary"] == {"a": [None, 1.0], "b": {"c": None}}
 
 
 def test_the_table_is_kept_even_if_reading_it_fails(tmp_path: Path) -> None:
@@ -168,8 +155,9 @@ def test_command_lists_the_maps_for_an_unknown_name(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize("name", MAPS)
 def test_a_table_without_a_computed_row_is_refused(name: str) -> None:
-    failed = [(point, "SceneError: no") for point in MAPS[name].points(4)]
+    given = MAPS[name].points(4)
+    table = table_of(given, [Outcome({}, "SceneError: no") for _ in given])
     with pytest.raises(StudyError, match="no point could be computed; first: SceneError: no"):
-        MAPS[name].read(written(failed))
+        MAPS[name].read(table)
     with pytest.raises(StudyError, match=f"map '{name}': the table has no rows"):
-        MAPS[name].read(without_rows(written(failed)))
+        MAPS[name].read(table.select(table.failed & ~table.failed))

@@ -10,6 +10,8 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,14 +21,38 @@ import pytest
 import sweep_functions as functions
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from sweep_runs import POINTS, computed, is_same, kept, serial
 
 from hapticbridge.errors import StudyError
 from hapticbridge.signals import holding_interrupts
-from hapticbridge.sweep import Interrupted, grid, sweep
+from hapticbridge.sweep import Interrupted, Table, grid, sweep
 from hapticbridge.sweep.points import plain, point_key
 from hapticbridge.sweep.results import Outcome, ResultFile
 from hapticbridge.sweep.sweep import WORKER_DIED, cores
+
+POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
+
+
+def computed(scratch: Path) -> Counter[int]:
+    return Counter(map(int, (scratch / "computed").read_text().split()))
+
+
+def serial(function: Callable[[Any], Any] = functions.bound, points: Any = POINTS) -> Table:
+    return sweep(function, points, jobs=1)
+
+
+def kept(path: Path) -> list[str]:
+    """Returns the lines of a file of results below the first."""
+    return path.read_text().splitlines()[1:]
+
+
+def is_same(first: Table, second: Table) -> bool:
+    """Tells whether two tables have the same columns, types and bits."""
+    return list(first.columns) == list(second.columns) and all(
+        column.dtype == other.dtype
+        and (column.tolist() if column.dtype == object else column.tobytes())
+        == (other.tolist() if other.dtype == object else other.tobytes())
+        for column, other in zip(first.columns.values(), second.columns.values(), strict=True)
+    )
 
 
 def test_the_table_holds_what_a_plain_loop_gives() -> None:
@@ -141,7 +167,7 @@ VALUES = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(values=st.lists(st.tuples(VALUES, VALUES), min_size=1, max_size=5))
 @example(values=[("", "\n"), ("a\rb", "x"), (-0.0, 5e-324), (True, "True"), (1, 1.0)])
 def test_every_value_comes_back_from_the_file_with_its_bits(
