@@ -183,10 +183,6 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
             assert mine["worst_ratio_error"] < 2e-3
             assert mine["slope"] == pytest.approx(-1, abs=0.01)
     titles = [axes.get_title() for axes in files.finding.figure.axes[:3]]
-    assert titles == [
-        "implicit, B′ = B",
-        "compensated, B′ = B − K T",
-        "lossless, B′ = B − K T/2",
-    ]
+    assert titles == ["implicit, B′ = B", "compensated, B′ = B − K T", "lossless, B′ = B − K T/2"]
     free = files.finding.boundary["uneven"]["drops"]["no hand"]
     assert free["at_longest"][-1] < free["measured"][-1] < free["at_mean"][-1]
