@@ -43,9 +43,11 @@ def test_no_docstring_comment_or_message_speaks_of_nobody() -> None:
     offences = []
     for path in SOURCES:
         with tokenize.open(path) as file:
-            for token in tokenize.generate_tokens(file.readline):
-                if token.type in TEXTS and NOBODIES.search(token.string):
-                    offences.append(f"{path.relative_to(ROOT)}:{token.start[0]}: {token.line.strip()}")
+            offences += [
+                f"{path.relative_to(ROOT)}:{token.start[0]}: {token.line.strip()}"
+                for token in tokenize.generate_tokens(file.readline)
+                if token.type in TEXTS and NOBODIES.search(token.string)
+            ]
     assert not offences
 
 
