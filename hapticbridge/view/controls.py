@@ -278,14 +278,14 @@ class Controls:
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)
         self._bounds.content = self._ends()
-        told = "; ".join(
+        text = "; ".join(
             f"{symbol[0]} goes to {pair[0]:.4g} {unit[0]}, {symbol[1]} to {pair[1]:.3g} {unit[1]}"
             for symbol, unit, pair in (
                 (SYMBOLS[sliders.span.axis], UNITS[sliders.span.axis], pair)
                 for sliders, pair in zip(self._sliders, self._gains, strict=True)
             )
         )
-        self._say("answer", told)
+        self._say("answer", text)
 
     def _refuse(self, reason: str) -> None:
         """Shows the reason of a refusal, and sets the controls back to the state of the run."""

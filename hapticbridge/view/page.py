@@ -281,7 +281,7 @@ class Page:
         self._ghost = Ghost(server.scene, model, parameters.grip)
         server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
         self.status = server.gui.add_markdown("waiting for the first tick")
-        self._told = _told(model, parameters, facts)
+        self._caption = _caption(model, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []
 
     def add_curves(self) -> None:
@@ -308,7 +308,7 @@ class Page:
                     legend={"show": len(names) > 1},
                 )
             )
-        gui.add_markdown(self._told)
+        gui.add_markdown(self._caption)
 
     def allow(self, sights: Sequence[Sight]) -> None:
         """Enlarges the scales for known later values."""
@@ -422,7 +422,7 @@ def _strongest(sight: Sight) -> float:
     return float(max(np.linalg.norm(sight.force), contacts.max(initial=0.0)))
 
 
-def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
+def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
     method = method_named(facts.get("method", ""))
     sentences = coupling_sentences(
         parameters.coupling,

@@ -119,7 +119,7 @@ def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) 
     inbox.put(None)
 
 
-def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
+def _read_job(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
     job = json.loads(stream.readline())
     files = {name: stream.read(size) for name, size in job["attachments"]}
     run = run_of(job["metadata"], files)
@@ -176,14 +176,14 @@ def run() -> None:
     # keeps viser's prints out of the answers to the bridge
     answers, sys.stdout = sys.stdout, sys.stderr
     stream = sys.stdin.buffer
-    job, told = _told(stream)
+    job, run = _read_job(stream)
     try:
-        live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], told)
+        live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], run)
         address = Address(job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
-        page = Page(server, live.model, live.parameters, dict(told.meta), live.reference)
-        controls = Controls(server, allowance_of(told.meta), outlet.ask)
+        page = Page(server, live.model, live.parameters, dict(run.meta), live.reference)
+        controls = Controls(server, allowance_of(run.meta), outlet.ask)
         page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)

@@ -92,7 +92,7 @@ class EngineRun:
 
         Method and integrator of the bridge do not apply to other engines.
         """
-        told = "; ".join(
+        text = "; ".join(
             f"{name}: {setting.value} ({setting.source})"
             for name, setting in self.engine.settings.items()
         )
@@ -104,7 +104,7 @@ class EngineRun:
             "solimp": "",
             "cone": "",
             "solver_iterations": "",
-            "engine_settings": f"{self.engine.name} {self.engine.version}; {told}",
+            "engine_settings": f"{self.engine.name} {self.engine.version}; {text}",
         }
 
     def go(self) -> float:

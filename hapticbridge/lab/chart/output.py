@@ -238,11 +238,11 @@ def draw_chart(chart: Chart) -> Figure:
 def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any]) -> None:
     points, orders = chart.of(panel), chart.orders(panel)
     for name, colour in colours.items():
-        mine = [each for each in points if who(each.setting) == name]
-        if not mine:
+        selected = [each for each in points if who(each.setting) == name]
+        if not selected:
             continue
-        axes.plot([], [], "-", color=colour, lw=2, label=_named(name, mine, orders.get(name)))
-        line = [each for each in mine if each.is_usual]
+        axes.plot([], [], "-", color=colour, lw=2, label=_named(name, selected, orders.get(name)))
+        line = [each for each in selected if each.is_usual]
         axes.plot(
             [drawn_cost(each, points) for each in line],
             [drawn_error(each) for each in line],
@@ -251,7 +251,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
             lw=0.8,
             alpha=0.6,
         )
-        for each in mine:
+        for each in selected:
             _draw_point(axes, each, drawn_cost(each, points), colour)
     _draw_front(axes, chart.front(panel))
     best = recommended(points)
@@ -278,24 +278,24 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
     axes.set_title(title, fontsize="small", parse_math=False)
     axes.grid(visible=True, which="major", alpha=0.3)
     if not all(each.is_usual for each in points):
-        told = "small: substeps, contacts, solver"
-        axes.plot([], [], "o", color="grey", ms=3.5, label=told)
+        label = "small: substeps, contacts, solver"
+        axes.plot([], [], "o", color="grey", ms=3.5, label=label)
     for verdict in dict.fromkeys(each.score.verdict for each in points):
-        mark, is_filled, told = MARKS[verdict]
+        mark, is_filled, label = MARKS[verdict]
         axes.plot(
-            [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=told
+            [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=label
         )
-    for told in _explained(points, orders.values()):
-        axes.plot([], [], " ", label=told)
+    for label in _explained(points, orders.values()):
+        axes.plot([], [], " ", label=label)
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _named(name: str, points: Sequence[Measurement], order: Order | None) -> str:
     """Returns a method's legend: its order, and its limit if that differs."""
-    told = [] if order is None else [order.words]
+    remarks = [] if order is None else [order.words]
     if not all(each.is_comparable for each in points):
-        told.append(f"limit {points[0].limit_apart:.2g} off")
-    return f"{name} ({', '.join(told)})" if told else name
+        remarks.append(f"limit {points[0].limit_apart:.2g} off")
+    return f"{name} ({', '.join(remarks)})" if remarks else name
 
 
 def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list[str]:

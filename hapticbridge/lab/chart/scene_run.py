@@ -438,12 +438,12 @@ class SceneMotion(Staged):
         )
         self._limits = OwnReferences(stages, grid, finest, duration, refinement)
         super().__init__(coupling, stages, self._limits)
-        told = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
-        self.about = f"the scene's own hand path, {duration:g} s of it{told}"
+        pace = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
+        self.about = f"the scene's own hand path, {duration:g} s of it{pace}"
         self.panels: Sequence[Panel] = (
             Panel(
                 "moving",
-                f"{self.name} along its hand path{told}",
+                f"{self.name} along its hand path{pace}",
                 f"the same method at a step {refinement} times smaller than the smallest: "
                 "convergence, not truth",
                 is_truth=False,

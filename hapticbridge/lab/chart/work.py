@@ -503,9 +503,9 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
         points = chart.of(family, variant)
         sizes = [each.size for each in points]
         growth = chart.growth(family, variant)
-        told = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
+        text = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
         axes.plot(
-            sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=told
+            sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=text
         )
         axes.plot(sizes, [1e6 * p.time.p99 for p in points], ":", color=colour, lw=1)
     axes.plot([], [], ":", color="grey", label="99th percentile")
