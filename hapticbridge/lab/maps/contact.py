@@ -59,12 +59,12 @@ def verdicts(table: Table) -> NDArray[np.int64]:
 
 def agreement(table: Table) -> dict[str, Any]:
     """Compares the rule with the measurement on the peg's grid, in counts."""
-    mine = table.select(table["rig"] == "peg")
+    selected = table.select(table["rig"] == "peg")
     numbers = [
         contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD)
-        for s, d in zip(mine["steps"], mine["dampratio"], strict=True)
+        for s, d in zip(selected["steps"], selected["dampratio"], strict=True)
     ]
-    measured = verdicts(mine)
+    measured = verdicts(selected)
     regions = {
         name: np.array([is_in(name, n) for n in numbers], dtype=bool)
         for name in ("strict", "relaxed", "abrupt")
@@ -85,8 +85,10 @@ def exceptions(table: Table) -> list[dict[str, Any]]:
     """Returns the search results worse than the rule, by treatment and tool mass in kg."""
     found = []
     for name, treatment in TREATMENTS.items():
-        mine = table.select(table["treatment"] == name)
-        for mass, verdict in zip(mine["mass"].tolist(), verdicts(mine).tolist(), strict=True):
+        selected = table.select(table["treatment"] == name)
+        for mass, verdict in zip(
+            selected["mass"].tolist(), verdicts(selected).tolist(), strict=True
+        ):
             numbers = treatment.numbers
             grade = numbers.grade if mass >= HEAVY else numbers.light_grade
             if treatment.is_ruled and verdict > base.VERDICTS.index(grade):
@@ -130,14 +132,14 @@ def search(name: str, mass: float) -> dict[str, float | int]:
     )
 
 
-def totals(mine: Table) -> dict[str, Any]:
+def totals(selected: Table) -> dict[str, Any]:
     """Sums runs by verdict, with the largest of the other quantities and the median depth."""
     counts = ("runs", "strict", "within_slack", "active")
     worst = ("created", "slack_share", "peak_force", "largest_depth")
     return {
-        **{name: int(mine[name].sum()) for name in counts},
-        **{name: float(mine[name].max()) for name in worst},
-        "median_depth": float(np.median(mine["median_depth"])),
+        **{name: int(selected[name].sum()) for name in counts},
+        **{name: float(selected[name].max()) for name in worst},
+        "median_depth": float(np.median(selected["median_depth"])),
     }
 
 
@@ -242,9 +244,9 @@ def methods_found(table: Table) -> list[dict[str, Any]]:
     """Returns the totals of each method on each rig over all tools."""
     found = []
     for rig, method in itertools.product(RIGS, COMPARED):
-        mine = table.select((table["rig"] == rig) & (table["method"] == method))
-        if len(mine):
-            found.append({"rig": rig, "method": method, **totals(mine)})
+        selected = table.select((table["rig"] == rig) & (table["method"] == method))
+        if len(selected):
+            found.append({"rig": rig, "method": method, **totals(selected)})
     return found
 
 
@@ -316,10 +318,10 @@ def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
 
 
 def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: float) -> None:
-    is_mine = (table["rig"] == rig) & (table["method"] == method)
-    mine = table.select(is_mine & (table["stiffness"] == stiffness))
+    is_selected = (table["rig"] == rig) & (table["method"] == method)
+    selected = table.select(is_selected & (table["stiffness"] == stiffness))
     base.draw_verdicts(
-        axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True
+        axes, selected["steps"], selected["dampratio"], verdicts(selected), log_x=True, log_y=True
     )
     steps, ratio, regions = _rule()
     for (_, style, _), is_above in zip(LINES, regions, strict=True):

@@ -269,8 +269,8 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
 
 def _first_alike(name: str) -> str:
     """Returns the first method with an equal bound of the free tool, computed once."""
-    mine = THEORIES[name], METHODS[name].lag
-    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == mine)
+    selected = THEORIES[name], METHODS[name].lag
+    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == selected)
 
 
 @cache
@@ -300,16 +300,16 @@ def _cells_below(name: str, cells: Table) -> dict[str, Any]:
     """Counts the outcomes at a method's points below (6), where a device bears the coupling."""
     needed = base.needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
     below = needed < DEVICE_DAMPING
-    mine = cells.select(below)
-    is_passive = verdicts_of(mine) <= base.VERDICTS.index("within slack")
-    ports = mine.texts("fault_port")
+    selected = cells.select(below)
+    is_passive = verdicts_of(selected) <= base.VERDICTS.index("within slack")
+    ports = selected.texts("fault_port")
     return {
-        "passive_share_below_6": float(np.mean(is_passive)) if len(mine) else None,
-        "runs_below_6": len(mine),
+        "passive_share_below_6": float(np.mean(is_passive)) if len(selected) else None,
+        "runs_below_6": len(selected),
         "environment_faults_below_6": int((ports == "environment").sum()),
         "device_faults_below_6": int((ports == "device").sum()),
-        "most_slack_used_below_6": float(mine.numbers("slack_share").max(initial=0.0)),
-        "largest_tapping_force_below_6": float(mine.numbers("peak_force").max(initial=0.0)),
+        "most_slack_used_below_6": float(selected.numbers("slack_share").max(initial=0.0)),
+        "largest_tapping_force_below_6": float(selected.numbers("peak_force").max(initial=0.0)),
     }
 
 
@@ -335,13 +335,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "K = 2 (b − B)/T, eq. (6)",
         methods["implicit"],
     )
-    for name, mine in methods.items():
+    for name, selected in methods.items():
         yield (
             "'{name}' is stable and passive at {passive_share_below_6:.0%} of the {runs_below_6} "
             "points below (6); the hand that taps finds the environment at fault at "
             "{environment_faults_below_6}, the device at {device_faults_below_6}, and at most "
             "{most_slack_used_below_6:.0%} of the slack used",
-            mine | {"name": name},
+            selected | {"name": name},
         )
     yield (
         "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "

@@ -332,21 +332,21 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
         if name in found:
-            mine, colour = found[name], base.METHOD_COLOURS[name]
+            selected, colour = found[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
-                mine["damping"],
-                mine["predicted"],
+                selected["damping"],
+                selected["predicted"],
                 color=colour,
                 lw=size / 3,
                 label=f"{name}: {base.law_in_words(name)}",
             )
             for what, marker in MARKERS.items():
-                axes.plot(mine["damping"], mine[what], marker, **style)
+                axes.plot(selected["damping"], selected[what], marker, **style)
     for what, marker in MARKERS.items():
         axes.plot([], [], marker, color="black", mfc="white", label=f"measured: {WORDS[what]}")
     # room above for the names
-    axes.set_ylim(0, 1.75 * max(max(mine["predicted"]) for mine in found.values()))
+    axes.set_ylim(0, 1.75 * max(max(selected["predicted"]) for selected in found.values()))
     lines = Line2D([], [], ls="", label="lines: f_c = K Δ/2 + B′ Δ/T")
     axes.legend(
         handles=[lines, *axes.get_legend_handles_labels()[0]], fontsize="small", loc="upper left"
@@ -409,7 +409,9 @@ def summarize(table: Table) -> dict[str, Any]:
         "stiffness": STIFFNESS,
         "resolution": RESOLUTION,
         "regions": _regions(cells) if len(cells) else {},
-        "friction": {name: _friction(name, mine) for name, mine in dampers.items() if len(mine)},
+        "friction": {
+            name: _friction(name, selected) for name, selected in dampers.items() if len(selected)
+        },
     }
 
 
@@ -453,11 +455,11 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "one {median_cycle_steps:.0f}",
         regions,
     )
-    for name, mine in boundary["friction"].items():
+    for name, selected in boundary["friction"].items():
         yield (
             "Shaken across one encoder step, '{name}' needs f_c = K Δ/2 + B′ Δ/T within "
             "{worst_ratio_error:.2%}",
-            mine | {"name": name},
+            selected | {"name": name},
         )
 
 

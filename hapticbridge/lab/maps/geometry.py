@@ -260,16 +260,16 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, METHODS_SHOWN, strict=True):
         _draw_cells(axes, table, name)
-        mine = base.of_method(table, "limit", name)
+        selected = base.of_method(table, "limit", name)
         if name == "direct":
             lengths = np.geomspace(*LENGTH, 100)
             axes.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
-            x, y = mine.numbers("limit"), mine["stiffness"]
+            x, y = selected.numbers("limit"), selected["stiffness"]
             axes.set_title("direct: no coupling", fontsize="medium")
             axes.set(ylabel="contact stiffness K_c (N/m)", ylim=CONTACT_STIFFNESS)
         else:
             axes.axhline(BOUNDS[name], color=base.THEORY_COLOUR, lw=1.8, ls="--")
-            x, y = mine["length"], mine.numbers("limit")
+            x, y = selected["length"], selected.numbers("limit")
             axes.set_title(f"{name}, {base.law_in_words(name, '_r')}", fontsize="medium")
             axes.set(ylabel="coupling stiffness K_r (N m/rad)", ylim=ROTATIONAL_STIFFNESS)
         axes.plot(1e3 * x, y, "o", color="black", ms=4, mfc="white")

@@ -301,10 +301,10 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
     # one hue, lighter with delay: a delay is a quantity, and verdicts have the other colours
     shade = matplotlib.colormaps["Blues_r"]
     axes.set(xscale="log", yscale="log")
-    for delay, mine in by_delay.items():
-        colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
-        axes.plot(period, mine["predicted"], color=colour, label=delay)
-        axes.plot(period, _drawable(mine["measured"]), "o", color=colour, mfc="white", ms=5)
+    for delay, selected in by_delay.items():
+        colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(selected["period"])
+        axes.plot(period, selected["predicted"], color=colour, label=delay)
+        axes.plot(period, _drawable(selected["measured"]), "o", color=colour, mfc="white", ms=5)
     if by_delay:
         axes.legend(
             title="bound, delay in samples",
@@ -328,10 +328,10 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
 
 def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
     axes.set_yscale("log")
-    for name, mine in found.items():
+    for name, selected in found.items():
         axes.plot(
-            mine["share"],
-            _drawable(mine["measured"]),
+            selected["share"],
+            _drawable(selected["measured"]),
             MARKERS[name],
             color="black",
             mfc="white",
@@ -371,8 +371,8 @@ def _by_delay(name: str, table: Table) -> dict[str, Any]:
     rows = base.of_method(table, "delay", name)
     found: dict[str, Any] = {}
     for delay in np.unique(rows["delay"]):
-        mine = rows.select(rows["delay"] == delay)
-        period, limit = mine["period"], mine.numbers("limit")
+        selected = rows.select(rows["delay"] == delay)
+        period, limit = selected["period"], selected.numbers("limit")
         predicted = np.array([wall_limit(name, float(t), int(delay)) for t in period])
         found[str(int(delay))] = {
             "period": period.tolist(),
@@ -395,12 +395,12 @@ def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | N
 def _uneven(rows: Table) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in HANDS:
-        mine = rows.select(rows["hand"] == name)
-        if len(mine):
+        selected = rows.select(rows["hand"] == name)
+        if len(selected):
             found[name] = {
-                "share": mine["share"].tolist(),
-                "measured": mine.numbers("limit").tolist(),
-                **{f"at_{line}": uneven_bound(mine.numbers(line)).tolist() for line in LINES},
+                "share": selected["share"].tolist(),
+                "measured": selected.numbers("limit").tolist(),
+                **{f"at_{line}": uneven_bound(selected.numbers(line)).tolist() for line in LINES},
             }
     return found
 
@@ -408,7 +408,7 @@ def _uneven(rows: Table) -> dict[str, Any]:
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States the agreement with the bounds at even ticks, and the limits at uneven ones."""
     for name, by_delay in boundary["methods"].items():
-        errors = [mine["worst_ratio_error"] for mine in by_delay.values()]
+        errors = [selected["worst_ratio_error"] for selected in by_delay.values()]
         yield (
             "'{name}': the worst hand turns the wall unstable within {error:.2%} of the bound for "
             "its delay",
@@ -419,12 +419,12 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             by_delay.get("0", {}) | {"name": name},
         )
     for what, by_hand in boundary["uneven"].items():
-        for hand, mine in by_hand.items():
+        for hand, selected in by_hand.items():
             yield (
                 "{axis}, {share:g}: with {hand} the wall is stable up to {measured:.0f} N/m; "
                 "2b ΣT/ΣT² by the balance of energy is {at_balanced:.0f} N/m, 2b/T at the mean "
                 "interval {at_mean:.0f} and at the longest {at_longest:.0f}, enough for any hand",
-                {key: values[-1] for key, values in mine.items()}
+                {key: values[-1] for key, values in selected.items()}
                 | {"axis": AXES[what].capitalize(), "hand": hand},
             )
 

@@ -230,17 +230,17 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
 
 def _draw_curves(axes: Axes, table: Table, name: str) -> None:
     rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
-    mine = table.select(rows)
-    if not len(mine):
+    selected = table.select(rows)
+    if not len(selected):
         base.say_missing(axes)
         return
-    angle = np.degrees(mine["angle"])
+    angle = np.degrees(selected["angle"])
     for law, colour in COLOURS.items():
-        axes.plot(angle, mine[law], color=colour, ls=STYLES[law], lw=1.6)
-    axes.plot(angle, mine["energy_change"], **MEASURED)
+        axes.plot(angle, selected[law], color=colour, ls=STYLES[law], lw=1.6)
+    axes.plot(angle, selected["energy_change"], **MEASURED)
     axes.axhline(0.0, color="black", lw=0.6)
     axes.set_xlabel("angle of the rod above the floor (°)")
-    axes.set_title(f"{name}: e = {mine['restitution'][0]:.2g}", fontsize="medium")
+    axes.set_title(f"{name}: e = {selected['restitution'][0]:.2g}", fontsize="medium")
 
 
 def _legend(figure: Figure) -> None:
@@ -329,23 +329,25 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
 def summarize(table: Table) -> dict[str, Any]:
     """Compares each contact setting with the laws of impact."""
     groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
-    return {"settings": {name: _summary(mine) for name, mine in groups.items() if len(mine)}}
-
-
-def _summary(mine: Table) -> Summary:
-    measured = mine["energy_change"]
-    distances = {law: float(np.sqrt(np.mean((measured - mine[law]) ** 2))) for law in COLOURS}
     return {
-        "restitution": float(mine["restitution"][0]),
+        "settings": {name: _summary(selected) for name, selected in groups.items() if len(selected)}
+    }
+
+
+def _summary(selected: Table) -> Summary:
+    measured = selected["energy_change"]
+    distances = {law: float(np.sqrt(np.mean((measured - selected[law]) ** 2))) for law in COLOURS}
+    return {
+        "restitution": float(selected["restitution"][0]),
         "rms_distance_to_law": distances,
         "nearest_law": _nearest(distances),
         "largest_energy_change": float(measured.max()),
-        "largest_by_newton": float(mine["newton"].max()),
-        "share_that_gained": float(np.mean(mine["first_gain"] >= 0)),
+        "largest_by_newton": float(selected["newton"].max()),
+        "share_that_gained": float(np.mean(selected["first_gain"] >= 0)),
         "at_the_largest": {
-            key: float(mine[key][measured.argmax()]) for key in ("angle", "friction", "slide")
+            key: float(selected[key][measured.argmax()]) for key in ("angle", "friction", "slide")
         },
-        "largest_own_restitution": float(mine["own_restitution"].max()),
+        "largest_own_restitution": float(selected["own_restitution"].max()),
     }
 
 
@@ -357,12 +359,12 @@ def _nearest(distances: Mapping[str, float]) -> str | None:
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States e, the energy and the nearest law of each contact setting."""
-    for name, mine in boundary["settings"].items():
+    for name, selected in boundary["settings"].items():
         yield (
             "With '{name}' a rod that falls upright comes back with e = {restitution:.2g}; at any "
             "angle and friction its energy changes by {largest_energy_change:+.2g} J at most, by "
             "Newton's law {largest_by_newton:+.2g} J; the nearest law is {nearest}",
-            mine | {"name": name, "nearest": mine["nearest_law"] or "none"},
+            selected | {"name": name, "nearest": selected["nearest_law"] or "none"},
         )
 
 

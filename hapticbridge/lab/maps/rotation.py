@@ -393,13 +393,13 @@ def _draw_cells(axes: Axes, table: Table, method: str) -> None:
 def _draw_creation(axes: Axes, table: Table) -> None:
     lines = table.select(table["what"] == "line")
     for method, stiffness in LINES:
-        mine = lines.select(
+        selected = lines.select(
             (lines["method"] == method) & (lines["rotational_stiffness"] == stiffness)
         )
         if stiffness == 0:
-            predicted = [max(free_creation(float(speed)), LEAST) for speed in mine["speed"]]
+            predicted = [max(free_creation(float(speed)), LEAST) for speed in selected["speed"]]
             axes.plot(
-                mine["speed"],
+                selected["speed"],
                 predicted,
                 color=base.THEORY_COLOUR,
                 lw=4,
@@ -407,8 +407,8 @@ def _draw_creation(axes: Axes, table: Table) -> None:
                 label=r"½T²|ω×Iω|²/I",
             )
         axes.plot(
-            mine["speed"],
-            np.maximum(mine.numbers("created"), LEAST),
+            selected["speed"],
+            np.maximum(selected.numbers("created"), LEAST),
             STYLES[stiffness],
             color=base.METHOD_COLOURS[method],
             ms=3,
@@ -427,11 +427,11 @@ def _draw_cut(axes: Axes, table: Table) -> None:
     cuts = table.select(table["what"] == "cut")
     widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last coincide
     for method, width in zip(METHODS_SHOWN, widths, strict=True):
-        mine = cuts.select(cuts["method"] == method)
+        selected = cuts.select(cuts["method"] == method)
         # the weld's jumps are far larger: they are drawn at the upper edge
-        jump = np.minimum(mine.numbers("torque_jump"), 0.97 * HIGHEST)
+        jump = np.minimum(selected.numbers("torque_jump"), 0.97 * HIGHEST)
         colour = base.METHOD_COLOURS[method]
-        axes.plot(mine["speed"], jump, "o-", color=colour, ms=3, lw=width, label=method)
+        axes.plot(selected["speed"], jump, "o-", color=colour, ms=3, lw=width, label=method)
     axes.axvline(cut_speed(SOFT), color=base.THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
     axes.axhline(2 * np.pi * SOFT, color=base.THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
     axes.set(
@@ -454,12 +454,12 @@ def summarize(table: Table) -> dict[str, Any]:
     predicted = np.array([free_creation(float(speed)) for speed in free["speed"]])
     kinetic = 0.5 * INERTIA[1] * free["speed"] ** 2
     share = predicted / kinetic
-    told = (share > TELLING[0]) & (share < TELLING[1])
+    comparable = (share > TELLING[0]) & (share < TELLING[1])
     created = free.numbers("created")
-    ratio = created[told] / predicted[told]
+    ratio = created[comparable] / predicted[comparable]
     cuts = table.select(table["what"] == "cut")
-    mine = cuts.select(cuts["method"] == "implicit")
-    passed = mine.select(mine.numbers("crossed") >= 0)
+    selected = cuts.select(cuts["method"] == "implicit")
+    passed = selected.select(selected.numbers("crossed") >= 0)
     limit = table.select(table["what"] == "limit").numbers("limit")
     return {
         "period": PERIOD,
@@ -473,7 +473,7 @@ def summarize(table: Table) -> dict[str, Any]:
             "created": created.tolist(),
             "predicted": predicted.tolist(),
             "grows_up_to": _grows_up_to(free),
-            "compared_up_to": float(free["speed"][told].max()) if told.any() else None,
+            "compared_up_to": float(free["speed"][comparable].max()) if comparable.any() else None,
             "largest_deviation": float(np.abs(ratio - 1).max()) if ratio.size else None,
         },
         "cut": {
@@ -503,17 +503,17 @@ def _grows_up_to(free: Table) -> float | None:
 
 def _first_passed(cells: Table, method: str) -> float | None:
     """Returns the slowest speed in rad/s at which the angle passed π in a run; None for none."""
-    mine = cells.select((cells["method"] == method) & (cells.numbers("crossed") >= 0))
-    return float(mine["speed"].min()) if len(mine) else None
+    selected = cells.select((cells["method"] == method) & (cells.numbers("crossed") >= 0))
+    return float(selected["speed"].min()) if len(selected) else None
 
 
 def _fastest(cells: Table, method: str) -> float | None:
     """Returns the speed in rad/s up to which a method is passive at every angle; None for none."""
-    mine = cells.select(cells["method"] == method)
-    is_good = (mine.texts("environment") != "active") & (mine.numbers("ticks") == TICKS)
-    bad = mine["speed"][~is_good].min(initial=np.inf)
+    selected = cells.select(cells["method"] == method)
+    is_good = (selected.texts("environment") != "active") & (selected.numbers("ticks") == TICKS)
+    bad = selected["speed"][~is_good].min(initial=np.inf)
     # a tool at rest creates nothing; 0 is no speed
-    good = mine["speed"][(mine["speed"] < bad) & (mine["speed"] > 0)]
+    good = selected["speed"][(selected["speed"] < bad) & (selected["speed"] > 0)]
     return float(good.max()) if good.size else None
 
 
@@ -526,16 +526,16 @@ def _strict_share(cells: Table, method: str) -> float | None:
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States passive ranges, the creation with translation alone, and the cut at π."""
     for name in METHODS_SHOWN:
-        mine = {"name": name, "gyroscopic_speed": boundary["gyroscopic_speed"]}
-        mine |= {key: boundary[key][name] for key in ("fastest_passive", "first_passed")}
-        mine |= {"strict": boundary["share_strict_below"][name]}
-        yield "'{name}' is passive at every angle up to {fastest_passive:.3g} rad/s", mine
+        selected = {"name": name, "gyroscopic_speed": boundary["gyroscopic_speed"]}
+        selected |= {key: boundary[key][name] for key in ("fastest_passive", "first_passed")}
+        selected |= {"strict": boundary["share_strict_below"][name]}
+        yield "'{name}' is passive at every angle up to {fastest_passive:.3g} rad/s", selected
         yield (
             "'{name}' is strict in {strict:.0%} of its runs below {gyroscopic_speed:.3g} rad/s, "
             "where the gyroscopic torque reaches what the spring gives at π",
-            mine,
+            selected,
         )
-        yield "The angle of '{name}' first passes π at {first_passed:.3g} rad/s", mine
+        yield "The angle of '{name}' first passes π at {first_passed:.3g} rad/s", selected
     yield (
         "Coupled in translation alone, the tool creates ½T²|ω × Iω|²/I a step within "
         "{largest_deviation:.2%} up to {compared_up_to:.3g} rad/s, and more the faster up to "

@@ -460,19 +460,19 @@ def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States by method the unstable range, and the agreement of the limits in mass with theory."""
-    for name, mine in boundary["methods"].items():
+    for name, selected in boundary["methods"].items():
         yield (
             "'{name}': held still, a tool is unstable at {unstable_held_still} of {points} points "
             "of the grid; below (6), held still or in its worst hand, at {unstable_below_6} of "
             "{points_below_6}; where stable, it creates at most {most_created:.2g} J",
-            mine | {"name": name},
+            selected | {"name": name},
         )
         for what in SEARCHES:
             yield (
                 "'{name}', {what}: limits in mass agree with theory within "
                 "{worst_ratio_error:.2%}; on whether there is one they disagree "
                 "{disagreements} times",
-                mine.get(what, {}) | {"name": name, "what": what},
+                selected.get(what, {}) | {"name": name, "what": what},
             )
 
 
