@@ -119,10 +119,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         way("B' = B, one tick late, against a wall", delay=1),
         anywhere,
         Alternative(
-            "transmission line of that stiffness",
-            float(line.max()),
-            None,
-            (frequency, line),
+            "transmission line of that stiffness", float(line.max()), None, (frequency, line)
         ),
     )
 

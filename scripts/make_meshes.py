@@ -33,13 +33,7 @@ def round_peg_sector() -> list[Row]:
     """
     radius, tangent = 0.011, np.tan(np.pi / 12)
     depth, chamfer, thickness = 0.040, 0.001, 0.020
-    places = [
-        (0.0, -depth),
-        (0.0, -chamfer),
-        (chamfer, 0.0),
-        (thickness, 0.0),
-        (thickness, -depth),
-    ]
+    places = [(0.0, -depth), (0.0, -chamfer), (chamfer, 0.0), (thickness, 0.0), (thickness, -depth)]
     return [[(x, side * (radius + x) * tangent, z) for side in (-1, 1)] for x, z in places]
 
 

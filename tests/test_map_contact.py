@@ -17,7 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
 from hapticbridge.lab.maps.base import loop_in, run_map, set_tool_mass
-from hapticbridge.lab.maps.contact import COMPARED, CONTACT, RIGS, method_runs, points
+from hapticbridge.lab.maps.contact import CONTACT, method_runs, points
 from hapticbridge.lab.maps.contact_rigs import (
     PERIOD,
     SHIPPED,
@@ -181,23 +181,15 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     chosen = [
         p
         for p in points(1)
-        if p["rig"] not in ("search", *RIGS)
-        or p["treatment"] in names
-        or (p["rig"] in RIGS and p["mass"] == 0.1)
+        if p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names)
     ]
     files = run_map(
         replace(CONTACT, points=lambda _: chosen), tmp_path, executor=ThreadPoolExecutor(2)
     )
     assert files.failed == 0
-    assert files.picture.stat().st_size > 10_000
     rule = files.finding.boundary["rule"]
     assert rule["strict"]["strict"] == rule["strict"]["cells"] > 0
     assert rule["abrupt"]["strict"] < rule["abrupt"]["cells"]
-    methods = files.finding.boundary["methods"]
-    assert [(one["rig"], one["method"]) for one in methods] == [
-        (rig, method) for rig in RIGS for method in COMPARED
-    ]
-    assert [one["runs"] for one in methods] == [2] * 3 + [4] * 3
     shipped, damped = files.finding.boundary["search"]
     assert shipped["active"] > 0
     assert damped["strict"] == damped["runs"]

@@ -143,7 +143,6 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         files = run_map(replace(DEVICE, points=few), tmp_path, points=9, executor=executor)
     assert files.failed == 0
-    assert files.picture.stat().st_size > 10_000
     said = files.finding.boundary
     assert said["regions"]["agreement"] >= 0.9
     for name in ("beta", "sigma"):
@@ -152,7 +151,3 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     # B = 3 is asked for, 2 and 1 are left; K T = 2
     for name, needed in (("implicit", 2.0), ("compensated", 1.0), ("lossless", 1.5)):
         assert said["friction"][name]["shaken"] == pytest.approx([needed], rel=1e-6)
-    legend = files.finding.figure.axes[1].get_legend()
-    assert legend is not None
-    names = [text.get_text() for text in legend.get_texts()]
-    assert [name.partition(":")[0] for name in names[1:4]] == list(METHODS_SHOWN)

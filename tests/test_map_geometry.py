@@ -117,7 +117,7 @@ def test_the_peg_fills_its_hole_and_touches_nothing_else() -> None:
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
-        files = run_map(GEOMETRY, tmp_path, points=32, executor=executor)
+        files = run_map(GEOMETRY, tmp_path, points=16, executor=executor)
     assert files.failed == 0
     boundary = files.finding.boundary
     assert boundary["direct"]["largest_deviation"] < 0.15
@@ -125,4 +125,3 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
         assert boundary[name]["largest_over_smallest"] < 1.05
         assert boundary[name]["largest_deviation"] < 0.03
     assert boundary["lossless"]["smallest"] > 1.3 * boundary["implicit"]["largest"]
-    assert files.picture.stat().st_size > 10_000

@@ -162,12 +162,15 @@ def wall() -> Scene:
 
 
 def few(count: int) -> list[Point]:
-    """Returns no delay, for one method the longest too, and free devices that lose ticks."""
+    """Returns one method without a delay and with the longest, and free devices that lose ticks."""
     return [
         each
         for each in RATE.points(count)
-        if (each["hand"] == "worst hand" and each["delay"] == 0)
-        or (each["method"] == "lossless" and each["delay"] == 5)
+        if (
+            each["hand"] == "worst hand"
+            and each["delay"] in (0, 5)
+            and each["method"] == "lossless"
+        )
         or (each["hand"] == "no hand" and each["what"] == "drops")
     ]
 
@@ -176,13 +179,10 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         files = run_map(replace(RATE, points=few), tmp_path, points=20, executor=executor)
     assert files.failed == 0
-    assert files.picture.stat().st_size > 10_000
-    for name, by_delay in files.finding.boundary["methods"].items():
-        assert set(by_delay) == ({"0", "5"} if name == "lossless" else {"0"})
-        for mine in by_delay.values():
-            assert mine["worst_ratio_error"] < 2e-3
-            assert mine["slope"] == pytest.approx(-1, abs=0.01)
-    titles = [axes.get_title() for axes in files.finding.figure.axes[:3]]
-    assert titles == ["implicit, B′ = B", "compensated, B′ = B − K T", "lossless, B′ = B − K T/2"]
+    by_delay = files.finding.boundary["methods"]["lossless"]
+    assert set(by_delay) == {"0", "5"}
+    for mine in by_delay.values():
+        assert mine["worst_ratio_error"] < 2e-3
+        assert mine["slope"] == pytest.approx(-1, abs=0.01)
     free = files.finding.boundary["uneven"]["drops"]["no hand"]
     assert free["at_longest"][-1] < free["measured"][-1] < free["at_mean"][-1]

@@ -16,7 +16,6 @@ from hapticbridge.lab.maps.tool_mass import (
     DAMPING,
     DEVICE_DAMPING,
     PERIOD,
-    THEORIES,
     TOOL_MASS,
     evaluate,
     felt,
@@ -166,11 +165,12 @@ def test_where_no_mass_is_stable_theory_has_no_limit() -> None:
 
 
 def few(count: int) -> list[Point]:
-    """Returns the whole grid, and of the searches one method's behind a handle held still."""
+    """Returns the grid of two methods, and a search behind a handle held still."""
     return [
         point
         for point in TOOL_MASS.points(count)
-        if point["what"] == "cell" or (point["what"], point["method"]) == ("held still", "explicit")
+        if (point["what"] == "cell" and point["method"] in ("implicit", "explicit"))
+        or (point["what"], point["method"]) == ("held still", "explicit")
     ]
 
 
@@ -178,9 +178,7 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as executor:
         files = run_map(replace(TOOL_MASS, points=few), tmp_path, points=16, executor=executor)
     assert files.failed == 0
-    assert files.picture.stat().st_size > 10_000
     methods = files.finding.boundary["methods"]
-    assert set(methods) == set(THEORIES)
     assert methods["implicit"]["unstable_held_still"] == 0
     assert methods["explicit"]["unstable_held_still"] > 0
 

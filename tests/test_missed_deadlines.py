@@ -22,8 +22,6 @@ from hapticbridge.commands import Couple
 from hapticbridge.guard import Limits
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Recording, Timeline, due_times, read_recording
-from hapticbridge.report.evidence import Evidence, draw_recording
-from hapticbridge.report.plots import draw_motion
 from hapticbridge.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
@@ -179,21 +177,6 @@ def rows(due: list[int]) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     made = np.zeros(len(due), TICK_DTYPE)
     made["tick"], made["deadline_ns"] = np.arange(len(due)), due
     return made
-
-
-def test_curves_and_events_stand_on_the_same_clock(late: Recording) -> None:
-    evidence = Evidence.of(late)
-    assert evidence is not None
-    assert len(late.ticks) == 100
-    [change] = [event for event in late.events if event["event"] == "coupling"]
-    tick, at = change["tick"], 1e-9 * change["time_ns"]
-    assert tick >= CHANGED > 20  # counted in ticks it would stand 30 ms earlier
-    assert evidence.time[tick - 1] <= at <= evidence.time[tick] + T
-    stop = 1e-9 * late.events[-1]["time_ns"]
-    assert evidence.time[-1] == pytest.approx(stop) == pytest.approx(0.131)
-    for figure in (draw_motion(evidence), draw_recording(late)):
-        drawn = figure.axes[0].lines[0].get_xdata()
-        assert np.max(drawn) == pytest.approx(0.131)
 
 
 @pytest.mark.parametrize(

@@ -108,11 +108,7 @@ class Theatre:
             )
             self._playing = self._server.gui.add_checkbox("play", initial_value=False)
         self._page = Page(
-            self._server,
-            stage.model,
-            stage.parameters,
-            dict(stage.recording.meta),
-            stage.reference,
+            self._server, stage.model, stage.parameters, dict(stage.recording.meta), stage.reference
         )
         self._page.allow(replay.sights)
         self._page.add_curves()

@@ -48,11 +48,7 @@ def serve(address: Address) -> viser.ViserServer:
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     _take_values_alone(server)
-    server.gui.configure_theme(
-        control_width="large",
-        show_logo=False,
-        show_share_button=False,
-    )
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     return server
 

@@ -17,11 +17,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart.engine_run import motion_along
 from hapticbridge.lab.chart.free_bodies import still
-from hapticbridge.lab.chart.scene_run import (
-    Stage,
-    Staged,
-    Stages,
-)
+from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
 from hapticbridge.lab.chart.workload import (
     Panel,
     PeerWork,

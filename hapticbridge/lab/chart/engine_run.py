@@ -14,12 +14,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.lab.chart.scene_run import Path
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import (
-    Judge,
-    PeerWork,
-    Score,
-    Take,
-)
+from hapticbridge.lab.chart.workload import Judge, PeerWork, Score, Take
 from hapticbridge.lab.engines.base import Engine, Pose, Simulation, Task, Velocity, composed
 from hapticbridge.lab.engines.from_scene import task_from_scene
 from hapticbridge.lab.methods import METHODS

@@ -15,11 +15,7 @@ from hapticbridge.check.perception import FORCE_FLOOR, LEVER, tool_angles
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart.engine_run import work_of
-from hapticbridge.lab.chart.scene_run import (
-    Stage,
-    Staged,
-    Stages,
-)
+from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import Velocity
 from hapticbridge.lab.maps.base import free_body, scene_of
@@ -52,9 +48,7 @@ DRIVEN_PANEL = Panel(
 )
 
 
-def handle_path(
-    times: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def handle_path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns the pose of the handle: A (1 − cos ωt) along and about fixed axes, from rest."""
     wave = 1 - np.cos(2 * np.pi * FREQUENCY * times)
     turned = Rotation.from_rotvec(np.outer(TURN * wave, AXIS)).as_quat()[:, [3, 0, 1, 2]]

@@ -37,12 +37,7 @@ from hapticbridge.lab.chart.workload import (
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import (
-    IMPLICIT,
-    Method,
-    prepare,
-    resolve_contact_stiffness,
-)
+from hapticbridge.rendering import IMPLICIT, Method, prepare, resolve_contact_stiffness
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Ledger
 
@@ -469,9 +464,7 @@ class SceneMotion(Staged):
 def path_of(motion: Motion, speed: float = 1.0) -> Path:
     """Returns a motion as the path of a stage, played faster by a factor >= 1."""
 
-    def path(
-        times: NDArray[np.float64],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         positions, quaternions = np.zeros((times.size, 3)), np.zeros((times.size, 4))
         cursor = 0
         for k, now in enumerate(times):

@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.rendering import (
-    Method,
-    method_named,
-)
+from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
 OWN = "hapticbridge"

@@ -246,11 +246,7 @@ FAMILIES = (
         mesh_ball,
     ),
     Family(
-        "resting",
-        "boxes at rest",
-        "on the floor, four contacts each",
-        (1, 3, 10, 30, 100),
-        resting,
+        "resting", "boxes at rest", "on the floor, four contacts each", (1, 3, 10, 30, 100), resting
     ),
 )
 

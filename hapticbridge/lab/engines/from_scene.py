@@ -344,8 +344,7 @@ def _law(
     orientation = product(body[1], grip[1])
     stretched = subtract(subtract(handle[0], handle_before[0]), subtract(position, tool_before[0]))
     twisted = subtract(
-        rotation_between(handle_before[1], handle[1]),
-        rotation_between(tool_before[1], orientation),
+        rotation_between(handle_before[1], handle[1]), rotation_between(tool_before[1], orientation)
     )
     force = add(scaled(stiffness, subtract(handle[0], position)), scaled(damping, stretched))
     torque = add(

@@ -81,11 +81,7 @@ class ContactGeom(Structure):
 class Contact(Structure):
     """``dContact``."""
 
-    _fields_: ClassVar = [
-        ("surface", Surface),
-        ("geom", ContactGeom),
-        ("direction", c_double * 4),
-    ]
+    _fields_: ClassVar = [("surface", Surface), ("geom", ContactGeom), ("direction", c_double * 4)]
 
 
 _REAL, _ID, _INT = c_double, c_void_p, c_int

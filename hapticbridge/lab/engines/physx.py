@@ -75,8 +75,7 @@ class SapienEngine:
         ),
         "velocity iterations": base.Setting("1", f"{_DYNAMICS}, Solver Iterations"),
         "contact offset": base.Setting(
-            f"{CONTACT_OFFSET:g} m",
-            f"{_COLLISION}, Tuning Shape Collision",
+            f"{CONTACT_OFFSET:g} m", f"{_COLLISION}, Tuning Shape Collision"
         ),
         "rest offset": base.Setting("0", f"{_COLLISION}, Tuning Shape Collision"),
         "contact generation": base.Setting("PCM", f"{_COLLISION}, PCM"),

@@ -325,9 +325,7 @@ def wall_runs(
 
 
 def peg_runs(
-    treatment: Treatment,
-    stiffness: float,
-    cases: Iterable[tuple[float, float, int]] = PEG_RUNS,
+    treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, float, int]] = PEG_RUNS
 ) -> Iterator[ContactRun]:
     """Runs pegs by mass (kg), friction and hand in the hole at K in N/m, as ``wall_runs`` does."""
     loop = base.loop_in("peg_in_hole", "contact", start_in_hole)
@@ -353,11 +351,7 @@ def ticks_of(device: SimulatedDevice) -> int:
 
 
 def run_once(
-    loop: ClosedLoop,
-    device: SimulatedDevice,
-    coupling: Coupling,
-    treatment: Treatment,
-    ticks: int,
+    loop: ClosedLoop, device: SimulatedDevice, coupling: Coupling, treatment: Treatment, ticks: int
 ) -> tuple[NDArray[np.void], ContactRun]:
     """Returns a run's records, and its outcome without the depth."""
     outcome = loop.run(

@@ -151,12 +151,7 @@ def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcom
         response = complex(felt(THEORIES[name], k, b, mass, PERIOD, angle))
         hand, loop = WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response), _tool()
     return loop.run(
-        SimulatedDevice(hand=hand),
-        coupling,
-        METHODS[name],
-        period=PERIOD,
-        ticks=TICKS,
-        knock=KNOCK,
+        SimulatedDevice(hand=hand), coupling, METHODS[name], period=PERIOD, ticks=TICKS, knock=KNOCK
     )
 
 

@@ -106,13 +106,7 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
     device, coupling = device_and_coupling(name, stiffness)
     return loop.run(
-        device,
-        coupling,
-        METHODS[name],
-        period=PERIOD,
-        ticks=TICKS,
-        knock=KNOCK,
-        keep_records=True,
+        device, coupling, METHODS[name], period=PERIOD, ticks=TICKS, knock=KNOCK, keep_records=True
     )
 
 

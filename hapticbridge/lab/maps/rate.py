@@ -199,13 +199,7 @@ def _run(
     timing: Timing | None = None,
 ) -> LoopOutcome:
     return base.wall_loop(WALL_MASS).run(
-        device,
-        coupling,
-        METHODS[name],
-        period=period,
-        ticks=ticks,
-        knock=KNOCK,
-        timing=timing,
+        device, coupling, METHODS[name], period=period, ticks=ticks, knock=KNOCK, timing=timing
     )
 
 
@@ -241,10 +235,7 @@ STYLES = {
 }
 """Label and line of each bound at uneven ticks."""
 
-AXES = {
-    "jitter": "ticks late by up to (share of T)",
-    "drops": "ticks lost (share of all)",
-}
+AXES = {"jitter": "ticks late by up to (share of T)", "drops": "ticks lost (share of all)"}
 
 MARKERS = dict(zip(HANDS, "os", strict=True))
 

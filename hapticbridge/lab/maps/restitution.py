@@ -190,13 +190,7 @@ COLOURS = {
 measurement is black."""
 
 STYLES = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
-MEASURED: Mapping[str, Any] = {
-    "color": "black",
-    "ls": "",
-    "marker": "o",
-    "ms": 3.5,
-    "mfc": "white",
-}
+MEASURED: Mapping[str, Any] = {"color": "black", "ls": "", "marker": "o", "ms": 3.5, "mfc": "white"}
 
 Summary = dict[str, Any]
 """Results of one contact setting."""

@@ -372,10 +372,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     )
     base.verdict_legend(
         figure,
-        [
-            ("angle passed π", "black", "o"),
-            ("gyroscopic torque = π K_r", base.THEORY_COLOUR, "--"),
-        ],
+        [("angle passed π", "black", "o"), ("gyroscopic torque = π K_r", base.THEORY_COLOUR, "--")],
     )
     return figure
 
