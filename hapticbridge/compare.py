@@ -277,9 +277,7 @@ def _meta_differences(
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def _event_differences(
-    files: tuple[RecordingFile, RecordingFile],
-) -> dict[str, tuple[int, int]]:
+def _event_differences(files: tuple[RecordingFile, RecordingFile]) -> dict[str, tuple[int, int]]:
     lists = [[str(event.get("event", "unnamed")) for event in file.events] for file in files]
     names = dict.fromkeys(lists[0] + lists[1])
     counts = {name: (lists[0].count(name), lists[1].count(name)) for name in names}

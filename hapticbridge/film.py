@@ -1,7 +1,7 @@
 """Pictures and films of a recorded run, drawn without a display by the first renderer that works.
 
-MuJoCo reads its renderer from the environment once, when it is imported. So a process of its own
-draws (``film_process``): it gets one job in a line of JSON and answers in lines of JSON.
+MuJoCo reads its renderer from the environment once, when it is imported. Therefore a separate
+process draws (``film_process``). It reads one job in a line of JSON and answers in lines of JSON.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ENDINGS = (".mp4", ".png")
 """Endings of the files that ``draw`` writes: a film, a picture."""
 
 PATIENCE = 120.0
-"""Longest wait for a renderer in s. A machine that compiles anew needs half a minute."""
+"""Longest wait for a renderer in s. A machine that compiles the code first needs half a minute."""
 
 MOST_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
@@ -42,7 +42,7 @@ sys.path.insert(0, sys.argv[1])
 from hapticbridge.film_process import run
 run()
 """
-# the renderer first, so that a later failure is not taken for a renderer that does not work
+# the renderer first, so that a later failure is not mistaken for a renderer that fails
 
 _NONE_WORKS = (
     "neither EGL nor OSMesa works here, so nothing can be drawn off-screen; on Debian: apt install "
@@ -57,11 +57,11 @@ class Shot:
     """Time, camera and size of a picture or a film.
 
     Attributes:
-        at: Time of a picture in s from the start of the run; None: the last tick.
+        at: Time of a picture in s from the start of the run; None for the last tick.
         start: Time in the run at which a film begins, in s.
-        stop: Time in the run at which a film ends, in s; None: with the run.
+        stop: Time in the run at which a film ends, in s; None for the end of the run.
         speed: Speed of a film relative to the run, 0.001 to 1000: at 0.1 a second takes ten.
-        camera: Name of a camera of the scene; None: the free one, as the scene's file sets it.
+        camera: Name of a camera of the scene; None for the free one, as the scene's file sets it.
         width: Pixels, 16 to 4096 and even.
         height: Pixels, 16 to 4096 and even.
         fps: Frames per second of a film, 1 to 120.
@@ -97,7 +97,7 @@ class Shot:
 
     @property
     def is_of_film(self) -> bool:
-        """True if a value is set that only a film has."""
+        """True if a value is set that applies to films only."""
         is_timed = bool(self.start) or self.stop is not None or self.speed != 1.0
         return is_timed or self.fps != Shot().fps
 
@@ -118,14 +118,14 @@ def draw(
         out: ``.png`` for one picture, ``.mp4`` for a film as long as the run; an existing file is
             replaced.
         shot: Time, camera and size; the last tick at 800 × 600 by default.
-        progress: Called with frames done and to do.
+        progress: Called with the finished and all frames.
 
     Returns:
         The renderer that drew it.
 
     Raises:
-        HapticBridgeError: No renderer works here, the file's ending is unknown, or a film is asked
-            for without the extra 'view'.
+        HapticBridgeError: No renderer works here, the file's ending is unknown, or a film is
+            requested without the extra 'view'.
         RecordingError: The recording cannot be drawn, or the file not written.
     """
     shot, target = shot or Shot(), Path(out)
@@ -187,12 +187,13 @@ def _check_target(target: Path, shot: Shot) -> None:
 
 
 def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) -> bool:
-    """Draws in a process of its own; returns False if its renderer does not work."""
+    """Draws in a separate process; returns False if its renderer does not work."""
     package = str(Path(__file__).resolve().parents[1])
     # -P: a file in the user's working folder must not replace a module
     command = [sys.executable, "-P", "-c", _BOOTSTRAP, package]
     environment = {**os.environ, "MUJOCO_GL": renderer}
-    environment.pop("PYOPENGL_PLATFORM", None)  # of another renderer, if one was tried in here
+    # settings of another renderer, if this process tried one
+    environment.pop("PYOPENGL_PLATFORM", None)
     process = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
@@ -208,11 +209,11 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
             print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
             return _follow(cast(IO[str], process.stdout), watch, progress)
     except BrokenPipeError:
-        return False  # it ended before it read the job
+        return False  # the process ended before it read the job
     finally:
         watch.cancel()
         process.kill()
-        process.wait()  # Popen does not where it was left by Ctrl-C
+        process.wait()  # Ctrl-C can leave Popen without waiting for the process
 
 
 def _follow(lines: IO[str], watch: threading.Timer, progress: Progress | None) -> bool:

@@ -1,4 +1,4 @@
-"""The process that draws a recorded run: the run simulated again, a camera, frames of a film.
+"""Process that draws a recorded run: the run simulated again, a camera, frames of a film.
 
 ``hapticbridge.film`` starts it, writes one job in a line of JSON and reads one answer per line:
 ``frame`` while a film is drawn, ``done``, or ``error`` with a sentence.
@@ -24,15 +24,16 @@ from hapticbridge.recording import RecordingFile, Timeline, open_recording
 from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4
-"""Largest distance in m of the tool, simulated again, from its record. It is less than a pixel.
-Beyond it the picture would be of another run, and is refused."""
+"""Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
+Beyond it the picture would show another run, and is refused."""
 
 LONGEST_ARROW = 0.8
 """Length of the arrow of the largest force, as a share of the scene's extent. A longer one leaves
 the picture."""
 
 LEAST_REFERENCE = 0.1
-"""Least force in N that is drawn at full length. Smaller forces of a run are drawn small."""
+"""Force in N at which the arrow has its full length in a run with smaller forces. Such forces are
+drawn small."""
 
 CONTACT_SIZE = 0.4
 """Size of a contact's disc relative to MuJoCo's default, which would hide the tool."""
@@ -51,7 +52,7 @@ QUALITY = 15
 Frame = NDArray[np.uint8]
 
 _PALE, _RED = np.array([0.75, 0.87, 0.98]), np.array([0.70, 0.15, 0.12])
-# pale to dark as well, which the colour-blind see
+# pale to dark as well, for colour-blind readers
 _GHOST = (0.1, 0.37, 0.71, 0.45)
 _HAND = (0.90, 0.38, 0.0, 1.0)
 
@@ -60,8 +61,8 @@ def force_colour(force: float, reference: float) -> NDArray[np.float64]:
     """Returns the colour of a spring that pulls: pale blue at rest, red from a reference force on.
 
     Args:
-        force: Its size in N.
-        reference: In N, > 0.
+        force: Magnitude of its force in N.
+        reference: Reference force in N, > 0.
 
     Returns:
         Red, green and blue from 0 to 1, (3,).
@@ -71,7 +72,7 @@ def force_colour(force: float, reference: float) -> NDArray[np.float64]:
 
 
 class Stage:
-    """A recorded run, simulated again tick by tick, forwards.
+    """Recorded run that is simulated again tick by tick, forwards.
 
     Args:
         path: The recording.
@@ -80,10 +81,10 @@ class Stage:
         recording: The recording without its ticks.
         parameters: Parameters of the run.
         model: The scene.
-        data: Its state at the tick last shown, with contacts as they were solved.
-        row: The record of that tick, one element of ``TICK_DTYPE``.
-        passed: The records since the tick shown before, that one not among them.
-        reference: The largest force on the tool in the run, in N, or ``LEAST_REFERENCE``.
+        data: State at the tick last shown, with contacts as they were solved.
+        row: Record of that tick, one element of ``TICK_DTYPE``.
+        passed: Records after the tick shown before and before this one.
+        reference: Largest force on the tool in the run, in N, or ``LEAST_REFERENCE``.
 
     Raises:
         RecordingError: The file is no recording, or cannot be simulated again here.
@@ -102,7 +103,7 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         self._rest = self.recording.blocks()
         self._block = next(self._rest)
-        self._at = 0  # in the block
+        self._at = 0  # index within the block
         self.row = self.passed = self._block[:1]
         forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
         largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
@@ -117,14 +118,14 @@ class Stage:
 
     @property
     def slack(self) -> float:
-        """Energy in J that the environment may have created by the tick shown."""
+        """Energy in J that the environment may have created up to the tick shown."""
         return self._run.slack
 
     def tick_at(self, time: float) -> int:
-        """Returns the tick that is shown at a time in s from the start: the one due nearest to it.
+        """Returns the tick whose due time is nearest to a time in s from the start.
 
         Raises:
-            RecordingError: The run does not last so long.
+            RecordingError: The run is shorter.
         """
         if not 0 <= time <= self.duration:
             raise RecordingError(
@@ -136,7 +137,7 @@ class Stage:
         """Simulates up to a tick, the present one or a later one.
 
         Raises:
-            RecordingError: Simulated again, the tool is elsewhere than recorded.
+            RecordingError: The tool, simulated again, is not at its recorded place.
         """
         passed = []
         while self._run.done <= tick:
@@ -150,7 +151,7 @@ class Stage:
             self._at, self.row = end, recorded[-1:]
         self.passed = np.concatenate(passed) if passed else self.row
         mujoco.mj_copyData(self.data, self.model, self._run.data)
-        # contacts stay as the tick solved them; only what is drawn is brought to its end
+        # contacts stay as the tick solved them; only the drawn quantities are brought to its end
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -223,7 +224,7 @@ class Camera:
         stage: The run.
         width: Width of a frame in pixels.
         height: Height of a frame in pixels.
-        name: A camera of the scene; None: the free one.
+        name: A camera of the scene; None for the free one.
 
     Raises:
         RecordingError: The scene has no camera of that name.
@@ -240,7 +241,8 @@ class Camera:
             self._camera.fixedcamid = _camera_id(model, name)
         shadows = model.vis.quality
         shadows.shadowsize = min(shadows.shadowsize, SHADOW)
-        self._shown.sitegroup[:] = 0  # grip and handle are points for the computer
+        # grip and handle are points in the model, without a shape to see
+        self._shown.sitegroup[:] = 0
         flags = mujoco.mjtVisFlag
         model.vis.map.alpha = TOOL_ALPHA
         for flag in (flags.mjVIS_CONTACTPOINT, flags.mjVIS_CONTACTFORCE, flags.mjVIS_TRANSPARENT):
@@ -272,14 +274,14 @@ def film_ticks(
         stage: The run.
         rate: Frames per second.
         start: Time in the run at which the film begins, in s.
-        stop: Time in the run at which the film ends, in s; None: with the run.
+        stop: Time in the run at which the film ends, in s; None for the end of the run.
         speed: Speed of the film relative to the run, without unit.
 
     Raises:
-        RecordingError: The run does not last so long.
+        RecordingError: The run is shorter.
     """
     end = stage.duration if stop is None else stop
-    stage.tick_at(end), stage.tick_at(start)  # refused before the first frame
+    stage.tick_at(end), stage.tick_at(start)  # refuse before the first frame
     for frame in range(max(1, int((end - start) / speed * rate))):
         yield stage.tick_at(start + frame * speed / rate)
 

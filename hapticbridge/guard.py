@@ -110,13 +110,7 @@ class Limits:
 
 
 UNLIMITED = Limits(
-    force=1e30,
-    torque=1e30,
-    rise=0.0,
-    ramp=0.0,
-    stretch=math.inf,
-    angle=math.inf,
-    energy=math.inf,
+    force=1e30, torque=1e30, rise=0.0, ramp=0.0, stretch=math.inf, angle=math.inf, energy=math.inf
 )
 """No limits, for simulations without a device; no finite force comes near."""
 

@@ -229,12 +229,7 @@ class Session:
     """
 
     def __init__(
-        self,
-        setup: RunSetup,
-        device: Device,
-        clock: Clock,
-        output: RecordOutput,
-        stop: StopRequest,
+        self, setup: RunSetup, device: Device, clock: Clock, output: RecordOutput, stop: StopRequest
     ) -> None:
         self.setup, self.device, self.clock, self.output = setup, device, clock, output
         self.stop = stop

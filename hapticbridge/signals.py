@@ -67,17 +67,17 @@ def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
 def holding_interrupts() -> Iterator[None]:
     """Defers Ctrl-C for the main thread, and for processes that this thread starts meanwhile.
 
-    It arrives at the end. A child process inherits the signals that its parent's thread blocks, so
-    an interrupt cannot end it with a traceback during its imports; it must unblock SIGINT itself.
-    In the parent, any other thread may take the signal and pass it to the main one, so a handler
-    notes it.
+    The signal arrives at the end. A child process inherits the signals that its parent's thread
+    blocks, so an interrupt cannot end it with a traceback during its imports; it must unblock
+    SIGINT itself. In the parent, any other thread may take the signal and pass it to the main one,
+    so a handler notes it.
     """
     noted: list[int] = []
-    before = signal.getsignal(signal.SIGINT)  # None if it is not Python's
+    before = signal.getsignal(signal.SIGINT)  # None for a handler that is not Python's
     is_ours = before is not None and threading.current_thread() is threading.main_thread()
     if is_ours:
         signal.signal(signal.SIGINT, lambda number, _frame: noted.append(number))
-    has_masks = hasattr(signal, "pthread_sigmask")  # all but Windows
+    has_masks = hasattr(signal, "pthread_sigmask")  # every system but Windows
     if has_masks:
         held = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -46,10 +46,10 @@ class Alternative:
 
     Attributes:
         name: Distinctive property.
-        needed: Device damping in N s/m; inf if none suffices.
+        needed: Required device damping in N s/m; inf if none suffices.
         frequency: Frequency in rad/s at which it is needed, 0.0 for low frequency. None without a
             single frequency: all alike, as for a spring without damper, or none.
-        spectrum: Frequencies in rad/s and the damping needed there; None without a curve.
+        spectrum: Frequencies in rad/s and the required damping there; None without a curve.
     """
 
     name: str

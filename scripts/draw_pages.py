@@ -29,14 +29,14 @@ from hapticbridge.view import Address  # noqa: E402
 from hapticbridge.view.replay import Replay, Theatre  # noqa: E402
 
 WIDTH = 800
-"""Of a picture in pixels; pages are drawn larger and made smaller, so that all of it fits."""
+"""Size of a picture in pixels. Pages are drawn larger and then reduced, so that all of it fits."""
 
 SETTLED = 15.0
-"""Seconds until a page without a graphics card has drawn what it was told."""
+"""Time in s until a page without a graphics card has drawn its content."""
 
 
 def save(tab: Tab, target: Path) -> None:
-    """Writes what a tab shows."""
+    """Writes the content of a tab."""
     with tempfile.TemporaryDirectory() as folder:
         tab.picture(Path(folder) / "page.png")
         image = Image.open(io.BytesIO((Path(folder) / "page.png").read_bytes())).convert("RGB")

@@ -21,15 +21,15 @@ from hapticbridge.scene import Scene, custom_numbers, scene_names, scene_path
 ROOT = Path(__file__).resolve().parents[1]
 
 WIDTH, HEIGHT = 640, 400
-"""Of a scene's picture, in pixels."""
+"""Size of a scene's picture, in pixels."""
 
 COLUMNS, GALLERY_WIDTH, GAP, LABEL = 4, 800, 6, 22
-"""Of the picture of all scenes: pictures in a row; width, space between and height of a name, in
-pixels."""
+"""Layout of the picture of all scenes: pictures in a row; width, space between and height of a
+name, in pixels."""
 
 
 def advance(scene: Scene) -> None:
-    """Moves a scene along its hand path to the moment that its picture shows."""
+    """Moves a scene along its hand path to the moment of its picture."""
     path, moment = scene.path.with_suffix(".csv"), custom_numbers(scene.model, "picture")
     if not moment or not path.is_file():
         return
@@ -49,7 +49,7 @@ def picture(name: str) -> Image.Image:
     mujoco.mj_forward(model, data)
     camera, shown = mujoco.MjvCamera(), mujoco.MjvOption()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    shown.sitegroup[:] = 0  # grip and handle are points for the computer, not parts of the tool
+    shown.sitegroup[:] = 0  # grip and handle are points in the model, not parts of the tool
     model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
         renderer.update_scene(data, camera, shown)

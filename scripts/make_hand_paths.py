@@ -48,7 +48,7 @@ TREMOR_BAND = (8.0, 12.0, 0.02e-3, 0.3e-3)
 SINES_PER_BAND = 8
 
 SWING, TURN_ROUND = 0.2, 0.11
-"""Time of a blow's movement down, and when within it the movement up begins, in s."""
+"""Duration of a blow's movement down, and start of the movement up within it, in s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +56,10 @@ class Reach:
     """One minimum-jerk movement.
 
     Attributes:
-        start: When it begins, in s.
-        duration: How long it takes, in s.
-        millimetres: By how much the position changes, in mm.
-        degrees: By how much the rotation vector changes, in degrees.
+        start: Start in s.
+        duration: Duration in s.
+        millimetres: Change of the position in mm.
+        degrees: Change of the rotation vector in degrees.
     """
 
     start: float
@@ -70,12 +70,12 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class HandPath:
-    """How one scene's path is made.
+    """Recipe of one scene's path.
 
     Attributes:
         motion: Returns position in m and rotation vector in rad, shape (n, 6), at times in s.
-        axes: Which of x, y, z and the rotation vector's three components the hand moves at all.
-        seed: Seeds wander and tremor.
+        axes: Axes among x, y, z and the rotation vector's three components that the hand moves.
+        seed: Seed of wander and tremor.
     """
 
     motion: Callable[[Array], Array]
@@ -107,9 +107,9 @@ def swinging(lever: float, *reaches: Reach) -> Callable[[Array], Array]:
     """Returns the motion of a handle that turns about an upright axis beside it.
 
     Args:
-        lever: From the axis to the handle's start along x, in m.
-        reaches: What the hand adds: the angle about z swings the position along, x is away from
-            the axis, the rest stays as it is.
+        lever: Distance from the axis to the handle's start along x, in m.
+        reaches: Movements of the hand. The angle about z swings the position along, x points away
+            from the axis, the rest stays unchanged.
     """
     turning = reaching(*reaches)
 
@@ -126,12 +126,12 @@ def swinging(lever: float, *reaches: Reach) -> Callable[[Array], Array]:
 def blows(first: float, interval: float, depths: tuple[float, ...]) -> tuple[Reach, ...]:
     """Returns blows straight down, each from 30 mm above the start and back to there.
 
-    Down and up overlap, so that the hand turns round at speed: what a wrist does when it strikes.
+    Down and up overlap, so that the hand reverses at speed, as a wrist does when it strikes.
 
     Args:
-        first: When the first swing begins, in s.
-        interval: From one swing to the next, in s.
-        depths: How far below the start the hand would go without turning round, in mm.
+        first: Start of the first swing in s.
+        interval: Time from one swing to the next, in s.
+        depths: Depths below the start that the hand would reach without reversal, in mm.
     """
     lift = 30.0
     reaches = [Reach(first - 0.6, 0.6, (0, 0, lift))]

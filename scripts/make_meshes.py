@@ -63,8 +63,8 @@ def hex_key_sector() -> list[Row]:
 
 ARM, HEAD_RADIUS, TOP_RADIUS = 0.0024 / 2, 0.006, 0.0046
 RECESS, RIM = 0.0031, 0.0012
-"""Of the M6 cross-recessed head: half an arm's width; radius below the rim and on top; depth of the
-recess, and of the rim's edge below the top."""
+"""Sizes of the M6 cross-recessed head: half an arm's width; radius below the rim and on top; depth
+of the recess, and of the rim's edge below the top."""
 
 
 def quarter() -> list[Row]:
@@ -78,7 +78,7 @@ def quarter() -> list[Row]:
 
 
 def arm_end() -> list[Row]:
-    """What closes an arm of the recess; its wall leans outwards by 26.6 degrees."""
+    """The part that closes an arm of the recess; its wall leans outwards by 26.6 degrees."""
     bottom, top = 0.0019, 0.00345
     outer, upper = (np.sqrt(radius**2 - ARM**2) for radius in (HEAD_RADIUS, TOP_RADIUS))
     profile = [(top, 0.0), (bottom, -RECESS), (outer, -RECESS), (outer, -RIM), (upper, 0.0)]
@@ -119,7 +119,7 @@ MESHES: dict[tuple[str, str], Callable[[], list[Row]]] = {
     ("screwdriver", "wings"): wings,
     ("lock", "plug"): lock_plug,
 }
-"""What makes each mesh, by scene and name."""
+"""Function that makes each mesh, by scene and name."""
 
 
 def vertices(rows: Iterable[Row]) -> str:

@@ -1,4 +1,4 @@
-"""Blocks of ticks of the checkout that is imported, timed when asked: for ``bench_tick --against``.
+"""Blocks of ticks of the imported checkout, timed on request: for ``bench_tick --against``.
 
 A line on stdin is a JSON object. ``{"scene": NAME, "method": NAME, "in_contact": BOOL}`` opens a
 bridge as it runs by default, pipelined and with a whole guard; ``{}`` runs its next block. A line
@@ -18,7 +18,7 @@ import numpy as np
 import hapticbridge as hb
 
 BLOCK = 250
-"""Ticks per block: some 5 ms, short beside what disturbs a machine, long beside a cold cache."""
+"""Ticks per block: some 5 ms, short beside disturbances of a machine, long beside a cold cache."""
 
 
 class UnpacedClock:
@@ -41,7 +41,7 @@ class UnpacedClock:
 
 
 def open_bridge(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
-    """Closes the last bridge and opens the one that is asked for."""
+    """Closes the last bridge and opens the requested one."""
     stack.close()
     bridge = hb.Bridge(
         asked["scene"],

@@ -4,16 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hapticbridge.lab.chart.catalogue import (
-    Extent,
-    open_workload,
-)
-from hapticbridge.lab.chart.chart import (
-    Chart,
-    Cost,
-    Measurement,
-    measure_chart,
-)
+from hapticbridge.lab.chart.catalogue import Extent, open_workload
+from hapticbridge.lab.chart.chart import Chart, Cost, Measurement, measure_chart
 from hapticbridge.lab.chart.setting import SHIPPED, Setting
 from hapticbridge.lab.chart.workload import Score, Verdict
 from hapticbridge.lab.methods import METHODS

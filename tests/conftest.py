@@ -9,18 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import (
-    recorded,
-    tapped,
-)
+from audit_cases import recorded, tapped
 from cli_cases import Called
 from hypothesis import settings
 from numpy.typing import NDArray
-from outside_scenes import (
-    hand_file,
-    mjcf,
-    scene_file,
-)
+from outside_scenes import hand_file, mjcf, scene_file
 from recording_cases import random_rows, write
 from report_runs import Made
 from scene_cases import GRIPPED, ticks

@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.engines.base import (
-    Body,
-    Engine,
-    Shape,
-    Simulation,
-    Task,
-    open_engine,
-)
+from hapticbridge.lab.engines.base import Body, Engine, Shape, Simulation, Task, open_engine
 from hapticbridge.theory.rigid_body import exact_mass_response
 
 COUPLING = Coupling(

@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from outside_scenes import (
-    FREE_TOOL,
-    scene_file,
-)
+from outside_scenes import FREE_TOOL, scene_file
 
 import hapticbridge as hb
 from hapticbridge.scene import load_scene

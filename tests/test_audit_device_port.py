@@ -239,11 +239,7 @@ class Turning(ScriptedDevice):
     ],
 )
 def test_a_device_is_blamed_only_where_all_its_damping_is_known_and_it_is_free_to_move(
-    changed: dict[str, Any],
-    coupling: Coupling,
-    certified: bool | None,
-    port: str,
-    tmp_path: Path,
+    changed: dict[str, Any], coupling: Coupling, certified: bool | None, port: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
     summary = recorded(path, "virtual_wall", Turning(**changed), coupling, duration=0.3)

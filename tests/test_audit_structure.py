@@ -6,12 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import (
-    recorded,
-    rewritten,
-    verdict_of,
-    without_model,
-)
+from audit_cases import recorded, rewritten, verdict_of, without_model
 from cli_cases import Called
 
 from hapticbridge.audit import audit

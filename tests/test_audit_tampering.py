@@ -9,13 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import (
-    COMPONENTS,
-    rewritten,
-    verdict_of,
-    without_model,
-    without_share,
-)
+from audit_cases import COMPONENTS, rewritten, verdict_of, without_model, without_share
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -62,9 +56,7 @@ def test_rewriting_alone_changes_no_verdict(tap: Recording, held: Recording, fol
 
 
 @settings(
-    max_examples=120,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=120, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     is_held=st.booleans(),
@@ -134,8 +126,7 @@ def test_no_changed_parameter_is_missed(
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start"],
+    "name", ["axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start"]
 )
 def test_no_changed_pose_of_the_start_is_missed(held: Recording, folder: Path, name: str) -> None:
     numbers = json.loads(held.meta[name])
@@ -235,9 +226,7 @@ def test_device_that_no_force_moves_is_not_certified_whatever_damping_it_claims(
 
 
 @settings(
-    max_examples=60,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     component=st.sampled_from(COMPONENTS),

@@ -15,20 +15,9 @@ from chart_cases import FakeRun, small_chart
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import Scheme
-from hapticbridge.lab.chart.catalogue import (
-    Extent,
-    open_workload,
-)
-from hapticbridge.lab.chart.chart import (
-    Chart,
-    interleaved_costs,
-    measure_chart,
-    pareto_front,
-)
-from hapticbridge.lab.chart.output import (
-    prepared_files,
-    write_chart,
-)
+from hapticbridge.lab.chart.catalogue import Extent, open_workload
+from hapticbridge.lab.chart.chart import Chart, interleaved_costs, measure_chart, pareto_front
+from hapticbridge.lab.chart.output import prepared_files, write_chart
 from hapticbridge.lab.chart.setting import (
     CONTACTS,
     SHIPPED,

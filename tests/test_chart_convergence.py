@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 from chart_cases import made_up
 
-from hapticbridge.lab.chart import (
-    contact_bodies,
-    free_bodies,
-)
+from hapticbridge.lab.chart import contact_bodies, free_bodies
 from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import convergence_orders, measure_chart
 from hapticbridge.lab.chart.peg import COUPLING as PEG_COUPLING

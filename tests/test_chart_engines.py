@@ -15,25 +15,13 @@ from engine_tasks import engine_or_skip
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import chart as chart_module
 from hapticbridge.lab.chart import contact_bodies
-from hapticbridge.lab.chart.catalogue import (
-    Extent,
-    open_workload,
-)
+from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import Chart, interleaved_costs, measure_chart
 from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
-from hapticbridge.lab.chart.output import (
-    summary_of,
-)
+from hapticbridge.lab.chart.output import summary_of
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import PeerWork, Workload
-from hapticbridge.lab.engines.base import (
-    ENGINES,
-    Engine,
-    Simulation,
-    Task,
-    composed,
-    open_engine,
-)
+from hapticbridge.lab.engines.base import ENGINES, Engine, Simulation, Task, composed, open_engine
 from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.pose import Vector

@@ -32,13 +32,7 @@ from hapticbridge.errors import DeviceError
 
 
 def plug(
-    bus: Path,
-    place: str,
-    usb_id: str,
-    *,
-    name: str = "",
-    serial: str = "",
-    hidraw: bool = False,
+    bus: Path, place: str, usb_id: str, *, name: str = "", serial: str = "", hidraw: bool = False
 ) -> None:
     """Writes what the kernel's sysfs shows of a device."""
     folder = bus / place

@@ -59,12 +59,7 @@ def test_records_are_those_of_the_live_loop_to_the_bit(scene: str, method: str) 
         )
 
     outcome = ClosedLoop(load_scene(scene)).run(
-        device(),
-        COUPLING,
-        METHODS[method],
-        period=T,
-        ticks=1500,
-        keep_records=True,
+        device(), COUPLING, METHODS[method], period=T, ticks=1500, keep_records=True
     )
     limits = Limits(force=1e9, torque=1e9, ramp=0.0)
     with Bridge(
@@ -154,12 +149,7 @@ def test_even_timing_changes_nothing_and_late_ticks_do(point_mass: ClosedLoop) -
     def force(timing: Timing | None) -> LoopOutcome:
         device = SimulatedDevice(path="models/point_mass/point_mass.csv")
         return point_mass.run(
-            device,
-            COUPLING,
-            METHODS["implicit"],
-            ticks=400,
-            timing=timing,
-            keep_records=True,
+            device, COUPLING, METHODS["implicit"], ticks=400, timing=timing, keep_records=True
         )
 
     without, even, late = force(None), force(Timing()), force(Timing(jitter=0.5, seed=1))

@@ -14,9 +14,7 @@ BUFFER = ctypes.create_string_buffer(4096)
 """C's stdout keeps it as long as the process lives."""
 
 
-def test_prints_of_c_are_told_once_and_kept_from_stdout(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_prints_of_c_are_told_once_and_kept_from_stdout(capfd: pytest.CaptureFixture[str]) -> None:
     told: list[str] = []
     libc = ctypes.CDLL(None)
     # as where stdout is a pipe: C writes when its memory is full (_IOFBF), or when it is told to

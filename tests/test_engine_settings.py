@@ -15,12 +15,7 @@ from unittest.mock import MagicMock
 import pytest
 from engine_tasks import FLOOR, GRAVITY, RESTING
 
-from hapticbridge.lab.engines.base import (
-    ENGINES,
-    Body,
-    Pose,
-    Task,
-)
+from hapticbridge.lab.engines.base import ENGINES, Body, Pose, Task
 
 PACKAGE = "hapticbridge.lab.engines."
 LIBRARIES = ("pybullet", "sapien")
@@ -54,9 +49,7 @@ def libraries(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, MagicMock]]
             sys.modules[name] = module
 
 
-def test_pybullet_is_given_what_it_tells_and_nothing_else(
-    libraries: dict[str, MagicMock],
-) -> None:
+def test_pybullet_is_given_what_it_tells_and_nothing_else(libraries: dict[str, MagicMock]) -> None:
     library = libraries["pybullet"]
     library.getBasePositionAndOrientation.return_value = ((0.0,) * 3, (0.0, 0.0, 0.0, 1.0))
     for engine in import_module(PACKAGE + "bullet").engines():

@@ -13,9 +13,7 @@ from engine_tasks import COUPLING
 
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.engines import (
-    base,
-)
+from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.base import (
     ENGINES,
     Body,

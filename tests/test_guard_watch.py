@@ -72,9 +72,7 @@ def test_a_clutch_moves_the_device_without_the_handle_and_comes_back_without_a_s
     assert (outcome.report.verdict, outcome.report.resimulation) == ("passive", "bit for bit")
 
 
-def test_a_clutch_let_go_while_the_force_is_off_puts_the_handle_to_the_tool(
-    tmp_path: Path,
-) -> None:
+def test_a_clutch_let_go_while_the_force_is_off_puts_the_handle_to_the_tool(tmp_path: Path) -> None:
     """The tool follows without force: a handle put where the device went would fling it there."""
     rig = Rig(tmp_path, options={"clutch": 3})
     rig.device.corrupt = pressed(3, lambda k: DOWN <= k < UP)

@@ -135,9 +135,7 @@ def test_bad_sample_is_refused_and_changes_nothing(field: str, value: tuple[floa
 @settings(max_examples=50)
 @given(
     st.lists(
-        st.one_of(st.floats(), st.floats(-2, 2), st.just(1e9), st.just(0.0)),
-        min_size=7,
-        max_size=7,
+        st.one_of(st.floats(), st.floats(-2, 2), st.just(1e9), st.just(0.0)), min_size=7, max_size=7
     )
 )
 @example([1e9, 0, 0, 1, 0, 0, 0])  # whose square swallows that of the quaternion

@@ -206,6 +206,25 @@ def test_random_free_motion_closes_the_balance_and_is_strictly_passive(
     assert ledger.slack_share == 0.0
 
 
+@settings(max_examples=20)
+@given(
+    mass=st.floats(0.01, 1),
+    stiffness=st.floats(100, 2e4),
+    damping=st.floats(0, 5),
+    amplitude=st.floats(1e-3, 0.05),
+    frequency=st.floats(0.3, 10),
+)
+def test_pure_translation_never_creates_energy_in_any_tick(
+    mass: float, stiffness: float, damping: float, amplitude: float, frequency: float
+) -> None:
+    scene = FREE_BALL.replace('mass="0.1"', f'mass="{mass}"')
+    samples = samples_of(sines(400, amplitude, frequency))
+    run = fast(scene, samples, Coupling(stiffness, damping, 1.0, 1e-4))
+    steps = np.diff(run.ticks["environment_energy"], prepend=0.0)
+    # differences of sums of the storage's size
+    assert steps.max() <= 1e-14 * (1 + run.ticks["kinetic"].max() * 100)
+
+
 def test_spinning_tool_behind_a_coupling_of_translation_alone_is_seen_to_create_energy() -> None:
     """Gyroscopic and Coriolis terms are explicit under `discrete`; the ledger must not hide it."""
     world = """

@@ -13,6 +13,7 @@ from kernel_runs import Array, unlimited
 from rendering_runs import FREE_MASS
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.trajectory import pose_at, read_motion
@@ -100,6 +101,20 @@ def test_turning_tool_and_arm_are_followed_to_second_order(
     assert coarse["environment_energy"].max() <= 1e-9
     loss, less = (-rows["environment_energy"].min() for rows in (coarse, fine))
     assert loss / less == pytest.approx(lost, abs=0.15)
+
+
+def test_default_couplings_are_rendered_ten_times_better_than_by_implicit(tmp_path: Path) -> None:
+    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
+    t: Array = T * np.arange(1, 2001, dtype=np.float64)
+    path = np.zeros((t.size, 3))
+    path[:, 0] = 0.02 * np.sin(2 * np.pi * 2.0 * t)
+    errors = {}
+    for method in ("implicit", "lossless"):
+        asked = default_coupling(SimulatedDevice().info, T, method=METHODS[method])
+        rows, _ = led(scene, method, asked, path, T)
+        felt = response_from_rest(t, asked.stiffness, asked.damping, 0.1)
+        errors[method] = float(np.sqrt(np.mean((rows["tool_position"][:, 0] - felt) ** 2)))
+    assert 10 * errors["lossless"] < errors["implicit"]
 
 
 def test_energy_that_turning_creates_is_given_back(tmp_path: Path) -> None:

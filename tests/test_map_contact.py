@@ -17,11 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
 from hapticbridge.lab.maps.base import loop_in, run_map, set_tool_mass
-from hapticbridge.lab.maps.contact import (
-    CONTACT,
-    method_runs,
-    points,
-)
+from hapticbridge.lab.maps.contact import CONTACT, method_runs, points
 from hapticbridge.lab.maps.contact_rigs import (
     PERIOD,
     SHIPPED,

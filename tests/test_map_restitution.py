@@ -46,11 +46,7 @@ def test_upright_without_friction_all_laws_and_mujoco_agree() -> None:
             assert found[name] == pytest.approx(lost, abs=1e-9)
 
 
-@given(
-    angle=st.floats(0.1, 1.5),
-    friction=st.floats(0.0, 1.0),
-    slide=st.floats(-1.0, 1.0),
-)
+@given(angle=st.floats(0.1, 1.5), friction=st.floats(0.0, 1.0), slide=st.floats(-1.0, 1.0))
 @settings(max_examples=60)
 def test_the_contact_of_the_scenes_never_gains(angle: float, friction: float, slide: float) -> None:
     found = drop("scenes", angle, friction, slide)

@@ -188,7 +188,7 @@ def test_pawl_resists_the_free_way_as_its_spring_presses_and_as_it_rubs() -> Non
     light, strong = (free_way("pawl_force", force) for force in (0.25, 3.0))
     assert strong / light == pytest.approx(12.0, rel=0.15)
     slippery, dry = (free_way("friction", value) for value in (0.05, 0.4))
-    assert slippery < 0.675 * dry
+    assert slippery < 0.75 * dry
 
 
 # --- open wrench ----------------------------------------------------------------------------------

@@ -34,13 +34,7 @@ from hapticbridge.realtime import (
 )
 from hapticbridge.realtime import realtime as asked
 from hapticbridge.realtime import realtime as pace
-from hapticbridge.realtime.realtime import (
-    BESIDE_THE_STEP,
-    CONTAINER,
-    PRIORITY,
-    SHELL,
-    rate_for,
-)
+from hapticbridge.realtime.realtime import BESIDE_THE_STEP, CONTAINER, PRIORITY, SHELL, rate_for
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import load_scene

@@ -290,12 +290,7 @@ def test_points_that_end_their_worker_are_found_and_recorded(scratch: Path) -> N
 def test_ctrl_c_keeps_what_is_done(scratch: Path) -> None:
     (scratch / "ctrl-c").touch()
     again = functools.partial(
-        sweep,
-        functions.counted,
-        functions.COUNTED,
-        results=scratch / "kept",
-        jobs=1,
-        chunk=2,
+        sweep, functions.counted, functions.COUNTED, results=scratch / "kept", jobs=1, chunk=2
     )
     with pytest.raises(Interrupted) as stop:
         again()

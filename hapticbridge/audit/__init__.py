@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_exports(
         __name__,
-        {
-            "AuditReport": "hapticbridge.audit.report",
-            "verdict_words": "hapticbridge.audit.report",
-        },
+        {"AuditReport": "hapticbridge.audit.report", "verdict_words": "hapticbridge.audit.report"},
         present=("audit",),
     )

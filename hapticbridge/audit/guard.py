@@ -223,11 +223,7 @@ def _handle_deviations(block: AuditedBlock, parameters: RunParameters) -> Iterat
     angle = np.linalg.norm(vector, axis=1, keepdims=True)
     turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
     pose = np.concatenate(
-        [
-            target[:, :3] + parameters.scale * moved,
-            quaternion_product(turn, target[:, 3:]),
-        ],
-        axis=1,
+        [target[:, :3] + parameters.scale * moved, quaternion_product(turn, target[:, 3:])], axis=1
     )
     pose = np.where(has_flag(ticks, TickFlag.CLUTCH)[:, None], block.motion.handle_before, pose)
     yield Deviation.between(

@@ -11,11 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.energy import (
-    EnergyBalance,
-    energy_balances,
-    energy_deviations,
-)
+from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import RecordedRun, RunEvents
 from hapticbridge.audit.guard import AuditedBlock, wrench_deviations
 from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation

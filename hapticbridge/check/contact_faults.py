@@ -116,11 +116,7 @@ def _soft(
         return None
     pair = max(tight or pairs, key=lambda each: depths[each])
     stiffness = constraint_stiffness(
-        setting.solref,
-        setting.solimp,
-        inertia_of(case, pair, setting),
-        step,
-        depths[pair],
+        setting.solref, setting.solimp, inertia_of(case, pair, setting), step, depths[pair]
     )
     is_default = np.allclose(setting.solref, MUJOCO_SOLREF)
     default = "MuJoCo's default " if is_default else ""

@@ -231,10 +231,7 @@ def _time_ticks(
         times[k] = clock() - begin
         if code != OK:
             raise not_finite(scene, k, samples.size)
-        contacts[k], rows[k] = (
-            int(row["contacts"][0]),
-            data.nefc,
-        )  # without near misses
+        contacts[k], rows[k] = (int(row["contacts"][0]), data.nefc)  # without near misses
     ring.close()
     return 1e-9 * times, contacts, rows
 

@@ -185,11 +185,7 @@ class Playback:
 
 
 def rehearse(
-    scene: Scene,
-    samples: NDArray[np.void],
-    coupling: Coupling,
-    period: float,
-    substeps: int = 1,
+    scene: Scene, samples: NDArray[np.void], coupling: Coupling, period: float, substeps: int = 1
 ) -> Playback:
     """Runs the scene from its start as the bridge would, one tick per sample.
 

@@ -130,11 +130,7 @@ def constraint_stiffness(
 
 
 def depth_under(
-    force: float,
-    solref: Sequence[float],
-    solimp: Sequence[float],
-    inertia: float,
-    timestep: float,
+    force: float, solref: Sequence[float], solimp: Sequence[float], inertia: float, timestep: float
 ) -> float:
     """Returns the penetration in m under a steady force; infinite for zero stiffness.
 

@@ -117,9 +117,7 @@ def contact_simplifications(seen: MotionTrace) -> list[Simplification]:
         _condim(3, "condim 3", "contacts resist sliding, not twisting or rolling"),
         _condim(4, "condim 4", "contacts resist sliding and twisting, not rolling"),
         Simplification(
-            "pyramidal cone",
-            "friction is limited by a pyramid in place of a cone",
-            _make_pyramidal,
+            "pyramidal cone", "friction is limited by a pyramid in place of a cone", _make_pyramidal
         ),
         Simplification(
             "idle geoms",

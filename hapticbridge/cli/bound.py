@@ -78,11 +78,7 @@ class Bound:
             "used_damping": law_damping(self.stiffness, self.damping, period, default_method().lag),
             "largest_stiffness": self._largest_stiffness(period),
             "alternatives": [
-                {
-                    "name": way.name,
-                    "needed": way.needed,
-                    "frequency_hz": _hertz(way),
-                }
+                {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
                 for way in ways
             ],
         }

@@ -10,22 +10,11 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.catalogue import (
-    Extent,
-    open_workload,
-)
+from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS, measure_chart
 from hapticbridge.lab.chart.engine_run import peer_settings
-from hapticbridge.lab.chart.output import (
-    ChartFiles,
-    prepared_files,
-    write_chart,
-)
-from hapticbridge.lab.chart.setting import (
-    chosen_methods,
-    chosen_periods,
-    settings_for,
-)
+from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
+from hapticbridge.lab.chart.setting import chosen_methods, chosen_periods, settings_for
 from hapticbridge.lab.chart.work import WORK_ENDINGS, measure_work, write_work
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 
@@ -82,10 +71,7 @@ class Chart:
         with caught_prints(_tell), progress(f"chart {workload.name}") as show:
             settings += peer_settings(self._peers(), periods)
             chart = measure_chart(
-                workload,
-                settings,
-                repeats=LEAST_REPEATS if self.quick else REPEATS,
-                progress=show,
+                workload, settings, repeats=LEAST_REPEATS if self.quick else REPEATS, progress=show
             )
         files = write_chart(chart, paths)
         if self.as_json:

@@ -260,9 +260,7 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
         seen[fault.kind] += 1
         if seen[fault.kind] > MOST_NAMED:
             continue
-        out.print(
-            f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}",
-        )
+        out.print(f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}")
         # what stands in quotes is to be copied: it stays on one line
         whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _GLUE), fault.sentence)
         for line in textwrap.wrap(whole, _WIDTH):

@@ -10,15 +10,7 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.certificate import delay_ticks
-from hapticbridge.cli.terminal import (
-    err,
-    out,
-    plain,
-    print_json,
-    progress,
-    tell,
-    write_figure,
-)
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress, tell, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.errors import HapticBridgeError, choices

@@ -25,10 +25,7 @@ SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no
 longer shows the hand where the tool is. A run that began softer may stay so."""
 
-UNITS = {
-    "translation": ("N/m", "N s/m"),
-    "rotation": ("N m/rad", "N m s/rad"),
-}
+UNITS = {"translation": ("N/m", "N s/m"), "rotation": ("N m/rad", "N m s/rad")}
 """Units of stiffness and damping by kind of axis."""
 
 _PREFIX = {"translation": "", "rotation": "rotational "}

@@ -8,7 +8,7 @@ from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_search
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
-"""Where the rules go. The number must be below 73: ``73-seat-late.rules`` is what turns the tag
+"""Path of the udev rules. The number must be below 73: ``73-seat-late.rules`` turns the tag
 ``uaccess`` into a permission, and rules are read in the order of their names."""
 
 
@@ -46,7 +46,7 @@ def udev_rules() -> str:
     family that is a device class gets one rule per connected device.
     """
     lines = [
-        "# Lets whoever sits at the machine open haptic devices. Written by",
+        "# Lets the user at the machine's own seat open haptic devices. Written by",
         "# 'hapticbridge devices --udev-rules'. Its number must stay below 73: 73-seat-late.rules",
         "# turns the tag into a permission. To install it:",
         f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",

@@ -126,10 +126,7 @@ def first_fault(table: NDArray[np.float64]) -> tuple[int, str] | None:
     if off.size:
         row = int(off[0])
         faults.append(
-            (
-                row,
-                f"quaternion of norm {norms[row]:.6g}; it must be 1 within {NORM_TOLERANCE:g}",
-            )
+            (row, f"quaternion of norm {norms[row]:.6g}; it must be 1 within {NORM_TOLERANCE:g}")
         )
     return min(faults, default=None)
 

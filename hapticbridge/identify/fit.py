@@ -266,13 +266,7 @@ def windows(
     x = x - x[:, :1]  # ∫φ' and ∫φ'' vanish, so the offset only adds rounding
     of_mass, of_damping = trapezoid * second, -trapezoid * first
     columns = np.stack(
-        [
-            x @ of_mass,
-            x @ of_damping,
-            direction * area,
-            np.full(len(begin), area),
-            -(f @ slope),
-        ],
+        [x @ of_mass, x @ of_damping, direction * area, np.full(len(begin), area), -(f @ slope)],
         axis=1,
     )
     bump = _BUMP(nodes) * trapezoid

@@ -25,20 +25,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.kernel.codes import (
-    COUPLING_ACTUATORS,
-    HANDLE,
-    WELD_NAME,
-    Scheme,
-    State,
-)
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
-from hapticbridge.kernel.coupling import (
-    COUPLING_DTYPE,
-    Gains,
-    bind_coupling,
-    set_tuning_goal,
-)
+from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
 from hapticbridge.kernel.guard import (
     GUARD_DTYPE,
     bind_guard,
@@ -53,12 +42,7 @@ from hapticbridge.kernel.ledger import (
     refresh_energies,
     start_energies,
 )
-from hapticbridge.kernel.lossless import (
-    LOSSLESS_DTYPE,
-    bind_lossless,
-    note_twist,
-    restart_lossless,
-)
+from hapticbridge.kernel.lossless import LOSSLESS_DTYPE, bind_lossless, note_twist, restart_lossless
 from hapticbridge.kernel.mujoco_c import MJ_DTYPE, model_addresses
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (

@@ -73,12 +73,7 @@ def refusal(priority: int, *, locks_memory: bool) -> str:
 
 
 def run(
-    period_ns: int,
-    ticks: int,
-    priority: int,
-    *,
-    locks_memory: bool,
-    core: int | None = None,
+    period_ns: int, ticks: int, priority: int, *, locks_memory: bool, core: int | None = None
 ) -> NDArray[np.int64] | str:
     """Runs one thread at the loop's priority; returns the lateness of each tick in ns.
 

@@ -52,12 +52,7 @@ _ENERGIES = (
     ("device_energy", "given to the device", "#e69f00", "-"),
     ("kinetic", "kinetic", "#555555", "--"),
 )
-_DRAWN = (
-    "wrench_on_tool",
-    "tool_position",
-    "handle_position",
-    *(name for name, *_ in _ENERGIES),
-)
+_DRAWN = ("wrench_on_tool", "tool_position", "handle_position", *(name for name, *_ in _ENERGIES))
 
 
 def decimated(

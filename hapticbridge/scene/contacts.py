@@ -139,11 +139,7 @@ class ContactNumbers:
 
 
 def contact_numbers(
-    solref: Sequence[float],
-    solimp: Sequence[float],
-    timestep: float,
-    *,
-    refsafe: bool = True,
+    solref: Sequence[float], solimp: Sequence[float], timestep: float, *, refsafe: bool = True
 ) -> ContactNumbers:
     """Returns the numbers of a contact setting that the rule uses.
 

@@ -44,7 +44,7 @@ def point_key(point: Mapping[str, Value]) -> str:
     """Returns the key of a point: its names in order with their values, as JSON.
 
     Floats enter with all their digits, so 0.1 + 0.2 and 0.3 are two points. 1, 1.0 and True are
-    three points, because a function may tell them apart.
+    three points, because a function may distinguish them.
     """
     return json.dumps(point, sort_keys=True)
 

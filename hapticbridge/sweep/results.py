@@ -2,7 +2,7 @@
 
 The file is JSON Lines. Its first line names the function, the versions of hapticbridge and MuJoCo
 and a digest of the package's sources. Each other line holds one ``point`` with its ``results`` and
-``error``. A line that was cut by a crash is passed over, and its point is computed again.
+``error``. A line that was cut by a crash is skipped, and its point is computed again.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Table:
         return np.asarray(self.columns["error"] != "", dtype=bool)
 
     def select(self, rows: NDArray[Any]) -> Table:
-        """Returns a table of some rows, chosen by a mask or by their numbers; types stay."""
+        """Returns a table of the rows selected by a mask or by their numbers; types stay."""
         return Table({name: column[rows] for name, column in self.columns.items()})
 
     def write(self, path: str | os.PathLike[str], units: Mapping[str, str] | None = None) -> None:
@@ -98,7 +98,7 @@ class Table:
             units: Unit of a column by its name; Parquet keeps it as metadata ``unit``.
 
         Raises:
-            StudyError: The name ends otherwise, pyarrow is missing, or the file cannot be written.
+            StudyError: The ending is unknown, pyarrow is missing, or the file cannot be written.
         """
         path = Path(path)
         check_format(form := path.suffix.removeprefix("."))
@@ -117,10 +117,11 @@ class Table:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during a sweep.
+    """Interruption of a sweep by Ctrl-C.
 
     Attributes:
-        table: One row for each point that was computed, at least one, in the order of the points.
+        table: One row for each point that was computed, at least one, in the order of the
+            points.
     """
 
     def __init__(self, table: Table) -> None:
@@ -219,7 +220,7 @@ class ResultFile:
         """Appends points and their outcomes.
 
         Raises:
-            StudyError: They cannot be written.
+            StudyError: The file cannot be written.
         """
         lines = [
             json.dumps({"point": point, "results": dict(done.results), "error": done.error}) + "\n"
@@ -235,7 +236,7 @@ class ResultFile:
 
 
 def _parsed(line: bytes) -> dict[str, Any]:
-    """Returns the JSON object on a line, or an empty one where the line is none."""
+    """Returns the JSON object on a line, or an empty one if the line holds none."""
     try:
         found = json.loads(line)
     except ValueError:

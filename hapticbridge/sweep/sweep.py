@@ -37,19 +37,21 @@ _CHUNKS_PER_CORE = 32
 """Tasks per core by default. A kill then costs at most 3 % of a sweep."""
 
 _LARGEST_CHUNK = 256
-"""Points per task at most. Above it, sending and writing cost less than 10 µs per point."""
+"""Largest number of points per task. Above it, sending and writing cost less than 10 µs per
+point."""
 
 _IN_FLIGHT = 64
-"""Tasks in flight on an executor of unknown size. More workers than that would idle."""
+"""Tasks in flight on an executor of unknown size. Further workers would idle."""
 
 _LONGEST_ERROR = 1000
-"""Letters of an error that are kept."""
+"""Largest number of characters of an error that are kept."""
 
 _PATIENCE = 3.0
-"""Time in s for a dask scheduler to answer. A local one takes 0.05 s; a far one needs more."""
+"""Longest wait in s for the answer of a dask scheduler. A local one takes 0.05 s; a far one needs
+more."""
 
 _WORKERS_PATIENCE = 5.0
-"""Time in s for a dask scheduler to have a worker. One that was just started takes 2 s."""
+"""Longest wait in s for a worker of a dask scheduler. One that was just started takes 2 s."""
 
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of the sweep's own processes, unless the user set it. There is one process per core;
@@ -80,22 +82,21 @@ def sweep(
 
     Args:
         function: Takes a point (a dict of parameters) and returns a mapping of results: numbers
-            (NaN and infinity too), flags or text. It stands at the top level of a module, or is a
-            ``functools.partial`` of such a one. Its random numbers must come from the point.
+            (NaN and infinity too), flags or text. It is defined at the top level of a module, or is
+            a ``functools.partial`` of such a function. Its random numbers must come from the point.
         points: Mappings of parameters to finite numbers, flags or text; all with the same names.
             See ``grid``.
         results: File that keeps the results. Points that it holds, failed ones too, are not
             computed again. One sweep at a time may use a file.
-        chunk: Points per task, >= 1; by default 1/32 of a core's share, 256 at most.
+        chunk: Points per task, >= 1; by default 1/32 of a core's share, at most 256.
         executor: Any executor; it stays open. By default fresh processes, one per core.
         scheduler: Address of a dask.distributed scheduler (extra ``cluster``) instead.
-        jobs: Processes at most, >= 1; 1 works in this process.
+        jobs: Largest number of processes, >= 1; 1 works in this process.
         progress: Called with the numbers of finished and of all points, first before any task.
 
     Raises:
         StudyError: The points, the function, the file or the workers cannot be used.
-        Interrupted: Ctrl-C, with the rows of the points that are done; KeyboardInterrupt where
-            none is.
+        Interrupted: Ctrl-C, with the rows of the finished points; KeyboardInterrupt without any.
     """
     name = _name_of(function)
     wanted = checked_points(points)
@@ -157,7 +158,7 @@ def _computed(
     while chunks:
         count = min(jobs or cores(), len(chunks))
         with _processes(function, count) as pool:
-            # one task waits behind each that runs, so that no process is ever without work
+            # one task waits behind each that runs, so that no process idles
             lost = yield from _submitted(pool, function, chunks, 2 * count)
         for point in lost:
             yield [point], [_alone(function, point)]
@@ -236,7 +237,7 @@ def _results(answer: object, point: Point) -> dict[str, Value]:
     """Returns the results of a point with plain values.
 
     Raises:
-        TypeError: They are no mapping with names.
+        TypeError: The results are no mapping with names.
         ValueError: A value is no number, flag or text, or a name is taken.
     """
     if not isinstance(answer, Mapping) or not all(isinstance(name, str) for name in answer):
@@ -263,7 +264,7 @@ def _name_of(function: Callable[[Any], Any]) -> str:
     """Returns a name that identifies a function, with the arguments of a ``functools.partial``.
 
     Raises:
-        StudyError: The function does not stand at the top level of a module, or cannot be sent to
+        StudyError: The function is not defined at the top level of a module, or cannot be sent to
             another process.
     """
     if isinstance(function, functools.partial):
@@ -298,8 +299,8 @@ def _cluster(scheduler: str) -> Iterator[tuple[Executor, int]]:
         await comm.close()
 
     try:
-        # A client that was refused takes 10 s to be given up and prints a traceback, so it is
-        # opened only where something answers. The thread: this one may run a loop already.
+        # A refused client takes 10 s to give up and prints a traceback, so it is opened only after
+        # a port answers. A thread is used because this one may already run an event loop.
         with ThreadPoolExecutor(1) as thread:
             thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()
         client = distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
@@ -317,12 +318,12 @@ def _cluster(scheduler: str) -> Iterator[tuple[Executor, int]]:
                 f"the dask scheduler at {scheduler} has no workers; start some with: "
                 f"dask worker {scheduler}"
             ) from None
-        # a task may have side effects that the caller counts on: never answered from a cache
+        # a task may have side effects that the caller depends on: never use a cached result
         yield client.get_executor(pure=False), sum(client.ncores().values())
 
 
 class _Processes(ProcessPoolExecutor):
-    """Processes with one thread for linear algebra each, that end with this one.
+    """Pool of processes with one thread for linear algebra each; they end with this process.
 
     They are started afresh (spawn): a forked process would inherit the locks of the threads that
     NumPy, MuJoCo and numba start.
@@ -345,10 +346,10 @@ class _Processes(ProcessPoolExecutor):
 
 @contextlib.contextmanager
 def _processes(function: Callable[[Any], Any], count: int) -> Iterator[Executor]:
-    """Opens processes of this sweep's own.
+    """Opens the sweep's own pool of processes.
 
     Raises:
-        StudyError: They cannot start, or cannot import the function.
+        StudyError: The processes cannot start, or cannot import the function.
     """
     pool = _Processes(count)
     try:
@@ -374,7 +375,7 @@ def _start_process() -> None:
 
 
 def _leave_with_parent() -> None:
-    """Ends this process when its parent has ended; a pool's processes would wait for ever."""
+    """Ends this process after its parent has ended; a pool's processes would wait for ever."""
     if parent := multiprocessing.parent_process():
         connection.wait([parent.sentinel])
         os._exit(1)

@@ -290,10 +290,7 @@ def _refined(
         fresh = np.where(rising, lower + width, upper - width)
         value = needed(fresh)
         left, right = np.where(rising, right, fresh), np.where(rising, fresh, left)
-        at_left, at_right = (
-            np.where(rising, at_right, value),
-            np.where(rising, value, at_left),
-        )
+        at_left, at_right = (np.where(rising, at_right, value), np.where(rising, value, at_left))
     for value, inner in ((at_left, left), (at_right, right)):
         better = value > best
         best, place = np.where(better, value, best), np.where(better, inner, place)

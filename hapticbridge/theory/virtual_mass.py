@@ -110,11 +110,7 @@ def _polynomials(k: _Array, g: _Array, inertia: _Array, delay: int) -> tuple[_Ar
     zero = np.zeros_like(k)
     slope = 2 * g * (k + g)
     shift, tilt = ((3.0, -2.0), (1.0, 0.0), (-1.0, 0.0))[delay]
-    real = (
-        (k, -(k + g), zero),
-        (k, g, zero),
-        (k, 3 * g - k, -2 * g),
-    )[delay]
+    real = ((k, -(k + g), zero), (k, g, zero), (k, 3 * g - k, -2 * g))[delay]
     top = [
         zero,
         -inertia * k**2 * shift,

@@ -1,7 +1,7 @@
-"""What can be asked of a run from its page: sliders, switches and buttons, and the answers.
+"""Controls of a run on its page: sliders, switches, buttons, and the answers to them.
 
-The page only asks. What is allowed is decided by the bridge, whatever a browser sends; the bounds
-drawn here are the same ones, so that a slider ends where a refusal would begin.
+The page only sends requests. The bridge decides, whatever a browser sends. The bounds drawn here
+are those of the bridge, so a slider ends where a refusal would begin.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from hapticbridge.rendering import method_named
 from hapticbridge.run_description import parameters_of
 
 PACE = 2.0 * INTERVAL
-"""In s, least time between two lines to the bridge. At its own limit a line that was held up and
-the next one would come too close, and be refused."""
+"""Smallest time in s between two commands to the bridge. At the bridge's own limit a delayed
+command and the next one would come too close, and be refused."""
 
 STILL = 0.5
-"""In s: for so long after the last touch a slider is not put anywhere; it may be in a hand."""
+"""Time in s after the last touch during which no slider is moved by the program. A hand may hold
+it."""
 
 FINENESS = 1e-3
-"""Least step of a slider as a share of its largest value, rounded down to a power of ten. A finer
-one is not felt, a coarser one is."""
+"""Smallest step of a slider as a share of its largest value, rounded down to a power of ten. A
+finer step cannot be felt, a coarser one can."""
 
-_ROUNDING = 1.0 + 1e-9  # a bound of 2 that was found as 1.9999999999 is one of 2
+_ROUNDING = 1.0 + 1e-9  # restores 2 from a bound that was computed as 1.9999999999
 
 SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
 _WORDS = {
@@ -50,7 +51,7 @@ _WORDS = {
 
 
 def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
-    """Returns what the device of a run allows, from the run's metadata."""
+    """Returns the coupling limits of a run's device, from the run's metadata."""
     parameters, method = parameters_of(metadata), method_named(metadata["method"])
     info, guarding = DeviceInfo.from_json(metadata["device"]), parameters.guarding
     limits = Limits(
@@ -72,10 +73,10 @@ def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
 
 
 class Outlet:
-    """Sends the page's commands to the bridge, slowly; of each kind the newest.
+    """Sends the page's commands to the bridge at a limited rate; of each kind only the newest.
 
     Args:
-        file: Descriptor that the bridge reads.
+        file: Descriptor of the pipe to the bridge.
     """
 
     def __init__(self, file: int) -> None:
@@ -84,7 +85,7 @@ class Outlet:
         self._has_news = threading.Condition()
 
     def ask(self, command: Command) -> None:
-        """Takes a command; never waits for the bridge."""
+        """Queues a command; never waits for the bridge."""
         with self._has_news:
             kind = type(command).__name__
             before = self._waiting.pop(kind, None)
@@ -96,12 +97,12 @@ class Outlet:
             self._has_news.notify()
 
     def run(self) -> None:
-        """Sends until the bridge is gone."""
+        """Sends commands until the bridge has closed the pipe."""
         with contextlib.suppress(OSError):
             while True:
                 with self._has_news:
                     self._has_news.wait_for(lambda: self._waiting)
-                    # whoever wants to stop waits for nothing
+                    # a stop is sent first
                     kind = "Stop" if "Stop" in self._waiting else next(iter(self._waiting))
                     command = self._waiting.pop(kind)
                 os.write(self._file, line_of(command))
@@ -109,15 +110,15 @@ class Outlet:
 
 
 class Sliders:
-    """Stiffness and damping along one kind of axis.
+    """Sliders of stiffness and damping along one kind of axis.
 
     Args:
-        gui: Where.
-        span: What the device allows.
-        want: Called when a hand has moved one of them.
+        gui: Page to add the sliders to.
+        span: Coupling limits of the device.
+        want: Called after a user has moved a slider.
 
     Attributes:
-        span: Likewise.
+        span: Coupling limits of the device.
     """
 
     def __init__(
@@ -145,22 +146,22 @@ class Sliders:
 
     @property
     def value(self) -> tuple[float, float]:
-        """What they show; whatever a browser has sent."""
+        """Values of the sliders, clipped to their ranges because a browser may send any number."""
         return self._stiffness.value, self._damping.value
 
     def show(self, stiffness: float, damping: float) -> None:
-        """Puts them to a stiffness and damping."""
+        """Sets both sliders to a stiffness and damping."""
         self.bound(stiffness, damping)
         most = self._stiffness.max, self._damping.max
         shown = self._shown(stiffness, damping, (self._stiffness.min, 0.0), most)
         self._stiffness.value, self._damping.value = shown
 
     def bound(self, stiffness: float, damping: float) -> None:
-        """Puts the end of each to where the other one lets it go."""
+        """Sets the end of each slider to the limit at the other one's value."""
         self._stiffness.max, self._damping.max = self._ends(stiffness, damping, self._stiffness.min)
 
     def ends(self) -> str:
-        """Says where they end."""
+        """Writes the ends of the sliders beside them."""
         symbols, units = SYMBOLS[self.span.axis], UNITS[self.span.axis]
         return (
             f"{symbols[0]} ends at {self._stiffness.max:g} {units[0]}, "
@@ -187,15 +188,15 @@ class Sliders:
 
 
 class Controls:
-    """The page's controls of one run.
+    """Controls of one run on the page.
 
     Args:
-        server: Where.
-        allowance: What the device allows.
-        ask: Hands a command on.
+        server: Server of the page.
+        allowance: Coupling limits of the device.
+        ask: Forwards a command.
 
     Attributes:
-        answer: What became of what was asked for, in words.
+        answer: Text element with the bridge's answer to the last request.
     """
 
     def __init__(
@@ -203,7 +204,7 @@ class Controls:
     ) -> None:
         self._allowance, self._ask = allowance, ask
         self._touched = 0.0
-        # viser calls from as many threads as it likes: an older value must not be asked for last
+        # viser calls from any number of threads: an older value must not be sent last
         self._turn = threading.Lock()
         self._sliders: tuple[Sliders, ...] = ()
         self._said = {"recording": "", "force": "", "answer": ""}
@@ -218,7 +219,7 @@ class Controls:
             reset = gui.add_button("back to the start")
             mark = gui.add_button("mark this moment")
             self.answer = gui.add_markdown("")
-        # how the run is, or soon will be
+        # state of the run, now or after the waiting commands
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
         self._is_forced, self._is_clutched = True, False
         self._force.on_update(by_hand(self._switch_force))
@@ -232,7 +233,7 @@ class Controls:
         return f"{ends}. {self._allowance.reason()}"
 
     def _want(self) -> None:
-        """Asks for what the sliders show."""
+        """Requests the values of the sliders."""
         with self._turn:
             self._touched = time.monotonic()
             try:
@@ -249,7 +250,7 @@ class Controls:
             self._ask(Switch(clutch=bool(self._clutch.value)))
 
     def note(self, event: Mapping[str, Any]) -> None:
-        """Takes an event of the run; the controls then show how it is, not what was asked for."""
+        """Handles an event; the controls then show the state of the run, not the request."""
         kind = event.get("event")
         if kind == "coupling" and self._sliders:
             self._take_coupling(event)
@@ -277,17 +278,17 @@ class Controls:
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)
         self._bounds.content = self._ends()
-        told = "; ".join(
+        text = "; ".join(
             f"{symbol[0]} goes to {pair[0]:.4g} {unit[0]}, {symbol[1]} to {pair[1]:.3g} {unit[1]}"
             for symbol, unit, pair in (
                 (SYMBOLS[sliders.span.axis], UNITS[sliders.span.axis], pair)
                 for sliders, pair in zip(self._sliders, self._gains, strict=True)
             )
         )
-        self._say("answer", told)
+        self._say("answer", text)
 
     def _refuse(self, reason: str) -> None:
-        """Says why, and takes back what was touched: what the run has is shown again."""
+        """Shows the reason of a refusal, and sets the controls back to the state of the run."""
         self._say("answer", f"**refused:** {json.dumps(reason, ensure_ascii=False)[1:-1]}")
         self._touched = -math.inf
         self._show_switches()
@@ -297,7 +298,7 @@ class Controls:
             self._bounds.content = self._ends()
 
     def _say(self, what: str, words: str) -> None:
-        """Says one thing without taking back the others."""
+        """Shows a message; the other controls stay unchanged."""
         self._said[what] = words
         self.answer.content = "  \n".join(words for words in self._said.values() if words)
 
@@ -306,9 +307,10 @@ class Controls:
 
 
 def by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:
-    """Returns a callback that acts on what a browser changed, and not on what this process did.
+    """Returns a callback for changes by a browser, and not by this process.
 
-    viser tells of both; what a run was given by others would come back to it as a wish.
+    viser reports both. A change of the run's state by other means would otherwise return to the run
+    as a request.
     """
 
     def acts(event: viser.GuiEvent[Any]) -> None:

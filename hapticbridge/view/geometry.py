@@ -1,6 +1,6 @@
 """Shapes that the page draws: bodies as triangles, tendons as lines, the coupling as a spring.
 
-Bodies have one colour each. ``NOT_DRAWN`` says what MuJoCo's own viewer draws beyond that.
+Bodies have one colour each. ``NOT_DRAWN`` lists the further elements of MuJoCo's own viewer.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ SHOWN_GROUPS = 3
 NOT_DRAWN = (
     f"Not drawn: textures, flexes, skins, sites, sensors' beams, and groups from {SHOWN_GROUPS} on."
 )
-"""Sentence on the page."""
+"""Sentence on the page about elements that are not drawn."""
 
 PLANE_SIDE = 4.0
-"""Side of a plane without end, as a multiple of the scene's extent. A larger one costs nothing, but
-its edge is the horizon of a camera that is moved far away."""
+"""Side of an infinite plane as a multiple of the scene's extent. A larger one costs nothing. Its
+edge is the horizon of a camera that is moved far away."""
 
 CREASE = math.radians(40.0)
 """Angle in rad between triangles beyond which their edge is drawn sharp. Below it a surface is
@@ -33,11 +33,12 @@ drawn round."""
 
 MOST_SAMPLES = 200
 """Largest number of samples of a height field along a side that are drawn. 200 make 80 000
-triangles, some 2 MB that a browser loads once. Of a finer field every second, third … is drawn."""
+triangles, some 2 MB that a browser loads once. A finer field is drawn with every second, third …
+sample."""
 
 MOST_PIECES = 10_000
 """Largest number of straight pieces of all tendons, as in MuJoCo's own renderer. A tendon around a
-pulley has some ten."""
+pulley has about ten."""
 
 MOST_TIMES = 500
 """Largest enlargement of the coupling's stretch. Beyond it noise would shake the spring."""
@@ -47,9 +48,9 @@ SHELL = 0.012
 flickers, farther it looks like another tool."""
 
 TURNS, POINTS = 8, 64
-"""Turns of the drawn spring, and straight pieces of its line."""
+"""Turns of the drawn spring, and number of straight pieces of its line."""
 
-_GREY = np.array([0.5, 0.5, 0.5, 1.0])  # MuJoCo's colour of a geom that names none
+_GREY = np.array([0.5, 0.5, 0.5, 1.0])  # MuJoCo's default colour of a geom
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class Prop:
     """A geom that can be drawn.
 
     Attributes:
-        body: Index of the body that it moves with.
+        body: Index of its body.
         place: Position in the body's frame, (3,) in m.
         turn: Orientation in the body's frame, a quaternion (4,).
         mesh: Its surface in m, split at sharp edges.
@@ -93,7 +94,7 @@ def props_of(model: mujoco.MjModel) -> list[Prop]:
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> Array:
-    """Returns a geom's own colour, or its material's; of a texture the mean."""
+    """Returns a geom's own colour, or its material's; for a texture the mean."""
     own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     is_own = material < 0 or not np.allclose(own, _GREY)
     colour = np.array(own if is_own else model.mat_rgba[material], dtype=np.float64)
@@ -102,7 +103,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> Array:
         channels, first = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
         size = int(model.tex_height[texture]) * int(model.tex_width[texture])
         texels = model.tex_data[first : first + size * channels].reshape(size, channels)
-        colour[:3] *= texels[:, :3].mean(axis=0) / 255.0  # one channel is a grey
+        colour[:3] *= texels[:, :3].mean(axis=0) / 255.0  # one channel is a grey image
     return colour
 
 
@@ -111,10 +112,10 @@ def _shape(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float64], NDArr
     if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
         field = int(model.geom_dataid[geom])
         corners = terrain(model, field).reshape(-1, 3)
-        # every triangle by itself: the tool feels the facets
+        # separate triangles: the tool feels the facets
         return corners, np.arange(len(corners)).reshape(-1, 3)
     if kind in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
-        # MuJoCo has a mesh of a signed distance field, too, where the distance is 0
+        # MuJoCo also has a mesh of a signed distance field, at its zero level
         mesh = int(model.geom_dataid[geom])
         first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
         start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
@@ -150,9 +151,9 @@ def terrain(model: mujoco.MjModel, field: int) -> Array:
 
         x = r_x (2 j / (columns − 1) − 1),  y = r_y (2 i / (rows − 1) − 1),  z = r_z · sample
 
-    so the first row is the one of least y. Each cell is cut from its first corner to the one across
-    (i + 1, j + 1); the sides go down to the base at z = −r_b. r = (r_x, r_y, r_z, r_b) is the
-    field's size in m.
+    so the first row has the smallest y. Each cell is cut from its first corner to the one across (i
+    + 1, j + 1); the sides go down to the base at z = −r_b. r = (r_x, r_y, r_z, r_b) is the field's
+    size in m.
 
     Args:
         model: The scene.
@@ -209,7 +210,7 @@ class Tendons:
             return
         self._scene = mujoco.MjvScene(model, MOST_PIECES)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
-        # nothing but tendons, which takes microseconds
+        # tendons alone, which takes microseconds
         option = self._option
         for groups in (option.geomgroup, option.sitegroup, option.flexgroup, option.skingroup):
             groups[:] = 0
@@ -225,7 +226,7 @@ class Tendons:
         """Returns the straight pieces of each tendon, (m, 2, 3) in m.
 
         Args:
-            data: With bodies in place (``mj_kinematics``); its tendons are computed here.
+            data: State after ``mj_kinematics``; its tendons are computed here.
         """
         found: dict[int, list[Array]] = {tendon: [] for tendon in self._shown}
         for piece in self._drawn(data) if self._shown else ():
@@ -235,7 +236,7 @@ class Tendons:
         return tuple(np.array(each, np.float32).reshape(-1, 2, 3) for each in found.values())
 
     def _drawn(self, data: mujoco.MjData) -> list[mujoco.MjvGeom]:
-        """Returns the geoms that MuJoCo would draw of tendons."""
+        """Returns the geoms that MuJoCo would draw for tendons."""
         assert self._scene is not None
         mujoco.mj_comPos(self._model, data)
         mujoco.mj_tendon(self._model, data)
@@ -284,14 +285,14 @@ class Surfaces:
 
     References:
         Möller & Trumbore, "Fast, minimum storage ray–triangle intersection", 1997; their triple
-        products are turned so that all but the direction is known beforehand.
+        products are rearranged so that all but the direction is precomputed.
     """
 
     def __init__(self, triangles: Array) -> None:
         first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         back = -triangles[:, 0]
         other = np.cross(back, first)
-        # what each gives along a direction: the volume, and it times u and v
+        # terms of each triangle along a direction: the volume, and its products with u and v
         self._products = np.stack([np.cross(second, first), np.cross(second, back), other])
         self._far = np.einsum("ij,ij->i", second, other)
 
@@ -302,14 +303,14 @@ class Surfaces:
             along: A unit vector.
         """
         volume, u, v = self._products @ along
-        volume[np.abs(volume) < 1e-30] = np.nan  # edge on or without area: nothing meets it
+        volume[np.abs(volume) < 1e-30] = np.nan  # edge on or without area: no intersection
         u, v, far = u / volume, v / volume, self._far / volume
         is_hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (far > 0.0)
         return float(far[is_hit].max(initial=0.0))
 
 
 def enlargement(room: float, stretch: float) -> int:
-    """Returns the enlargement of a stretch that fits into a room: 1, 2, 5, 10 and so on.
+    """Returns the enlargement of a stretch that fits into a length: 1, 2, 5, 10 and so on.
 
     Args:
         room: Largest drawn length in m, > 0.

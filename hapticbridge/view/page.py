@@ -1,4 +1,4 @@
-"""The page: the scene in three dimensions with the coupling, and curves beside it."""
+"""Page of a run: the scene in three dimensions with the coupling, and curves beside it."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Sight:
             model: The scene.
             data: Positions after the tick; the poses of bodies are computed here.
             row: Record of the tick, one element of ``TICK_DTYPE``.
-            tendons: The scene's.
+            tendons: Tendons of the scene.
             contacts: Position in m and force in N of each contact, (n, 2, 3).
         """
         mujoco.mj_kinematics(model, data)
@@ -127,11 +127,11 @@ class Sight:
 class Trace:
     """Curves of a run, thinned without losing a peak.
 
-    Each look adds one point: the largest force and lateness since the last look, and the energies
-    now.
+    Each call of ``add`` adds one point: the largest force and lateness since the last call, and the
+    present energies.
 
     Args:
-        length: Points that are kept, >= 2; None keeps all.
+        length: Number of points to keep, >= 2; None keeps all.
     """
 
     def __init__(self, length: int | None = None) -> None:
@@ -141,12 +141,12 @@ class Trace:
         """Adds a point.
 
         Args:
-            rows: Records since the last look, at least one.
-            slack: What the environment may have created by now, in J; NaN where unknown.
+            rows: Records since the last call, at least one.
+            slack: Energy in J that the environment may have created so far; NaN if unknown.
         """
         last = rows[-1]
         if self._points and 1e-9 * float(last["deadline_ns"]) < self._points[-1][0]:
-            self._points.clear()  # the run began anew
+            self._points.clear()  # the run restarted
         created = float(last["environment_energy"])
         late = rows["wake_ns"] - rows["deadline_ns"]
         self._points.append(
@@ -173,10 +173,10 @@ class Trace:
 class Ghost:
     """Drawing of the coupling: a ghost at the handle, a spring, an arrow for the force.
 
-    Handle and tool are rarely farther apart than a few tenths of a millimetre, which no picture
-    shows. So the ghost is a shell around the tool, where the tool would be if the coupling were not
-    stretched. The spring goes from its surface towards the tool, several times as long as the
-    stretch; the page says how many times. A stretch that can be seen is drawn from handle to tool.
+    Handle and tool are rarely farther apart than a few tenths of a millimetre, which is invisible
+    in a picture. The ghost is therefore a shell around the tool, at the tool's pose without
+    stretch. The spring goes from its surface towards the tool, several times as long as the
+    stretch; the page shows the factor. A visible stretch is drawn from handle to tool.
 
     Args:
         scene: viser's scene.
@@ -210,7 +210,7 @@ class Ghost:
         )
 
     def allow(self, stretch: float) -> None:
-        """Makes room for a distance between handle and tool, in m."""
+        """Enlarges the scale for a distance between handle and tool, in m."""
         self._longest = max(self._longest, stretch)
         self.times = enlargement(FARTHEST * self._extent, self._longest)
 
@@ -227,7 +227,7 @@ class Ghost:
         self.allow(stretch)
         self._handle.position, self._handle.wxyz = sight.handle, sight.handle_turn
         colour = linear(255.0 * force_colour(strength, reference))
-        # it begins outside of what the hand holds, unless it truly ends at the tool
+        # it begins on the ghost's surface, unless it truly ends at the tool
         start = sight.handle
         if self.times > 1 and stretch > 0.0:
             turn = np.zeros(9)
@@ -246,9 +246,9 @@ class Ghost:
 
 
 def linear(colour: ArrayLike) -> tuple[int, int, int]:
-    """Returns a colour as viser wants it for lines and arrows, which it draws lighter than it is.
+    """Returns a colour for viser's lines and arrows, corrected for viser drawing them too light.
 
-    It takes their numbers, 0 to 255, for shares of light and not for sRGB.
+    viser interprets their numbers, 0 to 255, as linear light and not as sRGB.
     """
     share = np.asarray(colour, dtype=np.float64) / 255.0
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
@@ -260,9 +260,9 @@ class Page:
     """Draws instants of one run on viser's page.
 
     Args:
-        server: Where.
+        server: Server of the page.
         model: The run's scene.
-        parameters: Of the run.
+        parameters: Parameters of the run.
         facts: Scene and method, as recorded.
         reference: The force in N that is drawn longest and reddest, > 0.
     """
@@ -281,11 +281,11 @@ class Page:
         self._ghost = Ghost(server.scene, model, parameters.grip)
         server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
         self.status = server.gui.add_markdown("waiting for the first tick")
-        self._told = _told(model, parameters, facts)
+        self._caption = _caption(model, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []
 
     def add_curves(self) -> None:
-        """Adds the curves and what the colours mean, below what is there."""
+        """Adds the curves and the legend of the colours below the controls."""
         gui = self._server.gui
         self._words = gui.add_markdown("")
         self._explain()
@@ -308,10 +308,10 @@ class Page:
                     legend={"show": len(names) > 1},
                 )
             )
-        gui.add_markdown(self._told)
+        gui.add_markdown(self._caption)
 
     def allow(self, sights: Sequence[Sight]) -> None:
-        """Makes room for what is known to come."""
+        """Enlarges the scales for known later values."""
         for sight in sights:
             self._ghost.allow(float(np.linalg.norm(sight.handle - sight.grip)))
             self._strongest = max(self._strongest, _strongest(sight))
@@ -348,7 +348,7 @@ class Page:
         """Draws the curves.
 
         Args:
-            time: In s, (n,), n >= 2.
+            time: Times in s, (n,), n >= 2.
             lines: One per line of ``PLOTS``, (n,) each, in its unit.
         """
         rest = iter(lines)
@@ -417,12 +417,12 @@ class Page:
 
 
 def _strongest(sight: Sight) -> float:
-    """Returns the largest force of an instant; a lever's contacts carry far more than the hand."""
+    """Returns the largest force of an instant; contacts at a lever carry far more than the hand."""
     contacts = np.linalg.norm(sight.contact_forces, axis=1)
     return float(max(np.linalg.norm(sight.force), contacts.max(initial=0.0)))
 
 
-def _told(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
+def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
     method = method_named(facts.get("method", ""))
     sentences = coupling_sentences(
         parameters.coupling,

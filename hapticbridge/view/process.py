@@ -1,4 +1,4 @@
-"""The process that shows a run while it goes on. The loop never waits for it.
+"""Process that shows a run while it continues. The loop never waits for it.
 
 It reads the newest positions of the scene (``recording.snapshot``) and the records of the ring, and
 draws them on the page. It ends when its input does.
@@ -32,13 +32,13 @@ from hapticbridge.view.server import serve
 from hapticbridge.view.window import Address
 
 FRAME = 1 / 30
-"""Time in s between two pictures, as often as the bridge publishes them."""
+"""Time in s between two pictures, equal to that between the bridge's snapshots."""
 
 REPLOT = 0.2
 """Time in s between two drawings of the curves, which cost a browser more than the scene."""
 
 FAREWELL = 0.3
-"""Time in s that the process stays after the run, so that the last words reach the page."""
+"""Time in s that the process stays after the run, so that the last messages reach the page."""
 
 BEHIND = 19
 """Niceness of this process: all other work comes first."""
@@ -48,7 +48,7 @@ TRACE = 600
 
 
 class LiveRun:
-    """A run that goes on, as the bridge publishes it.
+    """A running run as the bridge publishes it.
 
     Args:
         ring: The run's records.
@@ -88,7 +88,7 @@ class LiveRun:
         return sight
 
     def _gather(self, slack: float) -> None:
-        """Adds the records since the last look to the curves."""
+        """Adds the records since the last call to the curves."""
         number, rows = self._ring.since(self._gathered)
         self._gathered = number + len(rows)
         if rows.size:
@@ -96,7 +96,7 @@ class LiveRun:
 
 
 def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
-    """Returns metadata and attachments of a run that goes on as a recording without ticks."""
+    """Returns metadata and attachments of a running run as a recording without ticks."""
     return RecordingFile(
         path=Path("live"),
         count=0,
@@ -119,7 +119,7 @@ def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) 
     inbox.put(None)
 
 
-def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
+def _read_job(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
     job = json.loads(stream.readline())
     files = {name: stream.read(size) for name, size in job["attachments"]}
     run = run_of(job["metadata"], files)
@@ -129,15 +129,15 @@ def _told(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
 def _calm() -> None:
     if sys.platform == "linux":
         with contextlib.suppress(OSError):
-            # idle: any other process that wakes on this core takes it at once; niceness alone lets
-            # a loop without real-time priority wait for the rest of a slice
+            # Idle priority: any other process that wakes on this core preempts it at once. Niceness
+            # alone lets a loop without real-time priority wait for the rest of a slice.
             os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     if hasattr(os, "nice"):
         os.nice(BEHIND)
 
 
 def _ending(event: dict[str, Any]) -> str:
-    """Returns why a run ended, if that is what an event says."""
+    """Returns the reason of a run's end if an event contains it."""
     if event.get("event") == "trip" or (event.get("event") == "stop" and "overruns" in event):
         return str(event.get("reason"))
     return ""
@@ -165,7 +165,7 @@ def _follow(
         if now - plotted >= REPLOT and len(live.trace) > 1:
             plotted = now
             page.plot(*live.trace.curves())
-        # from the last due time on, so that a late picture does not make all later ones late
+        # counted from the last due time, so that a late picture does not delay all later ones
         due = max(due + FRAME, now)
         time.sleep(due - now)
 
@@ -173,17 +173,17 @@ def _follow(
 def run() -> None:
     """Runs the process."""
     _calm()
-    # what viser prints is no answer to the bridge
+    # keeps viser's prints out of the answers to the bridge
     answers, sys.stdout = sys.stdout, sys.stderr
     stream = sys.stdin.buffer
-    job, told = _told(stream)
+    job, run = _read_job(stream)
     try:
-        live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], told)
+        live = LiveRun(Ring.attach(job["ring"]), job["snapshot"], run)
         address = Address(job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
-        page = Page(server, live.model, live.parameters, dict(told.meta), live.reference)
-        controls = Controls(server, allowance_of(told.meta), outlet.ask)
+        page = Page(server, live.model, live.parameters, dict(run.meta), live.reference)
+        controls = Controls(server, allowance_of(run.meta), outlet.ask)
         page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)
@@ -195,4 +195,4 @@ def run() -> None:
     reason = _follow(live, page, controls, inbox) or "the bridge is gone"
     page.status.content = f"**The run is over** ({reason}). This is how it was at the end."
     time.sleep(FAREWELL)
-    os._exit(0)  # viser's threads would hold an ordinary exit up
+    os._exit(0)  # viser's threads would delay an ordinary exit

@@ -21,11 +21,11 @@ from hapticbridge.view.server import serve, stop
 from hapticbridge.view.window import Address
 
 FRAME = 1 / 30
-"""Seconds between two instants that can be chosen, unless there would be more than ``MOST``."""
+"""Time in s between two selectable instants, unless there would be more than ``MOST``."""
 
 MOST = 18_000
-"""Instants of a run at most: ten minutes at 30 a second, some 30 MB. A longer run has longer
-steps."""
+"""Largest number of instants of a run: ten minutes at 30 a second, some 30 MB. A longer run has
+longer steps."""
 
 Progress = Callable[[int, int], None]
 
@@ -35,16 +35,16 @@ class Replay:
 
     Args:
         path: The recording.
-        progress: Called with instants done and to do.
+        progress: Called with the finished and all instants.
 
     Attributes:
         stage: The run, at its end.
         sights: Its instants.
-        step: Seconds between two of them.
+        step: Time in s between two of them.
         trace: Its curves.
 
     Raises:
-        RecordingError: It is no recording, or cannot be simulated again here.
+        RecordingError: The file is no recording, or cannot be simulated again here.
     """
 
     def __init__(self, path: str | Path, progress: Progress | None = None) -> None:
@@ -63,7 +63,7 @@ class Replay:
                 progress(number + 1, count)
 
     def at(self, moment: float) -> Sight:
-        """Returns the instant nearest to a time in s; the first for what is no time."""
+        """Returns the instant nearest to a time in s; the first for a value that is no time."""
         if math.isnan(moment):
             return self.sights[0]
         return self.sights[round(min(max(moment / self.step, 0.0), len(self.sights) - 1.0))]
@@ -81,14 +81,14 @@ def contacts_of(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float6
 
 
 class Theatre:
-    """Serves a replay.
+    """Server of a replay.
 
     Args:
-        replay: What is shown.
-        address: Where.
+        replay: Replay to show.
+        address: Address of the page.
 
     Attributes:
-        url: What to open in a browser.
+        url: Address to open in a browser.
 
     Raises:
         HapticBridgeError: The page cannot be served.
@@ -96,7 +96,7 @@ class Theatre:
 
     def __init__(self, replay: Replay, address: Address) -> None:
         self._replay = replay
-        # viser calls from as many threads as it likes: an older time must not be drawn last
+        # viser calls from any number of threads: an older time must not be drawn last
         self._turn = threading.Lock()
         self._server: viser.ViserServer = serve(address)
         self.url = address.url(self._server.get_port())
@@ -128,13 +128,13 @@ class Theatre:
         self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
 
     def play(self, is_over: threading.Event) -> None:
-        """Moves the slider with the time where that is asked for, until it is over."""
+        """Moves the slider with the time while playback is on, until the server is closed."""
         before = time.monotonic()
         while not is_over.wait(FRAME):
             now, last = time.monotonic(), self._replay.sights[-1].time
             if self._playing.value:
                 following = self.slider.value + now - before
-                # which shows it, as if a hand had done it
+                # setting the value shows the instant, as a user's move does
                 self.slider.value = following if 0.0 <= following <= last else 0.0
             before = now
 
@@ -143,5 +143,5 @@ class Theatre:
             self.show(self.slider.value)
 
     def close(self) -> None:
-        """Ends serving."""
+        """Stops serving."""
         stop(self._server)

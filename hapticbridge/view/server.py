@@ -1,4 +1,4 @@
-"""viser's server, where each request must pass a check of its host, its origin and its token."""
+"""Server of viser's page, with a check of host, origin and token before every request."""
 
 from __future__ import annotations
 
@@ -36,14 +36,15 @@ def serve(address: Address) -> viser.ViserServer:
     """
     with _SERVING, _behind(address), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=HOST, port=address.port, verbose=False)
-    if address.port and server.get_port() != address.port:  # viser takes the next one instead
+    # viser would take the next free port instead
+    if address.port and server.get_port() != address.port:
         stop(server)
         raise HapticBridgeError(f"port {address.port} is in use; choose another with --port")
     if not _is_guarded(server.get_port()):
         stop(server)
         raise HapticBridgeError("this version of viser skips the check of the token")
-    # viser would carry the page to a server of its own on the internet if a browser asked for it,
-    # and keep files that a browser sends
+    # viser would forward the page to its server on the internet at a browser's request, and keep
+    # files that a browser sends
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     _take_values_alone(server)
@@ -58,15 +59,16 @@ def serve(address: Address) -> viser.ViserServer:
 
 def stop(server: viser.ViserServer) -> None:
     """Stops serving."""
-    with contextlib.redirect_stdout(io.StringIO()):  # viser says so, in the middle of our answers
+    # viser prints this in the middle of our answers
+    with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def _take_values_alone(server: viser.ViserServer) -> None:
-    """Lets a browser change the value of an element, and nothing else of it.
+    """Lets a browser change the value of an element, and no other attribute.
 
-    viser sets any attribute of its handle that a message names: ``removed`` would take the button
-    that stops a run off all pages, ``props`` would end this process.
+    viser sets any attribute of its handle that a message names. ``removed`` would remove the stop
+    button from all pages; ``props`` would end this process.
     """
     kind, take = viser._messages.GuiUpdateMessage, server.gui._handle_gui_updates
 
@@ -92,7 +94,7 @@ def _is_guarded(port: int) -> bool:
 
 @contextlib.contextmanager
 def _behind(address: Address) -> Iterator[None]:
-    """Puts the check before all that is served meanwhile; viser has no hook for it."""
+    """Inserts the check before every response; viser has no hook for it."""
     module: Any = websockets.asyncio.server
     plain = module.serve
 
@@ -103,7 +105,7 @@ def _behind(address: Address) -> Iterator[None]:
 
     # viser looks the name up in its server's thread, which runs once ViserServer() returns
     module.serve = guarded
-    # neither refusals nor messages that viser cannot read are news
+    # neither refusals nor messages that viser cannot read are errors to report
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
@@ -114,7 +116,7 @@ def _behind(address: Address) -> Iterator[None]:
 
 def _door(address: Address, inner: Process | None) -> Process:
     async def ask(connection: Any, request: Request) -> Response | None:
-        # repeated headers would let one through for another
+        # a repeated header could hide one value behind another
         headers = {name.lower(): request.headers.get_all(name) for name in request.headers}
         repeated = any(len(headers.get(name, [])) > 1 for name in ("host", "origin", "cookie"))
         first = {name: values[0] for name, values in headers.items()}

@@ -1,4 +1,4 @@
-"""The view as the bridge sees it: its address, and the process that shows the run."""
+"""The bridge's interface to the view: its address, and the process that shows the run."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
 
 HOST = "127.0.0.1"
-"""Address on which pages are served. Other machines reach it through an SSH tunnel alone."""
+"""Host name on which pages are served. Other machines reach it through an SSH tunnel alone."""
 
 PATIENCE = 2.0
-"""Longest time in s for the process to end. The run is over by then, and no force is left."""
+"""Longest wait in s for the process to end. The run is over by then, and the force is zero."""
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
@@ -113,7 +113,7 @@ class Address:
 
 
 def _cookie_name(host: str) -> str:
-    # browsers share cookies between ports; two pages must not take each other's away
+    # browsers share cookies between ports; two pages must not overwrite each other's
     return f"hapticbridge_{host.rpartition(':')[2]}"
 
 
@@ -165,7 +165,7 @@ class Window:
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
-        """Starts the process and waits until the page is there.
+        """Starts the process and waits until it serves the page.
 
         Raises:
             HapticBridgeError: The page cannot be served.
@@ -227,20 +227,21 @@ class Window:
         with contextlib.suppress(OSError, ValueError):
             while line := stream.readline(LONGEST_LINE + 1):
                 if not line.endswith(b"\n"):
-                    return  # longer than any command: not the process that was started
+                    return  # longer than any command, so not from the process that was started
                 try:
                     command = command_of(line)
                     if self.on_command is not None:
                         self.on_command(command)
                 except CommandError as error:
                     self.event({"event": "refused", "reason": str(error)})
-                # the loop shares the interpreter's lock with this thread: a flood must not take it
+                # the loop shares the interpreter's lock with this thread: a flood must not occupy
+                # it
                 time.sleep(INTERVAL)
 
     def _send(self) -> None:
         process = self._process
         stream = cast(IO[bytes], process and process.stdin)
-        # a process that died is told no more; the queue then grows by an event now and then
+        # a dead process receives nothing; the queue then grows by an event now and then
         with contextlib.suppress(OSError, ValueError):
             while (piece := self._outbox.get()) is not None:
                 stream.write(piece)

@@ -204,11 +204,7 @@ noise."""
 
 
 def intended(
-    info: DeviceInfo,
-    hand: Hand,
-    ticks: NDArray[np.void],
-    period: float,
-    start: tuple[float, ...],
+    info: DeviceInfo, hand: Hand, ticks: NDArray[np.void], period: float, start: tuple[float, ...]
 ) -> Array:
     """Returns the hand's intended motion p, as a ``Motion.table`` relative to the start.
 
@@ -273,10 +269,7 @@ def _mean_wrench(wrench: Array, delay: int) -> Array:
 
 
 def _solve_intent(
-    moved: Array,
-    force: Array,
-    period: float,
-    law: tuple[float, float, float, float, float],
+    moved: Array, force: Array, period: float, law: tuple[float, float, float, float, float]
 ) -> Array:
     """Solves b_h p' + k_h p = M a + β v + k_h x − w + f_c sign(v) for p, by the bilinear rule.
 

@@ -215,10 +215,7 @@ USUAL: dict[str, Report] = {
         kind=OUT,
         number=5,
         usage=PID | 0x73,
-        parts=(
-            _index(),
-            Part(name="magnitude", usage=PID | 0x70, bits=16, low=-32767, high=32767),
-        ),
+        parts=(_index(), Part(name="magnitude", usage=PID | 0x70, bits=16, low=-32767, high=32767)),
     ),
     "envelope": _envelope(2, 8, 8),
     "operation": Report(

@@ -22,11 +22,7 @@ DEVICES: dict[str, tuple[Callable[[], UsbDevice], str, tuple[str, ...]]] = {
     "falcon": (falcon, FALCON, ("peg_in_hole",)),
     "rawhid": (rawhid, "rawhid", ("peg_in_hole",)),
     # a scene in x and z for a stick in x and y
-    "pid": (
-        stick,
-        STICK,
-        ("planar_peg", "--axes", *"100", *("0", "0", "-1"), *"010"),
-    ),
+    "pid": (stick, STICK, ("planar_peg", "--axes", *"100", *("0", "0", "-1"), *"010")),
 }
 """What is plugged in, as what it is opened, and the scene to run."""
 

@@ -160,24 +160,12 @@ def solve(
     For a determinant of 0 the answer is unchanged.
     """
     a, b, c = rows[0], rows[1], rows[2]
-    x0, x1, x2 = (
-        b[1] * c[2] - b[2] * c[1],
-        b[2] * c[0] - b[0] * c[2],
-        b[0] * c[1] - b[1] * c[0],
-    )
+    x0, x1, x2 = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
     determinant = a[0] * x0 + a[1] * x1 + a[2] * x2
     if determinant == 0.0:
         return 0.0
-    y0, y1, y2 = (
-        c[1] * a[2] - c[2] * a[1],
-        c[2] * a[0] - c[0] * a[2],
-        c[0] * a[1] - c[1] * a[0],
-    )
-    z0, z1, z2 = (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    y0, y1, y2 = (c[1] * a[2] - c[2] * a[1], c[2] * a[0] - c[0] * a[2], c[0] * a[1] - c[1] * a[0])
+    z0, z1, z2 = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     answer[0] = (right[0] * x0 + right[1] * y0 + right[2] * z0) / determinant
     answer[1] = (right[0] * x1 + right[1] * y1 + right[2] * z1) / determinant
     answer[2] = (right[0] * x2 + right[1] * y2 + right[2] * z2) / determinant
@@ -315,10 +303,7 @@ BELIEVED, OUT_OF_REACH, JUMP = 0, 1, 2
 
 @compiled
 def believe(
-    motions: NDArray[np.void],
-    replies: NDArray[np.void],
-    samples: NDArray[np.void],
-    elapsed: float,
+    motions: NDArray[np.void], replies: NDArray[np.void], samples: NDArray[np.void], elapsed: float
 ) -> int:
     """Converts a reply into a sample in the device's frame, if it is plausible.
 

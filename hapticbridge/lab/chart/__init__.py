@@ -2,6 +2,6 @@
 
 Read ``setting`` (the method of a point), ``workload`` (its task and score) and ``chart`` (points
 judged, then timed) first. Workloads are in ``catalogue``; most run as a ``scene_run``, and other
-engines do the same work as an ``engine_run``. ``output`` recommends, draws and writes. ``work`` is
-another question: growth of a tick's time with the content of a scene.
+engines do the same work as an ``engine_run``. ``output`` recommends, draws and writes. ``work``
+measures the growth of a tick's time with the content of a scene.
 """

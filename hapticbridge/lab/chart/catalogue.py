@@ -1,4 +1,4 @@
-"""The workloads by name; any scene with a hand path is one too."""
+"""Workloads by name, any scene with a hand path among them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from hapticbridge.lab.chart.workload import Workload
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """What a chart's time steps mean to a workload.
+    """Time steps of a chart that a workload depends on.
 
     Attributes:
-        grid: Longest period T in s, at whose multiples runs are compared.
-        finest: Shortest in s.
+        grid: Longest period T in s; runs are compared at its multiples.
+        finest: Shortest period T in s.
     """
 
     grid: float
@@ -23,7 +23,7 @@ class Extent:
 
 
 def open_workload(name: str, extent: Extent) -> Workload:
-    """Returns a workload by its name, or that of a scene.
+    """Returns a workload by its name, or by that of a scene.
 
     Raises:
         HapticBridgeError: There is no such scene, or it has no hand path.

@@ -46,16 +46,16 @@ def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
 
 
 REPEATS = 7
-"""Rounds at most; the median of seven is not moved by three that were disturbed."""
+"""Largest number of rounds. Three disturbed rounds do not move the median of seven."""
 
 LEAST_REPEATS = 3
-"""Rounds at least, whatever they take: a median needs them."""
+"""Smallest number of rounds, however long they take: a median needs them."""
 
 PATIENCE = 45.0
 """Time in s after which no new round begins."""
 
 SEED = 7
-"""Of the order within a round, so that no point always follows the same other one."""
+"""Seed of the order within a round, so that no point always follows the same other one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +64,12 @@ class Cost:
 
     Attributes:
         median: Over the rounds; nan where a run failed before it could be timed.
-        low: Least.
+        low: Smallest.
         high: Largest.
         ratio: Median of the ratio to the baseline, each taken within one round; no unit.
-        ratio_low: Least of these.
-        ratio_high: Largest.
-        repeats: Rounds.
+        ratio_low: Smallest ratio.
+        ratio_high: Largest ratio.
+        repeats: Number of rounds.
     """
 
     median: float
@@ -83,7 +83,7 @@ class Cost:
 
 @contextmanager
 def one_core() -> Iterator[int | None]:
-    """Keeps this thread on one core; yields which, None where the system has no such call."""
+    """Keeps this thread on one core; yields its number, None if the system has no such call."""
     if not hasattr(os, "sched_setaffinity"):
         yield None
         return
@@ -97,7 +97,7 @@ def one_core() -> Iterator[int | None]:
 
 
 def machine(core: int | None) -> str:
-    """Names the machine and the core that was measured on."""
+    """Returns the name of the machine and of the measured core."""
     where = "not pinned" if core is None else f"pinned to core {core} of {os.cpu_count()}"
     return f"{processor()}, one thread, {where}"
 
@@ -111,14 +111,14 @@ def interleaved_costs(
     clock: Callable[[], float] = time.perf_counter,
     progress: Callable[[int], None] | None = None,
 ) -> list[Cost]:
-    """Runs all in rounds, in another order each round, so that a disturbance meets everyone.
+    """Runs all in rounds, in another order each round, so that a disturbance affects every run.
 
-    The runs have been run before, which warmed them up.
+    The runs were executed once before, which warmed them up.
 
     Args:
-        runs: What to time.
-        baseline: Index of the run that ratios are to.
-        repeats: Rounds at most, >= 1.
+        runs: Functions to time.
+        baseline: Index of the run that ratios refer to.
+        repeats: Largest number of rounds, >= 1.
         patience: Time in s after which no further round begins, from the third round on.
         clock: Time in s.
         progress: Called with the number of runs done.
@@ -145,7 +145,7 @@ def interleaved_costs(
 
 
 def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Returns median, least and largest of the rounds that were timed; nan where none was."""
+    """Returns median, smallest and largest of the timed rounds; nan without any."""
     known = values[np.isfinite(values)]
     if not known.size:
         return (float("nan"),) * 3
@@ -158,13 +158,13 @@ class Measurement:
 
     Attributes:
         panel: Key of the panel.
-        setting: How it was simulated.
-        cost: What it cost.
-        score: How wrong it was.
-        chosen: Contacts and solver as the engine got them, by name.
-        limit_apart: Where errors are counted from each method's own limit: how far that limit
-            lies from the one that most methods agree on, in JND. 0 where they are counted from
-            the truth.
+        setting: Setting of the simulation.
+        cost: Processor time.
+        score: Errors.
+        chosen: Contacts and solver of the engine, by name.
+        limit_apart: Where errors are counted from each method's own limit: the distance in JND of
+            that limit from the one that most methods agree on. 0 where they are counted from the
+            truth.
     """
 
     panel: str
@@ -176,26 +176,26 @@ class Measurement:
 
     @property
     def is_comparable(self) -> bool:
-        """Whether its error can be compared with those of other methods.
+        """True if its error can be compared with those of other methods.
 
-        Not where it is smaller than the distance of what the methods' errors are counted from.
+        An error below the distance between the methods' references cannot be compared.
         """
         return not self.score.felt < self.limit_apart
 
     @property
     def is_sound(self) -> bool:
-        """Whether the environment was passive and the run stayed in contact."""
+        """True if the environment was passive and the run stayed in contact."""
         return self.score.verdict in PASSIVE
 
     @property
     def is_usual(self) -> bool:
-        """Whether nothing but method and period was chosen."""
+        """True if nothing but method and period was chosen."""
         setting = self.setting
         is_plain = setting.contact == SHIPPED and setting.iterations is None
         return is_plain and setting.substeps == 1
 
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
-        """Returns the row of a table: every choice, every number."""
+        """Returns the row of a table with every choice and every number."""
         setting, method = self.setting, self.setting.method
         used = method.used(coupling, setting.timestep)
         return {
@@ -222,21 +222,22 @@ class Measurement:
 
 
 RESOLVED = 1e-5
-"""Error in JND below which a reference's own error may count, no unit: no order is taken from it.
-Five times what the tumbling body's reference errs by."""
+"""Error in JND that the reference's own error may reach, no unit. Smaller errors give no order. It
+is five times the error of the tumbling body's reference."""
 
 SETTLED = 0.1
 """Difference of the powers over the two smallest halvings up to which an order counts as settled,
-no unit. A method of order p whose next term is of order p + 1 is within it when that term is
-less than a tenth of the error; larger would call the slope of a knee an order."""
+no unit. A method of order p whose next term is of order p + 1 is within it if that term is less
+than a tenth of the error. A larger difference would accept the slope of a knee as an order."""
 
 LEVEL = 0.1
-"""Settled powers up to this, no unit, are none: the error does not shrink with the step."""
+"""Settled powers up to this value count as none, no unit: the error does not shrink with the
+step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """How the error of a method goes with its period, at its three smallest resolved steps.
+    """Order of convergence of a method, from its three smallest resolved steps.
 
         p = log(felt_2/felt_1) / log(T_2/T_1),   T_1 < T_2 < T_3
 
@@ -254,27 +255,27 @@ class Order:
 
     @property
     def is_settled(self) -> bool:
-        """Whether both powers agree; if not, the steps are too large to tell an order."""
+        """True if both powers agree; else the steps are too large for an order."""
         return abs(self.power - self.before) <= SETTLED
 
     @property
     def is_level(self) -> bool:
-        """Whether the error stays as it is: it is the model's, not the step's."""
+        """True if the error stays constant: it is then the model's, not the step's."""
         return self.is_settled and abs(self.power) <= LEVEL
 
     @property
     def words(self) -> str:
-        """The order as a picture has room for it."""
+        """Text of the order for a picture."""
         if self.is_level:
             return "level"
         return f"order {self.power:.1f}" if self.is_settled else "order ?"
 
 
 def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:
-    """Returns orders by method or engine, of the points where nothing but the period was chosen.
+    """Returns the orders by method or engine, from points with nothing but the period chosen.
 
-    A method is left out where fewer than three of its steps have an error that is finite and at
-    least ``RESOLVED``.
+    A method is left out if fewer than three of its steps have an error that is finite and at least
+    ``RESOLVED``.
     """
     series: dict[str, list[tuple[float, float]]] = {}
     for each in points:
@@ -296,16 +297,16 @@ def _order(steps: Sequence[tuple[float, float]]) -> Order:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """What was measured.
+    """Result of a measurement.
 
     Attributes:
-        workload: What was simulated.
-        measurements: One per point and panel; the points' order is that of the settings.
-        skipped: What could not be simulated, by method or engine, and why.
-        machine: Where it was measured, in words.
-        baseline: The setting that ratios are to.
-        notes: What else is to be known, a sentence each.
-        engines: The other engines on it, by name, with their settings.
+        workload: The simulated workload.
+        measurements: One per point and panel, in the order of the settings.
+        skipped: Reason for each method or engine that could not simulate the workload.
+        machine: Description of the machine.
+        baseline: Setting that ratios refer to.
+        notes: Further remarks, one sentence each.
+        engines: The other engines by name, with their settings.
     """
 
     workload: Workload
@@ -323,8 +324,8 @@ class Chart:
     def front(self, panel: Panel) -> list[Measurement]:
         """Returns the Pareto front, cheapest first.
 
-        Of the points that are sound and comparable, and render the coupling that was asked for: a
-        weld, or a tool that is where the handle is, renders another one, however well it converges.
+        Its points are sound and comparable, and render the requested coupling. A weld, or a tool at
+        the handle's place, renders another coupling, however well it converges.
         """
         points = [
             each
@@ -337,7 +338,7 @@ class Chart:
         return [points[index] for index in chosen]
 
     def orders(self, panel: Panel) -> dict[str, Order]:
-        """Returns by method how its error goes with the period."""
+        """Returns the order of convergence by method."""
         return convergence_orders(self.of(panel))
 
 
@@ -350,14 +351,14 @@ def measure_chart(
 ) -> Chart:
     """Judges and times every setting.
 
-    A setting that the workload cannot be rendered by is left out and named in ``skipped``; one that
+    A setting that cannot render the workload is left out and named in ``skipped``. A setting that
     diverges, or whose engine fails on the way, stays in.
 
     Args:
-        workload: What to simulate.
-        settings: How.
-        repeats: Rounds of timing at most.
-        progress: Called with steps done and all of them.
+        workload: The workload.
+        settings: Settings to simulate.
+        repeats: Largest number of rounds of timing.
+        progress: Called with the finished and all steps.
 
     Raises:
         StudyError: No setting could be simulated.
@@ -371,7 +372,7 @@ def measure_chart(
     runs: list[tuple[Setting, Run, dict[str, Score]]] = []
     skipped: dict[str, str] = {}
     peer_work = cache(workload.peer_work)
-    # the chart tells of every run that diverges; MuJoCo need not
+    # the chart reports every run that diverges; MuJoCo's warnings would repeat it
     with quiet(), one_core() as core:
         for index, setting in enumerate(settings):
             tell(index)
@@ -409,7 +410,7 @@ def measure_chart(
         )
         for panel in workload.panels
         for (setting, run, scores), cost in zip(runs, costs, strict=True)
-        # what another engine converges to is no error of its own
+        # the limit of another engine includes its model, so it is not its own error
         if panel.is_truth or setting.engine == OWN
     )
     label = runs[baseline][0].label
@@ -428,13 +429,13 @@ def _has_failed(scores: Mapping[str, Score]) -> bool:
 
 
 def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
-    """Returns the index of ``implicit`` at the period nearest to 1 ms, or what comes nearest."""
+    """Returns the index of ``implicit`` at the period nearest to 1 ms, or of its substitute."""
 
     def distance(index: int) -> tuple[bool, bool, bool, float]:
         setting = settings[index]
         is_plain = setting.substeps == 1 and setting.contact == SHIPPED
         return (
-            index in failed,  # it may not have been timed
+            index in failed,  # it may be without a time
             setting.engine != OWN or setting.method.name != "implicit",
             not (is_plain and setting.iterations is None),
             abs(np.log(setting.period / 1e-3)),

@@ -39,20 +39,21 @@ from hapticbridge.scene import Scene
 from hapticbridge.theory.impact import Impact, ImpactBody, resolve_impact
 
 BLOCK_MASS = 0.2
-"""In kg."""
+"""Mass in kg."""
 BLOCK_FRICTION = 0.5
-"""Of block and floor: it breaks away at 0.98 N."""
+"""Friction coefficient of block and floor; the block breaks away at 0.98 N."""
 GRAVITY = 9.81
-"""In m/s²."""
+"""Gravity in m/s²."""
 SPEED = 0.02
-"""Of the handle along the floor in m/s, after a start from rest within ``EASE``."""
+"""Speed of the handle along the floor in m/s, after a start from rest within ``EASE``."""
 EASE = 0.02
-"""In s: the handle's speed rises evenly over this time, while the block sticks."""
+"""Time in s over which the handle's speed rises evenly, while the block sticks."""
 BLOCK_DURATION = 0.5
-"""In s. The block breaks away after some 0.06 s, and then swings about the handle's speed."""
+"""Duration in s. The block breaks away after some 0.06 s, and then swings about the handle's
+speed."""
 
 BLOCK_COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
-"""As the other workloads'; the block does not turn."""
+"""Default coupling, that of the other workloads; the block does not turn."""
 
 BLOCK_PANEL = Panel(
     "sliding",
@@ -62,11 +63,11 @@ BLOCK_PANEL = Panel(
 )
 
 WIDTH, BLOCK_HEIGHT = 0.02, 0.01
-"""Half edges in m of the free box that other engines are given, along the floor and upwards."""
+"""Half edges in m, along the floor and upwards, of the free box for other engines."""
 
 TOUCHING = 0.25
-"""Share of the ticks in which the block must touch the floor. Not all: MuJoCo's friction lifts what
-slides by some T μ v (10 µm at 1 ms), and contacts come and go."""
+"""Share of the ticks in which the block must touch the floor. It is below 1, because MuJoCo's
+friction lifts a sliding body by some T μ v (10 µm at 1 ms), and contacts come and go."""
 
 _BLOCK = f"""
 <mujoco model="sliding_block">
@@ -91,7 +92,7 @@ _BLOCK = f"""
 
 
 def handle_place(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns how far the handle is along the floor in m."""
+    """Returns the position of the handle along the floor in m."""
     eased = np.minimum(times, EASE)
     return SPEED * (eased**2 / (2 * EASE) + np.maximum(times - EASE, 0.0))
 
@@ -104,7 +105,7 @@ def pulled(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def free_block(coupling: Coupling, path: Motion) -> Task:
-    """Returns the same block as a box that is free in space, for other engines.
+    """Returns the block as a box that is free in space, for other engines.
 
     It is held and pulled at its centre. Friction acts HEIGHT below it, a torque of μ m g HEIGHT
     that the weight on a base of half a side WIDTH bears: the box slides as it does on rails, and
@@ -112,7 +113,7 @@ def free_block(coupling: Coupling, path: Motion) -> Task:
 
     Args:
         coupling: K and B.
-        path: Of the handle, counted from its first pose.
+        path: Path of the handle relative to its first pose.
     """
     box = Shape("box", (WIDTH, WIDTH, BLOCK_HEIGHT))
     across = BLOCK_MASS * (WIDTH**2 + BLOCK_HEIGHT**2) / 3
@@ -136,10 +137,10 @@ def free_block(coupling: Coupling, path: Motion) -> Task:
 
 
 def breakaway(coupling: Coupling) -> float:
-    """Returns when the block breaks away in s: K h + B V = μ m g, with h = V (t − EASE/2).
+    """Returns the time in s of the breakaway: K h + B V = μ m g, with h = V (t − EASE/2).
 
     Raises:
-        StudyError: It breaks away while the handle still gathers speed, or not in time.
+        StudyError: The block breaks away while the handle still accelerates, or not in time.
     """
     limit = BLOCK_FRICTION * BLOCK_MASS * GRAVITY
     time = (limit - coupling.damping * SPEED) / (coupling.stiffness * SPEED) + EASE / 2
@@ -154,7 +155,7 @@ def breakaway(coupling: Coupling) -> float:
 def exact_sliding(
     coupling: Coupling, times: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the block's place in m and the force of the coupling in N at times in s.
+    """Returns the block's position in m and the force of the coupling in N at times in s.
 
     After the breakaway at t_0 the stretch e = h − x obeys m e'' + B e' + K e = μ m g from
     e(t_0) = h(t_0), e'(t_0) = V. It slides on as long as e' < V, which is checked.
@@ -177,7 +178,7 @@ def exact_sliding(
 
 
 class SlidingBlock(Staged):
-    """The workload.
+    """The sliding block as a workload.
 
     Args:
         coupling: K and B.
@@ -218,8 +219,8 @@ class SlidingBlock(Staged):
         if take.has_diverged:
             return {BLOCK_PANEL.key: diverged(take.created, take.ended)}
         records = take.at(self._grid).copy()
-        # the weight rests on a contact that gives way, and the handle holds a share of it: judged
-        # is what happens along the floor
+        # the weight rests on a compliant contact, and the handle carries a share of it, so only the
+        # motion along the floor is judged
         records["wrench_on_tool"][:, 1:] = 0.0
         self._reference["tool_position"][:] = records["tool_position"]
         self._reference["tool_position"][:, 0] = self._place
@@ -240,13 +241,13 @@ def block_scene() -> Scene:
 
 
 ROD_MASS, LENGTH = 0.1, 0.2
-"""Of a uniform rod, in kg and m: a light tool."""
+"""Mass in kg and length in m of a uniform rod: a light tool."""
 INERTIA = ROD_MASS * LENGTH**2 / 12
-"""About its centre of mass in kg m²."""
+"""Moment of inertia about its centre of mass in kg m²."""
 THIN = 1e-6
-"""About its axis in kg m²: a rod 9 mm thick. Nothing turns it about that axis."""
+"""Moment of inertia about its axis in kg m²: a rod 9 mm thick. No torque acts about that axis."""
 TIP = 1e-3
-"""Radius in m of the sphere at the lower end, all that can touch."""
+"""Radius in m of the sphere at the lower end, the only part that can touch."""
 
 APPROACH, SLIDE = 0.3, 0.2
 """Speed in m/s at which the rod falls and slides, without turning; a brisk tap."""
@@ -255,17 +256,18 @@ ROD_FRICTION = 0.3
 """Coulomb's μ, without unit."""
 
 ANGLES = (0.5, 0.8, 1.1, 1.4)
-"""Of the rod above the floor in rad, a fall each."""
+"""Angles of the rod above the floor in rad, one per fall."""
 
 ROD_HEIGHT = 0.6e-3
-"""How far the tip is above the floor at the start, in m: 2 ms of falling."""
+"""Height of the tip above the floor at the start, in m: 2 ms of falling."""
 
 ROD_DURATION = 0.024
-"""In s of each fall. A contact as soft as those of the shipped scenes ends within 20 ms; in that
-time the rod turns by 3 degrees at most, and a rigid impact takes none."""
+"""Duration in s of each fall. A contact as soft as those of the shipped scenes ends within 20 ms.
+In that time the rod turns by 3 degrees at most; a rigid impact takes no time."""
 
 ROD_COUPLING = Coupling(1e-9, 0.0, 0.0, 0.0)
-"""The rod falls alone: a coupling must have a stiffness, and 1e-9 N/m over 10 mm is nothing."""
+"""Negligible coupling: the rod falls alone. A stiffness is required, and 1e-9 N/m over 10 mm is no
+force."""
 
 ROD_PANEL = Panel(
     "impact",
@@ -301,7 +303,7 @@ def rod_scene() -> Scene:
 
 
 def falls_at(angle: float) -> Callable[[Scene], None]:
-    """Returns what puts the rod just above the floor, falling and sliding."""
+    """Returns the function that puts the rod just above the floor, falling and sliding."""
 
     def put(scene: Scene) -> None:
         data = scene.data
@@ -313,10 +315,10 @@ def falls_at(angle: float) -> Callable[[Scene], None]:
 
 
 def free_fall(angle: float) -> Task:
-    """Returns the same fall of a rod that is free in space, for other engines.
+    """Returns the fall of a rod that is free in space, for other engines.
 
-    The floor's surface is at z = 0. The tip's sphere is all that can touch, and it touches in the
-    plane of motion, so that no impulse turns the rod out of it.
+    The floor's surface is at z = 0. Only the tip's sphere can touch. It touches in the plane of
+    motion, so that no impulse turns the rod out of it.
     """
     tip = Shape("sphere", (TIP,), (-LENGTH / 2, 0.0, 0.0))
     rod = Body(ROD_MASS, (THIN, INERTIA, INERTIA), shapes=(tip,), friction=ROD_FRICTION)
@@ -331,12 +333,12 @@ def free_fall(angle: float) -> Task:
 
 
 def _in_the_plane(take: Take) -> Take:
-    """Returns a take with the velocities of the plane alone: along x, along z, about y."""
+    """Returns a take with the planar velocities alone: along x, along z, about y."""
     return replace(take, velocity=take.velocity[[0, 2, 4]])
 
 
 def rigid_impacts() -> Impact:
-    """Returns the four impacts of a rigid rod that does not rebound, by mechanics."""
+    """Returns the rigid impacts of the four falls without rebound, by mechanics."""
     angle = np.array(ANGLES)
     arm = np.stack([-LENGTH / 2 * np.cos(angle), -LENGTH / 2 * np.sin(angle) - TIP], axis=-1)
     rod = ImpactBody(np.full(angle.size, ROD_MASS), np.full(angle.size, INERTIA), arm)
@@ -344,10 +346,10 @@ def rigid_impacts() -> Impact:
 
 
 class RodImpact(Staged):
-    """The workload.
+    """The falling rod as a workload.
 
     Args:
-        coupling: Ignored but for its name in tables: none acts.
+        coupling: Only its name appears in tables; no coupling acts.
         grid: Longest period T in s; the falls last a multiple of it.
     """
 
@@ -366,7 +368,7 @@ class RodImpact(Staged):
         )
 
     def peer_work(self) -> PeerWork:
-        """Describes the falls to other engines: of a free rod, which stays in its plane."""
+        """Describes the falls to other engines, with a free rod that stays in its plane."""
         return PeerWork(
             tuple(free_fall(angle) for angle in ANGLES),
             self._duration,

@@ -1,4 +1,4 @@
-"""The same work in another engine: the same motion, the same judge, its own contacts and solver."""
+"""A workload in another engine: equal motion and judge, its own contacts and solver."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
 
 HELD = METHODS["explicit"]
-"""How engines get the coupling: a force that is computed after a step and held in the next. Those
-whose name ends with ``SPRING`` solve it together with the contacts, as a spring of their own."""
+"""Couplings of the engines. By default a force is computed after a step and held in the next.
+Engines whose name ends with ``SPRING`` solve it together with the contacts, as their own spring."""
 
 FARTHEST = 10.0
-"""Distance in m of the tool at which a run has diverged beyond doubt."""
+"""Distance in m of the tool beyond which a run counts as diverged."""
 
 _LEFT = ("tool_position", "tool_quaternion", "wrench_on_tool")
 
@@ -43,14 +43,14 @@ def work_of(
 
     Args:
         scene: One free tool among fixed shapes.
-        path: Of the handle.
-        duration: In s.
-        finest: Shortest period in s: the handle is exact at its multiples.
+        path: Path of the handle.
+        duration: Duration in s.
+        finest: Shortest period in s; the handle is exact at its multiples.
         coupling: K and B.
-        judge: Of the workload.
+        judge: Judge of the workload.
 
     Raises:
-        StudyError: The scene cannot be given to other engines.
+        StudyError: Other engines cannot represent the scene.
     """
     motion = motion_along(path, duration, finest)
     return PeerWork((task_from_scene(scene, motion, coupling),), duration, judge)
@@ -65,9 +65,9 @@ def motion_along(path: Path, duration: float, finest: float) -> Motion:
 class EngineRun:
     """A workload in an engine at one time step, as a chart times and judges it.
 
-    What is timed is every step of the run through the engine's Python interface, with the
-    coupling's law: a user pays that too. Compare engines with the engine ``mujoco``, which is
-    called the same way, and not with the compiled loop of the bridge.
+    The time covers every step of the run through the engine's Python interface, with the coupling's
+    law, because a user pays for both. Compare engines with the engine ``mujoco``, which is called
+    the same way, and not with the compiled loop of the bridge.
 
     Raises:
         StudyError: The setting has substeps.
@@ -83,16 +83,16 @@ class EngineRun:
 
     @property
     def seconds(self) -> float:
-        """Simulated time in s of what is timed: a run that ended early counts as far as it came."""
+        """Simulated time in s of the timed steps; less for a run that ended early."""
         return max(1, sum(self._ticks)) * self._setting.period
 
     @property
     def chosen(self) -> Mapping[str, str | int]:
-        """What the engine was set to, and which page of its documentation advises it.
+        """Settings of the engine, with the page of its documentation that advises each.
 
-        Method and integrator of the bridge are none of another engine's.
+        Method and integrator of the bridge do not apply to other engines.
         """
-        told = "; ".join(
+        text = "; ".join(
             f"{name}: {setting.value} ({setting.source})"
             for name, setting in self.engine.settings.items()
         )
@@ -104,11 +104,11 @@ class EngineRun:
             "solimp": "",
             "cone": "",
             "solver_iterations": "",
-            "engine_settings": f"{self.engine.name} {self.engine.version}; {told}",
+            "engine_settings": f"{self.engine.name} {self.engine.version}; {text}",
         }
 
     def go(self) -> float:
-        """Runs it; returns the processor time in s of the steps, nan where none was completed."""
+        """Runs it; returns the processor time in s of the steps, nan if none was completed."""
         if not any(self._ticks):
             return float("nan")
         spent = 0.0
@@ -125,13 +125,13 @@ class EngineRun:
                 finally:
                     simulation.close()
             except Exception:
-                return float("nan")  # a round that failed is none; the others are counted
+                return float("nan")  # a failed round does not count; the others do
         return spent
 
     def scores(self) -> Mapping[str, Score]:
-        """Runs it once more with every tick written down, and judges it.
+        """Runs it once more with a record of every tick, and judges it.
 
-        An engine that raises on the way has ``failed`` there, and the score says what it raised.
+        An exception of the engine gives the verdict ``failed``; the score names the exception.
 
         Raises:
             HapticBridgeError: The engine refuses the task.
@@ -151,7 +151,7 @@ class EngineRun:
         return {key: replace(score, verdict="failed") for key, score in found.items()}
 
     def _take(self, task: Task, poses: Sequence[Pose]) -> tuple[Take, bool]:
-        """Goes along a motion; returns the take, and whether the engine raised an error."""
+        """Follows a motion; returns the take, and True if the engine raised an error."""
         rows = np.zeros(len(poses), TICK_DTYPE)
         done, ended, has_failed, velocity = 0, "", False, Velocity()
         try:
@@ -167,7 +167,7 @@ class EngineRun:
             finally:
                 simulation.close()
         except Exception as error:
-            # a foreign library raises what it likes; one engine's failure must not end the chart
+            # a foreign library may raise anything; one engine's failure must not end the chart
             if isinstance(error, HapticBridgeError) and not done:
                 raise
             has_failed = True
@@ -186,13 +186,13 @@ class EngineRun:
 
 
 def _written(row: NDArray[np.void], simulation: Simulation, grip: Pose) -> str:
-    """Writes one record; returns what is not of this world in it, empty where all is."""
+    """Writes one record; returns a description of impossible values in it, empty without any."""
     pose = composed(simulation.pose(), grip)
     wrench = simulation.wrench()
     row["tool_position"] = pose.position
     row["tool_quaternion"] = pose.quaternion
     row["wrench_on_tool"] = (*wrench.force, *wrench.torque)
-    # before the contacts: an engine asked for those of such a pose may raise
+    # before the contacts: an engine may raise at such a pose
     if not all(np.isfinite(row[name]).all() for name in _LEFT):
         return "a number was not finite"
     if np.abs(row["tool_position"]).max() >= FARTHEST:

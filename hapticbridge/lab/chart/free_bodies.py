@@ -28,20 +28,22 @@ from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response, integrate_rotation
 
 DRIVEN_MASS, DRIVEN_INERTIA = 0.1, 9e-6
-"""Of the ball in ``models/point_mass`` in kg, and about any axis in kg m²."""
+"""Mass in kg and moment of inertia in kg m², about any axis, of the ball in
+``models/point_mass``."""
 
 FREQUENCY = 3.0
-"""Of the motion in Hz: brisk for a hand, far below the mass's resonance behind the coupling."""
+"""Frequency of the motion in Hz: brisk for a hand, far below the mass's resonance behind the
+coupling."""
 
 AMPLITUDE, TURN = 0.02, 0.3
-"""Half of the way in m, and half of the angle in rad."""
+"""Half of the stroke in m, and half of the angle in rad."""
 
 DRIVEN_DURATION = 1.0
-"""In s: three periods."""
+"""Duration in s: three periods."""
 
 DIRECTION = np.array([0.6, 0.0, 0.8])
 AXIS = np.array([0.0, 0.6, 0.8])
-"""Unit vectors, along which it moves and about which it turns; none is a coordinate axis."""
+"""Unit vectors of translation and rotation; neither is a coordinate axis."""
 
 DRIVEN_PANEL = Panel(
     "driven",
@@ -53,7 +55,7 @@ DRIVEN_PANEL = Panel(
 def handle_path(
     times: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns where the handle is: A (1 − cos ωt) along and about fixed axes, from rest."""
+    """Returns the pose of the handle: A (1 − cos ωt) along and about fixed axes, from rest."""
     wave = 1 - np.cos(2 * np.pi * FREQUENCY * times)
     turned = Rotation.from_rotvec(np.outer(TURN * wave, AXIS)).as_quat()[:, [3, 0, 1, 2]]
     return np.outer(AMPLITUDE * wave, DIRECTION), turned
@@ -67,7 +69,7 @@ def exact_response(
         m x'' = K (h − x) + B (h' − x'),   x(0) = x'(0) = 0
         x = 1 − Re(H e^{jωt}) + x_h,   H = (K + jωB)/(K + jωB − m ω²)
 
-    x_h is the free vibration that makes the start right.
+    x_h is the free vibration that satisfies the initial conditions.
 
     Args:
         stiffness: K in N/m, or N m/rad.
@@ -96,7 +98,7 @@ def exact_response(
 
 
 def exact_records(coupling: Coupling, grid: float, mass: float = DRIVEN_MASS) -> NDArray[np.void]:
-    """Returns what an exact simulation would record at whole multiples of ``grid`` s."""
+    """Returns the records of an exact simulation at whole multiples of ``grid`` s."""
     count = round(DRIVEN_DURATION / grid)
     x, force = exact_response(coupling.stiffness, coupling.damping, mass, grid, count)
     angle, torque = exact_response(
@@ -112,7 +114,7 @@ def exact_records(coupling: Coupling, grid: float, mass: float = DRIVEN_MASS) ->
 
 
 class DrivenMass(Staged):
-    """The workload.
+    """The driven point mass as a workload.
 
     Args:
         coupling: K and B.
@@ -153,7 +155,7 @@ class DrivenMass(Staged):
 
 
 SPINNING_MASS = 0.3
-"""In kg."""
+"""Mass in kg."""
 SPINNING_INERTIA = (1.5e-3, 3.63e-3, 4.53e-3)
 """Principal moments in kg m², all different: near those of a hand tool with a long handle."""
 
@@ -161,13 +163,13 @@ SPIN = (3.0, 20.0, 3.0)
 """Angular velocity at the start in rad/s, near the middle axis, about which the body tumbles."""
 
 SPINNING_DURATION = 1.0
-"""In s: three turns and a flip."""
+"""Duration in s: three turns and a flip."""
 
 COUPLING = Coupling(1000.0, 1.0, 0.0, 0.0)
-"""Holds the place, in N/m and N s/m, and lets the body turn."""
+"""Coupling that holds the position, in N/m and N s/m, and leaves the rotation free."""
 
 FELT_STIFFNESS = 1.0
-"""K_r in N m/rad, that of the other workloads: what an error of angle would be felt through."""
+"""Stiffness K_r in N m/rad, that of the other workloads, by which an error of angle is felt."""
 
 FINE_STEP = 2e-6
 """T in s of the reference. The midpoint rule errs by some (ωT)²/12 of the angle: some 1e-9 rad."""
@@ -192,7 +194,7 @@ def set_spinning(scene: Scene) -> None:
 
 
 def still(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns a handle that stands still."""
+    """Returns a handle at rest."""
     quaternions = np.zeros((times.size, 4))
     quaternions[:, 0] = 1.0
     return np.zeros((times.size, 3)), quaternions
@@ -213,10 +215,10 @@ def exact_orientations(grid: float, count: int) -> NDArray[np.float64]:
 
 
 class SpinningBody(Staged):
-    """The workload.
+    """The tumbling body as a workload.
 
     Args:
-        coupling: K and B; without K_r and B_r, or there would be a torque.
+        coupling: K and B. K_r and B_r must be 0, because they would cause a torque.
         grid: Longest period T in s.
         finest: Shortest in s.
 

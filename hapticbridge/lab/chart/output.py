@@ -28,33 +28,35 @@ from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.run_description import versions
 
 RATE = 1000.0
-"""Hz that is asked for."""
+"""Required rate in Hz."""
 
 JND = 1.0
-"""Error in just noticeable differences that is allowed."""
+"""Largest error in just noticeable differences."""
 
 SHARE = 0.5
-"""Share of a core that the simulation may take; the rest is for the device and for waking up."""
+"""Share of a core for the simulation; the rest is for the device and for waking up."""
 
 ALIKE = 0.05
-"""Relative difference of two errors that decides nothing, no unit: where they differ by more, so do
-the two digits that are said of them."""
+"""Relative difference of two errors that is irrelevant, no unit. A larger one changes the two
+digits that are printed."""
 
 ALONE = " No other time step bears this out, so it may be luck."
 
 TOLERANCE = 1e-9
-"""Relative: 1/(1 ms) is 1000 Hz but for rounding."""
+"""Relative tolerance of the rate: 1/(1 ms) is 1000 Hz but for rounding."""
 
 
 def recommended(points: Sequence[Measurement]) -> Measurement | None:
-    """Returns the point to use, None where there is none.
+    """Returns the recommended point, None if there is none.
 
-    Of the points at ``RATE`` or above, with an error below ``JND`` here and at every smaller step,
-    a passive environment, a solver that runs to its tolerance, at most ``SHARE`` of a core, an
-    error that can be compared with others' (``Measurement.is_comparable``) and no hazard on a real
-    device (``Method.hazard``): those that a second step bears out, if there are any; of them the
-    cheapest; of those whose spread of cost meets its own, the most accurate; and where errors are
-    the same within ``ALIKE``, one with the usual contacts.
+    Candidates have ``RATE`` or more, an error below ``JND`` here and at every smaller step, a
+    passive environment and a solver that runs to its tolerance. They take at most ``SHARE`` of a
+    core. Their error can be compared with others' (``Measurement.is_comparable``), and the method
+    has no hazard on a real device (``Method.hazard``).
+
+    Points that a second step confirms come first, if there are any. Of them the cheapest is chosen;
+    of those whose spread of cost overlaps its own, the most accurate. Among errors that agree
+    within ``ALIKE``, a point with the usual contacts is preferred.
     """
     fit = [each for each in points if _is_fast(each) and not _objections(each, points)]
     if not fit:
@@ -68,13 +70,13 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
 
 
 def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
-    """Says what to use and why nothing better, or which point is nearest and what is wrong with it.
+    """States the recommendation and why nothing is better, or the nearest point and its faults.
 
     Args:
-        points: Of one panel.
-        machine: In words.
-        is_truth: Whether errors are counted from the truth (``Panel.is_truth``); if not, it says
-            that they are only the distance from each method's own limit.
+        points: Points of one panel.
+        machine: Description of the machine.
+        is_truth: True if errors are counted from the truth (``Panel.is_truth``). If not, the text
+            states that they are only the distance from each method's own limit.
     """
     best = recommended(points)
     goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
@@ -94,9 +96,9 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
 
 
 def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
-    """Returns whether another time step, all else alike, has an error below ``JND`` as well.
+    """Returns True if another time step, all else equal, has an error below ``JND`` too.
 
-    What was tried at one step alone may be right by luck.
+    A setting tried at one step alone may be right by luck.
     """
 
     def settings_but_steps(point: Measurement) -> tuple[object, ...]:
@@ -116,7 +118,7 @@ def _is_fast(each: Measurement) -> bool:
 
 
 def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
-    """Returns the largest error in JND at this and at every smaller step, all else alike.
+    """Returns the largest error in JND at this and at every smaller step, all else equal.
 
     An error that grows again when the step shrinks was small by luck.
     """
@@ -131,7 +133,7 @@ def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
 
 
 def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
-    """Returns what speaks against a point, in words."""
+    """Returns the faults of a point in words."""
     found = []
     steady = steady_error(each, points)
     if not each.score.felt < JND:
@@ -164,22 +166,24 @@ def _numbers(each: Measurement) -> str:
 
 
 FIGURE_WIDTH, FIGURE_HEIGHT = 8.0, 5.6
-"""In inches: 800 pixels wide, a panel each."""
+"""Size in inches: 800 pixels wide, one panel each."""
 
 FLOOR = 1e-4
-"""Error in JND below which all points are drawn at the lower edge: nobody could tell."""
+"""Error in JND below which all points are drawn at the lower edge: the difference is
+imperceptible."""
 
 CEILING = 1e3
-"""Error in JND above which they are drawn at the upper edge, with those that diverged."""
+"""Error in JND above which points are drawn at the upper edge, with those that diverged."""
 
 NARROW = 30.0
-"""Ratio of the ends of an axis up to which more than the powers of ten are named, no unit."""
+"""Ratio of the ends of an axis up to which more ticks than the powers of ten have labels, no
+unit."""
 
 PALE = 0.2
-"""Opacity of points that cannot be compared with those of other methods, no unit."""
+"""Opacity, without unit, of points that cannot be compared with those of other methods."""
 
 UNTIMED = 1.0
-"""Cost in s per s at which points are drawn where none was timed."""
+"""Cost in s per s at which points are drawn if no point was timed."""
 
 MARKS: dict[Verdict, tuple[str, bool, str]] = {
     "strict": ("o", True, "passive"),
@@ -190,7 +194,7 @@ MARKS: dict[Verdict, tuple[str, bool, str]] = {
     "failed": ("v", True, "the engine failed (at the upper edge)"),
     "not metered": ("s", True, "another engine: energy not metered"),
 }
-"""Mark, whether it is filled, and what it means."""
+"""Marker, True if it is filled, and its meaning."""
 
 
 def colours_of(chart: Chart) -> dict[str, Any]:
@@ -200,15 +204,15 @@ def colours_of(chart: Chart) -> dict[str, Any]:
 
 
 def drawn_error(each: Measurement) -> float:
-    """Returns where a point is drawn, in JND: held within the picture's edges."""
+    """Returns the ordinate of a point in JND, clipped to the picture's edges."""
     felt = each.score.felt
     return float(np.clip(felt, FLOOR, CEILING)) if np.isfinite(felt) else CEILING
 
 
 def drawn_cost(each: Measurement, points: Sequence[Measurement]) -> float:
-    """Returns where a point is drawn, in s per s: with the dearest where it was not timed.
+    """Returns the abscissa of a point in s per s; without a time the largest cost.
 
-    An engine that fails in its first step has no cost, and is on the chart all the same.
+    An engine that fails in its first step has no cost, and stays on the chart.
     """
     if math.isfinite(each.cost.median):
         return each.cost.median
@@ -234,11 +238,11 @@ def draw_chart(chart: Chart) -> Figure:
 def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any]) -> None:
     points, orders = chart.of(panel), chart.orders(panel)
     for name, colour in colours.items():
-        mine = [each for each in points if who(each.setting) == name]
-        if not mine:
+        selected = [each for each in points if who(each.setting) == name]
+        if not selected:
             continue
-        axes.plot([], [], "-", color=colour, lw=2, label=_named(name, mine, orders.get(name)))
-        line = [each for each in mine if each.is_usual]
+        axes.plot([], [], "-", color=colour, lw=2, label=_named(name, selected, orders.get(name)))
+        line = [each for each in selected if each.is_usual]
         axes.plot(
             [drawn_cost(each, points) for each in line],
             [drawn_error(each) for each in line],
@@ -247,7 +251,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
             lw=0.8,
             alpha=0.6,
         )
-        for each in mine:
+        for each in selected:
             _draw_point(axes, each, drawn_cost(each, points), colour)
     _draw_front(axes, chart.front(panel))
     best = recommended(points)
@@ -274,28 +278,28 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
     axes.set_title(title, fontsize="small", parse_math=False)
     axes.grid(visible=True, which="major", alpha=0.3)
     if not all(each.is_usual for each in points):
-        told = "small: substeps, contacts, solver"
-        axes.plot([], [], "o", color="grey", ms=3.5, label=told)
+        label = "small: substeps, contacts, solver"
+        axes.plot([], [], "o", color="grey", ms=3.5, label=label)
     for verdict in dict.fromkeys(each.score.verdict for each in points):
-        mark, is_filled, told = MARKS[verdict]
+        mark, is_filled, label = MARKS[verdict]
         axes.plot(
-            [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=told
+            [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=label
         )
-    for told in _explained(points, orders.values()):
-        axes.plot([], [], " ", label=told)
+    for label in _explained(points, orders.values()):
+        axes.plot([], [], " ", label=label)
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _named(name: str, points: Sequence[Measurement], order: Order | None) -> str:
-    """Returns a legend's words for a method: its order, and its limit where that is another."""
-    told = [] if order is None else [order.words]
+    """Returns a method's legend: its order, and its limit if that differs."""
+    remarks = [] if order is None else [order.words]
     if not all(each.is_comparable for each in points):
-        told.append(f"limit {points[0].limit_apart:.2g} off")
-    return f"{name} ({', '.join(told)})" if told else name
+        remarks.append(f"limit {points[0].limit_apart:.2g} off")
+    return f"{name} ({', '.join(remarks)})" if remarks else name
 
 
 def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list[str]:
-    """Returns what the words and edges of a panel mean, for those that it has."""
+    """Returns the legends of marks and edges that a panel contains."""
     said = []
     if any(order.is_level for order in orders):
         said.append("level: smaller steps gain nothing")
@@ -346,11 +350,11 @@ ENDINGS = (*PICTURES, "csv", "json")
 
 @dataclass(frozen=True, slots=True)
 class ChartFiles:
-    """Paths by ending, and what the chart says.
+    """Paths by ending, and the content of the JSON file.
 
     Attributes:
-        paths: By ending, of ``ENDINGS``.
-        said: What is in the JSON file.
+        paths: Paths by ending, of ``ENDINGS``.
+        said: Content of the JSON file.
     """
 
     paths: Mapping[str, Path]
@@ -361,12 +365,13 @@ def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) ->
     """Makes the folder and proves that every file can be written, before anything is computed.
 
     Args:
-        folder: To write into.
-        name: Of the files, without ending.
-        endings: Of the files.
+        folder: Folder to write into.
+        name: Name of the files, without ending.
+        endings: Endings of the files.
 
     Raises:
-        StudyError: It cannot, or a scene of this name lies there, whose hand path is ``NAME.csv``.
+        StudyError: A file cannot be written, or a scene of this name lies there, whose hand path is
+            ``NAME.csv``.
     """
     if (folder / f"{name}.xml").exists():
         raise StudyError(
@@ -379,18 +384,18 @@ def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) ->
 
 
 def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
-    """Writes everything.
+    """Writes all files of a chart.
 
     Args:
-        chart: What was measured.
-        paths: By ending, as ``prepared_files`` returned them.
+        chart: The measurement.
+        paths: Paths by ending, as ``prepared_files`` returned them.
 
     Raises:
         HapticBridgeError: A file cannot be written.
     """
     said = summary_of(chart)
     texts = {
-        "csv": table_of(chart),  # first: it is what cost the time
+        "csv": table_of(chart),  # the table first: computing it took the time
         "json": json.dumps(said, indent=2, allow_nan=False) + "\n",
     }
     write_files(paths, texts, draw_chart(chart))
@@ -436,7 +441,7 @@ def table_of(chart: Chart) -> str:
 
 
 def summary_of(chart: Chart) -> dict[str, Any]:
-    """Returns what the chart says, for JSON: numbers that are not finite become None."""
+    """Returns the content of the JSON file; numbers that are not finite become None."""
     panels = [
         {
             "panel": panel.key,

@@ -25,7 +25,7 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 
 HOME = np.array([0.0, 0.0, 0.04])
-"""Where the peg's centre starts in m, 10 mm above the mouth."""
+"""Start of the peg's centre in m, 10 mm above the mouth."""
 
 POSES: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
     ((0.0, 0.0, 0.012), (0.0, 0.0, 0.0)),
@@ -33,12 +33,12 @@ POSES: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
     ((-1e-3, 1.5e-3, 0.010), (0.03, 0.06, 0.0)),
     ((0.5e-3, 0.0, -0.012), (0.0, -0.05, 0.0)),
 )
-"""Where the handle goes, in m and as a rotation vector in rad: in, against a wall, tilted against
-two edges, onto the bottom. The last three are judged."""
+"""Poses of the handle, in m and as a rotation vector in rad: in, against a wall, tilted against two
+edges, onto the bottom. The last three are judged."""
 
 RAMP, HOLD = 0.2, 0.4
-"""Time in s to go to a pose and to stay there. The ramp is a minimum-jerk one, which leaves little
-to ring; after the hold, with the damping of the chart, e⁻⁶ of it is left."""
+"""Times in s of a ramp and of a hold. The minimum-jerk ramp leaves little ringing. After the hold,
+with the damping of the chart, e⁻⁶ of it is left."""
 
 DURATION = len(POSES) * (RAMP + HOLD)
 
@@ -46,7 +46,7 @@ JUDGED = tuple(range(1, len(POSES)))
 
 
 def peg_path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns positions and quaternions of the handle, counted from ``HOME``."""
+    """Returns positions and quaternions of the handle relative to ``HOME``."""
     stops = np.array([(*HOME, 0.0, 0.0, 0.0), *((*place, *turn) for place, turn in POSES)])
     stage = np.minimum((times / (RAMP + HOLD)).astype(int), len(POSES) - 1)
     share = np.clip((times - stage * (RAMP + HOLD)) / RAMP, 0.0, 1.0)
@@ -62,14 +62,14 @@ def end_of_hold(index: int) -> float:
 
 
 HALF_WIDTH, HALF_LENGTH = 0.01, 0.03
-"""Of the peg of ``models/peg_in_hole`` in m."""
+"""Half edges in m of the peg of ``models/peg_in_hole``."""
 
 CLEARANCE, DEPTH = 0.2e-3, 0.04
-"""Gap a side with the peg in the middle, and depth of the hole, in m."""
+"""Gap per side with the peg in the middle, and depth of the hole, in m."""
 
 SCALE = 1e3
-"""Lengths are given to the optimiser in mm and angles in mrad, so that its steps suit both; it
-stops at 1e-16 of the energy, some 1e-10 m."""
+"""Units of the optimiser, mm and mrad, so that its steps suit both. It stops at 1e-16 of the
+energy, some 1e-10 m."""
 
 _SIGNS = np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
 
@@ -79,10 +79,10 @@ class RestingPeg:
     """A peg at rest.
 
     Attributes:
-        position: Of its centre in m, the hole's mouth at z = 0, shape (3,).
+        position: Position of its centre in m, with the hole's mouth at z = 0, shape (3,).
         rotation: Rotation vector in rad, shape (3,).
-        wrench: On the peg by the coupling, force in N and torque in N m, shape (6,).
-        gaps: Distances in m that the contacts leave, all >= 0 but for rounding.
+        wrench: Wrench of the coupling on the peg, force in N and torque in N m, shape (6,).
+        gaps: Remaining distances in m to the walls, all >= 0 but for rounding.
     """
 
     position: NDArray[np.float64]
@@ -94,16 +94,16 @@ class RestingPeg:
 def gaps(
     position: NDArray[np.float64], rotation: NDArray[np.float64], clearance: float = CLEARANCE
 ) -> NDArray[np.float64]:
-    """Returns how far a peg is from each wall and the bottom, in m; < 0 where it would be inside.
+    """Returns a peg's distance from each wall and the bottom in m; < 0 inside a wall.
 
-    What of the peg lies below the mouth is a convex body; its extreme points are the four lower
-    corners, and where the long edges pass the plane of the mouth. Valid while exactly those four
-    edges pass it: an inserted peg that is not turned by more than some 30 degrees.
+    The part of the peg below the mouth is a convex body. Its extreme points are the four lower
+    corners, and the points where the long edges pass the plane of the mouth. Valid while exactly
+    those four edges pass it: an inserted peg that is not turned by more than some 30 degrees.
 
     Args:
-        position: Of the centre, shape (3,).
+        position: Position of the centre in m, shape (3,).
         rotation: Rotation vector, shape (3,).
-        clearance: Gap a side in m.
+        clearance: Gap per side in m.
 
     Returns:
         Shape (36,): eight points by four walls, then the corners above the bottom.
@@ -124,17 +124,17 @@ def resting_peg(
     rotation: ArrayLike = (0.0, 0.0, 0.0),
     clearance: float = CLEARANCE,
 ) -> RestingPeg:
-    """Finds the pose that a coupling to a handle that stands still pulls a rigid peg into.
+    """Finds the pose of a rigid peg that a coupling pulls towards a handle at rest.
 
         minimise  ½ K ‖h − p‖² + ½ K_r ‖log(R_h Rᵀ)‖²    subject to  gaps(p, R) >= 0
 
-    Without friction this is where any mechanics that loses energy ends.
+    Without friction any mechanics that loses energy ends in this pose.
 
     Args:
-        coupling: K and K_r, both > 0; the dampings play no part.
-        position: h, of the handle in m.
-        rotation: Of the handle, a rotation vector in rad.
-        clearance: Gap a side in m.
+        coupling: K and K_r, both > 0; the dampings have no effect.
+        position: Position h of the handle in m.
+        rotation: Rotation vector of the handle in rad.
+        clearance: Gap per side in m.
 
     Raises:
         StudyError: The optimiser found no minimum, or a stiffness is not > 0.
@@ -169,7 +169,7 @@ def resting_peg(
         options={"ftol": 1e-16, "maxiter": 500},
     )
     left = gaps(found.x[:3] / SCALE, found.x[3:] / SCALE, clearance)
-    # mode 8: no further descent to be found at this precision, which is the end as well
+    # mode 8: no further descent is possible at this precision, which is a minimum as well
     if found.status not in (0, 8) or left.min() < -1e-8:
         raise StudyError(f"no resting pose of the peg was found: {found.message}")
     return RestingPeg(
@@ -194,11 +194,11 @@ MOVING = Panel(
 )
 
 COUPLING = Coupling(1000.0, 3.0, 1.0, 2e-3)
-"""As the other workloads', with three times the damping, so that the peg is at rest at the end of
-each hold. Where it rests does not depend on it."""
+"""Default coupling: that of the other workloads with three times the damping, so that the peg is at
+rest at the end of each hold. Its resting place does not depend on it."""
 
 MOVING_TIME = 0.9
-"""In s: into the hole, and 0.1 s into the hold against the wall."""
+"""Duration in s of the judged motion: into the hole, and 0.1 s into the hold against the wall."""
 
 
 def _scene() -> Scene:
@@ -206,13 +206,13 @@ def _scene() -> Scene:
 
 
 class PegInHole(Staged):
-    """The workload.
+    """The peg in its hole as a workload.
 
     Args:
         coupling: K and B, K > 0 and K_r > 0.
         grid: Longest period T in s.
         finest: Shortest period T in s.
-        refinement: How many times smaller the step of the moving peg's reference is.
+        refinement: Ratio of ``finest`` to the step of the moving peg's reference.
 
     Raises:
         StudyError: The coupling holds no peg.
@@ -247,7 +247,7 @@ class PegInHole(Staged):
         return {SETTLED.key: self.settled(take), MOVING.key: self._limits.score(take)}
 
     def settled(self, take: Take) -> Score:
-        """Compares where the peg rests at the end of each hold with the rigid optimum."""
+        """Compares the peg's pose at the end of each hold with the rigid optimum."""
         if take.has_diverged:
             return diverged(take.created, take.ended)
         ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in JUDGED]

@@ -1,4 +1,4 @@
-"""A scene led along a prescribed motion at one setting, compiled, as a bridge would run it."""
+"""A scene led along a prescribed motion at one setting, in the compiled loop of the bridge."""
 
 from __future__ import annotations
 
@@ -47,29 +47,29 @@ from hapticbridge.scene import Scene, load_scene
 from hapticbridge.summary import Ledger
 
 Path = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""The handle's motion: times in s, shape (n,), to positions in m, (n, 3), and quaternions (n, 4),
-both counted from the handle's start; at time 0 it is there, at rest."""
+"""Motion of the handle: maps times in s, shape (n,), to positions in m, (n, 3), and quaternions (n,
+4), both relative to the handle's start. At time 0 the handle is there, at rest."""
 
 Start = Callable[[Scene], None]
-"""Changes the scene's state before the first tick: a body that already spins."""
+"""Changes the scene's state before the first tick, for example to a body that already spins."""
 
 _BAD = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
 )
-"""After these MuJoCo has reset the scene, and what follows is another run."""
+"""MuJoCo warnings after which MuJoCo has reset the scene, so that the rest is another run."""
 
 
 class Stage:
-    """A scene with its motion, set up anew for every setting; one for all points of a chart.
+    """A scene with its motion, prepared anew for every setting; one for all points of a chart.
 
     Args:
-        scene: Loaded; its model is changed.
-        path: Of the handle.
-        duration: In s.
-        coupling: K and B asked for.
-        starts: How each take begins; one take by default.
+        scene: Loaded scene; its model is changed.
+        path: Path of the handle.
+        duration: Duration in s.
+        coupling: Requested K and B.
+        starts: Start of each take; one take by default.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Stage:
 
     @property
     def shipped(self) -> ShippedOptions:
-        """Contacts and solver as the scene's file says them."""
+        """Contacts and solver of the scene's file."""
         return self._shipped
 
     @property
@@ -117,8 +117,8 @@ class Stage:
         """Runs every take; returns the processor time of the ticks alone in s.
 
         Args:
-            setting: How.
-            judge: Sees each take before the next one overwrites its records.
+            setting: Setting of the simulation.
+            judge: Receives each take before the next one overwrites its records.
 
         Raises:
             HapticBridgeError: The method cannot render the scene.
@@ -131,14 +131,14 @@ class Stage:
             binding = self.bound(setting, start)
             begin = time.thread_time()
             done = simulate(binding.state, samples, binding.row, rows)
-            # what diverged counts as if it had gone on
+            # the time of a diverged run is extrapolated to its full length
             seconds += (time.thread_time() - begin) * samples.size / max(done, 1)
             if judge is not None:
                 judge(self._take(setting, binding, rows[:done], samples.size))
         return seconds
 
     def bound(self, setting: Setting, start: Start | None = None) -> BoundKernel:
-        """Puts the scene to its start, and binds it for the compiled loop.
+        """Resets the scene to its start, and binds it for the compiled loop.
 
         Raises:
             HapticBridgeError: The method cannot render the scene.
@@ -146,7 +146,7 @@ class Stage:
         scene, period, method = self._scene, setting.period, setting.method
         self._shipped.apply(scene, setting)
         effective = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
-        # an error inside the C symbol would end the process, so the first step is Python's
+        # an error inside the C symbol would end the process, so the first step runs in Python
         mujoco.mj_step(scene.model, scene.data)
         scene.reset()
         if start is not None:
@@ -210,7 +210,7 @@ class SceneRun:
 
 
 class Stages:
-    """The stages of a workload: a scene with a weld in it cannot serve the other methods."""
+    """Stages of a workload. A scene with a weld cannot serve the other methods."""
 
     def __init__(self, make: Callable[[], Stage]) -> None:
         self._make = make
@@ -225,10 +225,11 @@ class Stages:
 
 
 REFERENCE_REFINEMENT = 32
-"""How many times smaller the reference's step is than the smallest step of the chart."""
+"""Ratio of the chart's smallest step to the reference's step."""
 
 TOUCHING = 0.5
-"""Share of the reference's instants in contact that a run must share, or it has lost contact."""
+"""Share of the reference's instants in contact that a run must share; below it, contact counts as
+lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +238,7 @@ class OwnReference:
 
     Attributes:
         records: ``TICK_DTYPE`` at whole multiples of the chart's longest period.
-        period: Of the reference in s.
+        period: Period of the reference in s.
     """
 
     records: NDArray[np.void]
@@ -245,14 +246,14 @@ class OwnReference:
 
 
 class OwnReferences:
-    """The reference of each method, computed when it is first asked for.
+    """References of the methods, each computed on first use.
 
     Args:
-        stages: Where it runs.
+        stages: Stages to run on.
         grid: Longest period of the chart in s.
         finest: Shortest period of the chart in s.
-        duration: How much of the motion is compared, in s.
-        refinement: How many times smaller than ``finest`` the step is.
+        duration: Duration in s of the compared part of the motion.
+        refinement: Ratio of ``finest`` to the reference's step.
     """
 
     def __init__(
@@ -268,7 +269,7 @@ class OwnReferences:
         self._found: dict[str, OwnReference | None] = {}
 
     def of(self, method: Method) -> OwnReference | None:
-        """Returns a method's reference; None where it diverges even at this step."""
+        """Returns a method's reference; None if it diverges even at this step."""
         if method.name not in self._found:
             setting = Setting(method, self._period)
             stage = self._stages.for_method(setting)
@@ -279,9 +280,9 @@ class OwnReferences:
         return self._found[method.name]
 
     def score(self, take: Take) -> Score:
-        """Compares the first part of a take with the same method at the small step."""
+        """Compares the first part of a take with its method's reference."""
         if take.setting.engine != OWN:
-            return Score(felt=NAN)  # not on the chart
+            return Score(felt=NAN)  # the method is not on the chart
         reference = self.of(take.setting.method)
         if take.has_diverged:
             return diverged(take.created, take.ended)
@@ -298,11 +299,11 @@ class OwnReferences:
         )
 
     def disagreement(self) -> dict[str, float]:
-        """Returns how far each method's limit is from the central one in JND, 0 for that one.
+        """Returns the distance in JND of each method's limit from the central one.
 
-        Central is the limit whose median distance to all is least: the one that most agree on. It
-        is that of a method that renders the coupling that was asked for, if there is one.
-        Where limits agree, they are likely the motion of the model; where not, at most one is.
+        The central limit has the least median distance to all, so most methods agree on it. It
+        belongs to a method that renders the requested coupling, if there is one. Limits that agree
+        are likely the motion of the model; if they differ, at most one is.
         """
         found = {name: each.records for name, each in self._found.items() if each is not None}
         centers = [name for name in found if METHODS[name].has_law] or list(found)
@@ -316,9 +317,9 @@ class OwnReferences:
 def fine_records(
     stage: Stage, setting: Setting, grid: float, count: int
 ) -> NDArray[np.void] | None:
-    """Runs a stage and keeps one record per ``grid`` s; None where it diverges.
+    """Runs a stage and keeps one record per ``grid`` s; None if it diverges.
 
-    The memory of a million ticks is not needed: the run goes from one instant to the next.
+    The memory of a million ticks is not needed: the run advances from one instant to the next.
 
     Raises:
         StudyError: The method cannot render the scene, or ``grid`` is no multiple of the period.
@@ -340,16 +341,16 @@ def fine_records(
 
 
 class Staged(ABC):
-    """A workload whose every point is its stage at another setting.
+    """A workload whose points are one stage at different settings.
 
     Args:
         coupling: K and B.
-        stages: Where it runs.
-        references: The methods' own limits, where it compares with them.
+        stages: Stages to run on.
+        references: The methods' own limits, if the workload compares with them.
 
     Attributes:
-        needs_tool: What a method that does without the tool's own dynamics fails to do, as in
-            "method 'weld' …"; empty where the workload suits it.
+        needs_tool: Text after "method 'weld' …" for a method without the tool's own dynamics; empty
+            if the workload suits it.
     """
 
     needs_tool: ClassVar[str] = ""
@@ -365,7 +366,7 @@ class Staged(ABC):
         """Prepares a point.
 
         Raises:
-            StudyError: The method does without the tool's own dynamics, and that is what is judged.
+            StudyError: The method omits the tool's own dynamics, which the workload judges.
         """
         method = setting.method
         if self.needs_tool and method.scheme in (Scheme.WELD, Scheme.MASSLESS):
@@ -374,37 +375,37 @@ class Staged(ABC):
 
     @abstractmethod
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
-        """Says what the takes of a point are worth, by ``Panel.key``."""
+        """Returns the scores of a point's takes by ``Panel.key``."""
 
 
 COUPLING = Coupling(1000.0, 1.0, 1.0, 1e-3)
-"""K = 1000 N/m and B = 1 N s/m: what the default simulated device (b = 2 N s/m) certifies at 1 kHz,
-and B = K T there, so that a compensated coupling is compensated in full."""
+"""Default coupling, K = 1000 N/m and B = 1 N s/m. The default simulated device (b = 2 N s/m)
+certifies it at 1 kHz. There B = K T, so that a compensated coupling is compensated in full."""
 
 PROBED = 1e-3
-"""T in s of the run that finds the first contact."""
+"""Period T in s of the run that finds the first contact."""
 
 AFTER_CONTACT = 0.3
-"""How much of the motion after the first contact is simulated, in s."""
+"""Simulated time in s of the motion after the first contact."""
 
 SHORTEST, LONGEST = 0.4, 1.2
-"""Range of the simulated time in s: enough ticks to compare, and a chart in three minutes. Where
-the path touches later, it is played as much faster as it takes."""
+"""Range of the simulated time in s: enough ticks to compare, and a chart in three minutes. A path
+that touches later is played faster in proportion."""
 
 REFINEMENT = 8
-"""How many times smaller the reference's step is than the smallest of the chart: 64 times smaller
-than 1 ms by default. Scenes cost many times what a peg does."""
+"""Ratio of the chart's smallest step to the reference's step: 64 times smaller than 1 ms by
+default. Scenes cost many times as much as a peg."""
 
 
 class SceneMotion(Staged):
-    """The workload.
+    """A shipped or user's scene with its hand path as a workload.
 
     Args:
         scene: A shipped scene's name or an MJCF file, with ``NAME.csv`` beside it.
         coupling: K and B.
         grid: Longest period T in s.
         finest: Shortest period T in s.
-        refinement: How many times smaller the reference's step is than ``finest``.
+        refinement: Ratio of ``finest`` to the reference's step.
 
     Raises:
         HapticBridgeError: The scene cannot be read, or there is no hand path beside it.
@@ -437,12 +438,12 @@ class SceneMotion(Staged):
         )
         self._limits = OwnReferences(stages, grid, finest, duration, refinement)
         super().__init__(coupling, stages, self._limits)
-        told = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
-        self.about = f"the scene's own hand path, {duration:g} s of it{told}"
+        pace = "" if self.speed == 1 else f", {self.speed:.3g} times as fast"
+        self.about = f"the scene's own hand path, {duration:g} s of it{pace}"
         self.panels: Sequence[Panel] = (
             Panel(
                 "moving",
-                f"{self.name} along its hand path{told}",
+                f"{self.name} along its hand path{pace}",
                 f"the same method at a step {refinement} times smaller than the smallest: "
                 "convergence, not truth",
                 is_truth=False,
@@ -450,7 +451,7 @@ class SceneMotion(Staged):
         )
 
     def peer_work(self) -> PeerWork:
-        """Refuses: convergence to a method's own limit means nothing across engines.
+        """Refuses other engines, because a method's own limit has no meaning across engines.
 
         Raises:
             StudyError: Always.
@@ -482,9 +483,9 @@ def path_of(motion: Motion, speed: float = 1.0) -> Path:
 
 
 def _first_contact(stage: Stage) -> float | None:
-    """Returns when the tool first touches in s, None for never.
+    """Returns the time in s of the tool's first touch, None for never.
 
-    Contacts that are there from the start are no event: the first tick with more of them is.
+    Contacts at the start do not count: the first tick with more of them does.
     """
     samples = stage.samples(PROBED)
     rows = np.zeros(samples.size, TICK_DTYPE)

@@ -1,4 +1,4 @@
-"""How one point of a chart is simulated: method, time steps, contacts, solver."""
+"""Setting of one point of a chart: method, time steps, contacts, solver."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from hapticbridge.rendering import (
 from hapticbridge.scene import Scene
 
 OWN = "hapticbridge"
-"""The bridge itself, in its compiled loop around MuJoCo; other engines carry their own names, and
-MuJoCo as any other engine is called ``mujoco``."""
+"""Name of the bridge itself, in its compiled loop around MuJoCo. Other engines have their own
+names; MuJoCo as a peer engine is called ``mujoco``."""
 
 SPRING = "_spring"
-"""How the name of an engine ends that solves the coupling as a spring of its own."""
+"""Ending of the name of an engine that solves the coupling as its own spring."""
 
 SHIPPED = "as shipped"
-"""The contact setting that the scene's file names."""
+"""Name of the contact setting in the scene's file."""
 
 PYRAMIDAL = "pyramidal cone"
 SOFT = "soft"
@@ -47,10 +47,10 @@ SOFT_SOLREF = (0.02, 1.0)
 """MuJoCo's default: timeconst in s and dampratio."""
 
 DIRECT_SOLREF = (-1e6, -2e3)
-"""Contact stiffness and damping given directly, in 1/s² and 1/s, as MuJoCo's negative solref: that
-of timeconst 1 ms and dampratio 1, four times as stiff as ``2 steps`` at 1 kHz. MuJoCo raises a time
-constant below two steps, this it leaves. In one of twenty random hands a peg in its hole then
-creates 0.5 mJ, 9 % of the slack, where ``2 steps`` creates nothing."""
+"""Contact stiffness and damping in 1/s² and 1/s, as MuJoCo's negative solref. They are those of
+timeconst 1 ms and dampratio 1, four times as stiff as ``2 steps`` at 1 kHz. MuJoCo raises a time
+constant below two steps, but leaves these values. In one of twenty random hands a peg in its hole
+then creates 0.5 mJ, 9 % of the slack, where ``2 steps`` creates nothing."""
 
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 """Impedance of the named settings, that of the shipped scenes and MuJoCo's default."""
@@ -60,17 +60,16 @@ _GIVEN = {SOFT: SOFT_SOLREF, DIRECT_CONTACT: DIRECT_SOLREF}
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Everything that is chosen at a point.
+    """All choices at a point.
 
     Attributes:
-        method: How the tool is rendered; its integrator is MuJoCo's.
+        method: Rendering method; its integrator is MuJoCo's.
         period: T in s, one tick.
         substeps: MuJoCo steps per tick.
         contact: One of ``CONTACTS``.
-        iterations: The most that MuJoCo's solver may take; None as the scene says.
-        engine: Who simulates; another than ``OWN`` is set as its documentation advises, and
-            holds the coupling's force as method ``explicit`` does, unless its name ends with
-            ``SPRING``.
+        iterations: Limit of MuJoCo's solver; None for that of the scene.
+        engine: Engine. Any other than ``OWN`` is set as its documentation advises. It holds the
+            coupling's force as method ``explicit`` does, unless its name ends with ``SPRING``.
     """
 
     method: Method
@@ -87,7 +86,7 @@ class Setting:
 
     @property
     def label(self) -> str:
-        """The setting in words, what is usual left out."""
+        """Setting in words, without the usual values."""
         law = "own spring" if self.engine.endswith(SPRING) else "held force"
         who = self.method.name if self.engine == OWN else f"{self.engine}, {law}"
         parts = [who, f"{1e3 * self.period:g} ms"]
@@ -102,13 +101,13 @@ class Setting:
 
 
 def who(setting: Setting) -> str:
-    """Returns the method's name, or the engine's where it is another."""
+    """Returns the method's name, or the engine's if it is another."""
     return setting.method.name if setting.engine == OWN else setting.engine
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShippedOptions:
-    """What of a scene a setting changes, as its file says it."""
+    """Properties of a scene that a setting changes, as in its file."""
 
     solref: NDArray[np.float64]
     solimp: NDArray[np.float64]
@@ -117,7 +116,7 @@ class ShippedOptions:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> ShippedOptions:
-        """Keeps what the scene's file says."""
+        """Keeps the values of the scene's file."""
         return cls(
             model.geom_solref.copy(),
             model.geom_solimp.copy(),
@@ -126,7 +125,7 @@ class ShippedOptions:
         )
 
     def chosen(self, setting: Setting) -> dict[str, str | int]:
-        """Returns contacts and solver of a point as MuJoCo gets them, for a table."""
+        """Returns contacts and solver of a point as MuJoCo receives them, for a table."""
         solref, solimp = _different(self.solref), _different(self.solimp)
         in_steps = CONTACTS[setting.contact]
         if in_steps is not None:
@@ -146,7 +145,7 @@ class ShippedOptions:
         }
 
     def apply(self, scene: Scene, setting: Setting) -> None:
-        """Gives the scene's model the contacts and the solver that a setting asks for."""
+        """Sets contacts and solver of the scene's model to those of a setting."""
         model = scene.model
         model.geom_solref[:] = self.solref
         model.geom_solimp[:] = self.solimp
@@ -173,24 +172,24 @@ def _different(rows: NDArray[np.float64]) -> str:
 
 
 PERIODS_MS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
-"""T in ms where nobody chooses: 250 Hz to 8 kHz."""
+"""Periods T in ms by default: 250 Hz to 8 kHz."""
 
 QUICK_PERIODS_MS = (4.0, 1.0, 0.25)
-"""Likewise, of a quick chart."""
+"""Periods T in ms of a quick chart."""
 
 USUAL_MS = 1.0
-"""T in ms at which everything but the time step is varied."""
+"""Period T in ms at which everything but the time step is varied."""
 
 SUBSTEPS = (2, 4, 8)
 ITERATIONS = (1, 2, 5, 20)
-"""The most solver iterations; MuJoCo's own limit is 100 and it rarely needs more than ten."""
+"""Limits of solver iterations. MuJoCo's own limit is 100, and it rarely needs more than ten."""
 
 VARIED = ("implicit", "lossless")
 """Methods whose contacts and solver are varied: the two that are meant for a device. The others
-answer to a contact as 'implicit' does, by the same solver."""
+respond to a contact as 'implicit' does, with an equal solver."""
 
 LEAST_MS, MOST_MS = 0.02, 20.0
-"""Range of T in ms: 50 kHz to 50 Hz. Beyond, nothing haptic runs."""
+"""Range of T in ms: 50 kHz to 50 Hz. No haptic loop runs beyond it."""
 
 
 def chosen_methods(names: Sequence[str] | None) -> list[Method]:
@@ -198,7 +197,7 @@ def chosen_methods(names: Sequence[str] | None) -> list[Method]:
 
     Raises:
         StudyError: No name is given.
-        SceneError: A name is none of a method's.
+        SceneError: A name is not that of a method.
     """
     if names is None:
         return list(METHODS.values())
@@ -211,12 +210,12 @@ def chosen_periods(steps_ms: Sequence[float] | None, *, is_quick: bool = False) 
     """Returns the periods T in s, longest first.
 
     Args:
-        steps_ms: In ms; None for ``PERIODS_MS``.
-        is_quick: Whether None means ``QUICK_PERIODS_MS``.
+        steps_ms: Periods in ms; None for ``PERIODS_MS``.
+        is_quick: True selects ``QUICK_PERIODS_MS`` for None.
 
     Raises:
-        StudyError: One is out of range or does not divide the longest, so that there would be no
-            common instants to compare at.
+        StudyError: A period is out of range or does not divide the longest. Runs could then not be
+            compared at common instants.
     """
     if steps_ms is None:
         steps_ms = QUICK_PERIODS_MS if is_quick else PERIODS_MS
@@ -241,15 +240,15 @@ def settings_for(
 ) -> list[Setting]:
     """Returns the points of a chart.
 
-    Every method at every period. At 1 ms, or the period nearest to it, also: every method with 2, 4
-    and 8 substeps, unless it cannot divide a tick; and where something can touch, the methods of
-    ``VARIED`` with every contact setting, and with few solver iterations. The contact settings are
-    tried at the next smaller period too: what is right at one step alone is right by luck.
+    Every method runs at every period. At 1 ms, or the period nearest to it, every method also runs
+    with 2, 4 and 8 substeps, unless it cannot divide a tick. If bodies can touch, the methods of
+    ``VARIED`` run with every contact setting, and with few solver iterations. The contact settings
+    are tried at the next smaller period too, because a setting may be right at one step by luck.
 
     Args:
-        methods: Which.
+        methods: Names of the methods.
         periods: T in s.
-        has_contact: Whether anything in the scene can touch.
+        has_contact: True if bodies in the scene can touch.
     """
     points = [Setting(method, period) for method in methods for period in periods]
     usual = min(periods, key=lambda period: abs(period - 1e-3 * USUAL_MS))
@@ -275,7 +274,7 @@ def settings_for(
 
 
 def _with_neighbour(usual: float, periods: Sequence[float]) -> list[float]:
-    """Returns a period and the next smaller one; where there is none, the next larger one."""
+    """Returns a period and the next smaller one; without one, the next larger one."""
     others = [period for period in periods if period != usual]
     smaller = [period for period in others if period < usual]
     return [usual, *([max(smaller)] if smaller else [min(others)] if others else [])]

@@ -1,4 +1,4 @@
-"""Cost against work: how a tick's time grows with bodies, contacts and triangles."""
+"""Cost against work: growth of a tick's time with bodies, contacts and triangles."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.scene import Scene
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 TICKS = 300
-"""Ticks of a run, with the first ``WARM_UP`` not counted."""
+"""Number of ticks of a run; the first ``WARM_UP`` do not count."""
 
 LONGEST = 2.0
-"""Time in s after which a run ends early: scenes that cannot be simulated at 1 kHz by far."""
+"""Time in s after which a run ends early. Such a scene is far too slow for 1 kHz."""
 
 SHAKE = 1e-3
-"""How far the handle goes down in m, at 5 Hz: a tool on the floor is pressed, and never sleeps."""
+"""Descent of the handle in m, at 5 Hz. It presses a tool on the floor, which thus never sleeps."""
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """How a scene is stepped.
+    """A way to step a scene.
 
     Attributes:
-        name: In tables.
-        has_islands: Whether MuJoCo divides the scene into islands that it solves by themselves.
-        is_bare: Whether MuJoCo's step is run alone, without the bridge's arithmetic.
-        sleeps: Whether MuJoCo lets bodies at rest sleep. The bridge refuses that (a sleeping tool
+        name: Name in tables.
+        has_islands: True if MuJoCo divides the scene into islands that are solved separately.
+        is_bare: True if MuJoCo's step runs alone, without the bridge's arithmetic.
+        sleeps: True if MuJoCo lets bodies at rest sleep. The bridge refuses that (a sleeping tool
             would not feel its coupling), so it is measured with the bare step.
     """
 
@@ -71,11 +71,11 @@ VARIANTS = (
 
 
 def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDArray[np.float64]:
-    """Returns the time of each tick in s, whole ticks as the live loop has them.
+    """Returns the time of each tick in s, for whole ticks of the live loop.
 
     Args:
-        scene: Reset first.
-        variant: How it is stepped.
+        scene: Scene; reset first.
+        variant: Way to step it.
         clock: Time in ns.
 
     Raises:
@@ -127,16 +127,16 @@ def _flags(model: mujoco.MjModel, variant: Variant) -> Iterator[None]:
 
 
 SPACING = 0.05
-"""Between the bodies of a scene in m: none touches its neighbour."""
+"""Distance in m between the bodies of a scene; none touches its neighbour."""
 
 FOOT = 2e-3
-"""Radius in m of the balls that a plate stands on, one contact each."""
+"""Radius in m of the balls under a plate, one contact each."""
 
 BALL = 0.01
 """Radius in m of a ball, and half the edge of a box."""
 
 MOST = 200_000
-"""Triangles at most: more take MuJoCo minutes to compile."""
+"""Largest number of triangles; more take MuJoCo minutes to compile."""
 
 _FRAME = """
 <mujoco model="{name}">
@@ -156,9 +156,9 @@ class Family:
     """Scenes that differ in one count.
 
     Attributes:
-        name: In tables.
-        unit: What is counted.
-        about: What the scenes are, in a sentence.
+        name: Name in tables.
+        unit: Counted items.
+        about: Description of the scenes in a sentence.
         sizes: The counts.
         build: Returns the scene of a count.
     """
@@ -176,9 +176,9 @@ def floating(count: int) -> Scene:
 
 
 def plate(count: int) -> Scene:
-    """Returns a tool that stands on ``count`` feet, as near to a square as they divide."""
+    """Returns a tool on ``count`` feet, in a rectangle as near to a square as possible."""
     _check(count, 100_000)
-    # a full rectangle: a body that stands on one side of itself would tilt
+    # a full rectangle: a body with feet on one side only would tilt
     rows = max(n for n in range(1, int(count**0.5) + 1) if count % n == 0)
     columns = count // rows
     feet = "".join(
@@ -293,28 +293,28 @@ def _check(count: int, most: int) -> None:
 
 
 ROUNDS = 3
-"""How often every scene is run, in turn with the others."""
+"""Number of runs of every scene, in turn with the others."""
 
 LARGE = 0.1
-"""Share of a family's largest size from which on its exponent is fitted, no unit: below, the cost
-that every tick has hides the growth."""
+"""Share of a family's largest size above which its exponent is fitted, no unit. Below it, the
+constant cost of a tick hides the growth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """What a scene cost.
+    """Cost of a scene.
 
     Attributes:
-        family: Its name.
-        variant: Its name.
-        size: The count that was asked for.
+        family: Name of the family.
+        variant: Name of the variant.
+        size: Requested count.
         contacts: Contacts at the end.
         rows: Constraint rows at the end.
         freedoms: Degrees of freedom.
-        time: Of a tick in s, all rounds together.
-        low: Least median of a round in s.
-        high: Largest.
-        rate: Hz at which the 99th percentile of a tick fills half a period.
+        time: Time of a tick in s, all rounds together.
+        low: Smallest median of a round in s.
+        high: Largest median of a round in s.
+        rate: Rate in Hz at which the 99th percentile of a tick fills half a period.
     """
 
     family: str
@@ -331,12 +331,13 @@ class Work:
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How the time of a tick goes with the size: time ~ size^p.
+    """Growth of a tick's time with the size: time ~ size^p.
 
     Attributes:
         exponent: p, fitted to the larger sizes; no unit.
-        low: Least p from one of these sizes to the next.
-        high: Largest. Far from ``low``, the growth is no power of the size.
+        low: Smallest p from one of these sizes to the next.
+        high: Largest p from one of these sizes to the next. Far from ``low``, the growth is no
+            power of the size.
         start: Smallest size of the fit.
     """
 
@@ -348,11 +349,11 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class WorkChart:
-    """Everything that was measured.
+    """Results of the measurement.
 
     Attributes:
         points: One per family, size and variant.
-        machine: In words.
+        machine: Description of the machine.
     """
 
     points: tuple[Work, ...]
@@ -363,11 +364,11 @@ class WorkChart:
         return [p for p in self.points if (p.family, p.variant) == (family.name, variant.name)]
 
     def variants(self, family: Family) -> list[Variant]:
-        """Returns the variants that a family was measured with."""
+        """Returns the measured variants of a family."""
         return [variant for variant in VARIANTS if self.of(family, variant)]
 
     def growth(self, family: Family, variant: Variant) -> Growth | None:
-        """Returns how the time goes with the larger sizes; None for fewer than two."""
+        """Returns the growth of the time with the larger sizes; None for fewer than two."""
         points = self.of(family, variant)
         return growth_of(
             np.array([each.size for each in points], dtype=np.float64),
@@ -379,8 +380,8 @@ def growth_of(sizes: NDArray[np.float64], times: NDArray[np.float64]) -> Growth 
     """Fits time ~ size^p to the sizes from ``LARGE`` of the largest on.
 
     Args:
-        sizes: > 0, rising, shape (n,).
-        times: In s, > 0, shape (n,).
+        sizes: Sizes, > 0, increasing, shape (n,).
+        times: Times in s, > 0, shape (n,).
 
     Returns:
         None for fewer than two such sizes.
@@ -406,16 +407,16 @@ def measure_work(
     clock: Callable[[], int] = time.thread_time_ns,
     progress: Callable[[int, int], None] | None = None,
 ) -> WorkChart:
-    """Times ticks of scenes that grow, all in turn, on one core.
+    """Times ticks of growing scenes, all in turn, on one core.
 
     Bodies at rest are measured with every variant, the others as the bridge runs them.
 
     Args:
-        families: What grows.
+        families: Families of scenes.
         most: Largest size; None for all.
-        rounds: How often every scene is run.
-        clock: Time in ns; by default the thread's own, in which nothing else of the machine counts.
-        progress: Called with the runs done and all of them.
+        rounds: Number of runs of every scene.
+        clock: Time in ns; by default the thread's own, which excludes other work of the machine.
+        progress: Called with the finished and all runs.
     """
     jobs = [
         (family, variant, size)
@@ -464,21 +465,21 @@ def measure_work(
 
 
 RATE = 1000.0
-"""Hz that a paragraph asks for."""
+"""Rate in Hz for the paragraph."""
 
 WORK_ENDINGS = (*PICTURES, "csv", "json")
-"""Of the files; there is no page."""
+"""Endings of the files; there is no page."""
 
 HOLDS = f"A rate is held where 99 of 100 ticks take at most {100 * TICK_SHARE:g} % of its period"
-"""What the paragraph means by that."""
+"""Definition of the rate in the paragraph."""
 
 ROOM = 15.0
-"""How far the axis of time goes beyond half of a tick, a ratio without unit: the legend stands
-above the curves."""
+"""Ratio of the upper end of the time axis to half of a tick, without unit. The legend stands above
+the curves."""
 
 
 def draw_work(chart: WorkChart) -> Figure:
-    """Draws the tick's time over the count, a panel for each way to grow."""
+    """Draws the tick's time over the count, one panel per family."""
     figure = new_figure(8, 7)
     panels = figure.subplots(2, 2, sharey=True)
     for axes, family in zip(panels.ravel(), FAMILIES, strict=True):
@@ -502,9 +503,9 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
         points = chart.of(family, variant)
         sizes = [each.size for each in points]
         growth = chart.growth(family, variant)
-        told = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
+        text = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
         axes.plot(
-            sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=told
+            sizes, [1e6 * p.time.median for p in points], "o-", color=colour, ms=4, label=text
         )
         axes.plot(sizes, [1e6 * p.time.p99 for p in points], ":", color=colour, lw=1)
     axes.plot([], [], ":", color="grey", label="99th percentile")
@@ -522,7 +523,7 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
 
 
 def paragraph(chart: WorkChart) -> str:
-    """States the growth of a tick's time, and how much fits into a tick at 1 kHz."""
+    """States the growth of a tick's time, and the largest scenes that fit into a tick at 1 kHz."""
     said = []
     for family in FAMILIES:
         for variant in chart.variants(family):
@@ -542,10 +543,10 @@ def _power(growth: Growth) -> str:
 
 
 def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:
-    """Writes picture, table and JSON; returns what is in the JSON file.
+    """Writes picture, table and JSON; returns the content of the JSON file.
 
     Args:
-        chart: What was measured.
+        chart: The measurement.
         paths: By ending, as ``prepared_files`` returned them.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What is simulated at every point of a chart, and what it is compared with."""
+"""Workload and references of a chart: the simulated task and its scores."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from hapticbridge.lab.engines.base import Task
 Verdict = Literal[
     "strict", "within slack", "active", "lost contact", "diverged", "failed", "not metered"
 ]
-"""Of the environment (``Ledger.environment``), or what else became of the run. ``failed``: another
-engine raised an error on the way. ``not metered``: another engine, whose energy nobody counted."""
+"""Verdict on the environment (``Ledger.environment``), or another outcome of the run. ``failed``:
+another engine raised an error on the way. ``not metered``: another engine, whose energy is not
+measured."""
 
 PASSIVE = ("strict", "within slack")
 
@@ -32,15 +33,15 @@ class Score:
     Attributes:
         felt: The chart's error in just noticeable differences, no unit; inf where it diverged.
         force_rms: RMS of the force's error in N.
-        force_peak: Largest, in N.
-        torque_rms: In N m.
+        force_peak: Largest error of the force in N.
+        torque_rms: RMS of the torque's error in N m.
         position_peak: Largest distance from the reference in m.
         angle_peak: Largest angle from it in rad.
         stiffness: Relative error of the static stiffness that a displaced handle feels, no unit.
-        energy: Error of the energy in J, where the reference knows it.
+        energy: Error of the energy in J, if the reference has it.
         created: Largest Σ E_k in J: > 0 where the simulation created energy.
-        verdict: What became of it.
-        reason: Why it ended early, in words; empty where it did not.
+        verdict: Outcome of the run.
+        reason: Reason of an early end, in words; else empty.
     """
 
     felt: float
@@ -65,15 +66,15 @@ def score_of(
     stiffness: float = NAN,
     energy: float = NAN,
 ) -> Score:
-    """Compares records at the same instants, tick by tick.
+    """Compares records at equal instants, tick by tick.
 
     Args:
-        reference: ``TICK_DTYPE``; its forces set the thresholds (``check.felt``).
-        records: ``TICK_DTYPE``, as many.
-        created: In J.
-        verdict: What became of the run.
+        reference: ``TICK_DTYPE``; its forces set the thresholds (``check.perception``).
+        records: ``TICK_DTYPE``, as many as in the reference.
+        created: Created energy in J.
+        verdict: Outcome of the run.
         stiffness: Relative error of the static stiffness.
-        energy: In J.
+        energy: Error of the energy in J.
 
     Raises:
         SceneError: The numbers of records differ.
@@ -94,7 +95,7 @@ def score_of(
 
 
 def diverged(created: float = INF, reason: str = "") -> Score:
-    """Returns the score of a run that left all bounds."""
+    """Returns the score of a run that diverged."""
     return Score(felt=INF, created=created, verdict="diverged", reason=reason)
 
 
@@ -103,10 +104,10 @@ class Take:
     """One pass along the motion.
 
     Attributes:
-        setting: How.
-        records: ``TICK_DTYPE``, one per tick that was completed.
-        ended: Why it diverged, in words: it ended early, or MuJoCo gave its state up; empty where
-            it did not.
+        setting: Setting of the simulation.
+        records: ``TICK_DTYPE``, one per completed tick.
+        ended: Reason of the divergence, in words: an early end, or a state that MuJoCo rejected;
+            else empty.
         environment: ``strict``, ``within slack`` or ``active``.
         created: Largest Σ E_k in J.
         velocity: ``qvel`` at the end.
@@ -121,7 +122,7 @@ class Take:
 
     @property
     def has_diverged(self) -> bool:
-        """Whether it ended early, or MuJoCo gave its state up."""
+        """True if it ended early, or MuJoCo rejected its state."""
         return bool(self.ended)
 
     def at(self, grid: float) -> NDArray[np.void]:
@@ -131,17 +132,17 @@ class Take:
 
 
 Judge = Callable[[Sequence[Take]], Mapping[str, Score]]
-"""What a point's takes say, by ``Panel.key``; the takes' records are copies."""
+"""Function from a point's takes to its scores by ``Panel.key``; the takes' records are copies."""
 
 
 @dataclass(frozen=True, slots=True)
 class PeerWork:
-    """A workload as other engines are given it.
+    """A workload for other engines.
 
     Attributes:
-        tasks: What is simulated, one after the other; a take each.
-        duration: Of each in s.
-        judge: What the takes say, the same as for the bridge's own runs.
+        tasks: Tasks in their order, one take each.
+        duration: Duration of each in s.
+        judge: Judge of the takes, shared with the bridge's own runs.
     """
 
     tasks: tuple[Task, ...]
@@ -151,14 +152,14 @@ class PeerWork:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One comparison of a workload: a picture of its own.
+    """One comparison of a workload, with its own picture.
 
     Attributes:
-        key: In tables.
-        title: What is compared, in a few words.
-        reference: What the error is counted from, in a sentence.
-        is_truth: Whether the reference is independent of the simulation. If not, an error says
-            how far a method has converged, and not how far it is from the truth.
+        key: Key in tables.
+        title: Subject of the comparison, in a few words.
+        reference: Reference of the error, in a sentence.
+        is_truth: True if the reference is independent of the simulation. If not, an error measures
+            the convergence of a method, and not its distance from the truth.
     """
 
     key: str
@@ -168,7 +169,7 @@ class Panel:
 
 
 class Run(Protocol):
-    """A workload at one setting, which can be run again and again."""
+    """A workload at one setting, for repeated runs."""
 
     @property
     def seconds(self) -> float:
@@ -176,7 +177,7 @@ class Run(Protocol):
 
     @property
     def chosen(self) -> Mapping[str, str | int]:
-        """Contacts and solver as the engine got them: the same columns for every point."""
+        """Contacts and solver as the engine received them: equal columns for every point."""
 
     def go(self) -> float:
         """Runs it from the start; returns the processor time in s of the simulation alone."""
@@ -186,22 +187,22 @@ class Run(Protocol):
 
 
 class References(Protocol):
-    """What each method converges to."""
+    """Limits to which the methods converge."""
 
     def disagreement(self) -> dict[str, float]:
-        """Returns how far each limit lies from the one that most agree on in JND, by method."""
+        """Returns the distance in JND of each limit from the one that most agree on, by method."""
 
 
 class Workload(Protocol):
-    """What is simulated.
+    """Workload of a chart.
 
     Attributes:
-        name: What the command line calls it.
+        name: Name at the command line.
         about: One sentence.
-        panels: At least one; the first is what the recommendation goes by.
-        coupling: K and B asked for.
-        has_contact: Whether anything can touch.
-        references: The methods' own limits, where a panel compares with them.
+        panels: At least one; the recommendation depends on the first.
+        coupling: Requested K and B.
+        has_contact: True if bodies can touch.
+        references: The methods' own limits, if a panel compares with them.
     """
 
     name: str
@@ -219,8 +220,8 @@ class Workload(Protocol):
         """
 
     def peer_work(self) -> PeerWork:
-        """Returns the same work for other engines.
+        """Returns the workload for other engines.
 
         Raises:
-            StudyError: It cannot be described to them.
+            StudyError: Other engines cannot represent it.
         """

@@ -35,14 +35,14 @@ _STDOUT = 1
 
 
 @contextmanager
-def caught_prints(told: Callable[[str], None]) -> Iterator[None]:
+def caught_prints(notify: Callable[[str], None]) -> Iterator[None]:
     """Captures all that is printed on stdout inside, from C too, and reports it afterwards.
 
     PyBullet prints two lines whenever a world is opened, which would break JSON on stdout. Each
     line is reported once, however often it was printed.
 
     Args:
-        told: Called with each different line, in the order of first appearance.
+        notify: Called with each different line, in the order of first appearance.
     """
     try:
         kept = os.dup(_STDOUT)
@@ -62,7 +62,7 @@ def caught_prints(told: Callable[[str], None]) -> Iterator[None]:
         finally:
             os.close(kept)
             for line in _lines(file):
-                told(line)
+                notify(line)
 
 
 def _flush() -> None:

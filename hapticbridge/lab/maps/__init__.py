@@ -19,4 +19,4 @@ from hapticbridge.lab.maps.tool_mass import TOOL_MASS
 _IN_ORDER = (COUPLING, TOOL_MASS, GEOMETRY, CONTACT, ROTATION, RATE, DEVICE, RESTITUTION)
 
 MAPS = {each.name: each for each in _IN_ORDER}
-"""The maps by name, in the order in which they are best read."""
+"""The maps by name, in the recommended order of reading."""

@@ -38,18 +38,18 @@ from hapticbridge.theory.bounds import maximum_stiffness
 Point = dict[str, float | int | str | bool]
 
 LEAST_POINTS, MOST_POINTS = 4, 1_000_000
-"""Fewest and most points of a map: with fewer there is no grid, and a million take hours to days
+"""Smallest and largest number of points of a map. Fewer form no grid. A million take hours to days
 and a gigabyte."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What a map shows.
+    """Result of a map.
 
     Attributes:
         figure: The picture, legible at 800 pixels.
-        paragraph: What it says, in a few sentences with its numbers.
-        boundary: Where methods fail, measured beside predicted; for JSON.
+        paragraph: A few sentences with the numbers of the picture.
+        boundary: Limits of the methods, measured beside predicted; for JSON.
     """
 
     figure: Figure
@@ -68,10 +68,10 @@ class StabilityMap:
     Attributes:
         name: Name at the command line.
         doc: Docstring of the map's module; ``about`` is its first line behind the colon.
-        default_points: About how many points there are by default.
-        points: Returns about that many points, in a fixed order.
+        default_points: Approximate number of points by default.
+        points: Returns approximately the requested number of points, in a fixed order.
         evaluate: Computes one point; at the top level of a module, so that other processes find it.
-        summarize: Returns the numbers of a table: where methods fail, measured beside predicted.
+        summarize: Returns the numbers of a table: limits of the methods, measured beside predicted.
         draw: Draws a table and its numbers.
         sentences: States the numbers; see ``paragraph``.
     """
@@ -87,11 +87,11 @@ class StabilityMap:
 
     @property
     def about(self) -> str:
-        """What the map shows, in one sentence."""
+        """Subject of the map in one sentence."""
         return (self.doc or "").partition("\n")[0].partition(": ")[2].rstrip(".")
 
     def read(self, table: Table) -> Finding:
-        """Reads the rows at which something was computed.
+        """Reads the rows of points that were computed.
 
         Raises:
             StudyError: There is no such row.
@@ -108,7 +108,7 @@ class StabilityMap:
 
 
 def paragraph(sentences: Sentences) -> str:
-    """Fills numbers into sentences; one that lacks a number, for its points failed, is left out."""
+    """Fills numbers into sentences; a sentence is left out if its number is missing."""
     said = []
     for text, numbers in sentences:
         with contextlib.suppress(KeyError, TypeError):
@@ -118,14 +118,14 @@ def paragraph(sentences: Sentences) -> str:
 
 @dataclass(frozen=True, slots=True)
 class MapFiles:
-    """What a map left in its folder.
+    """Files and finding of a map.
 
     Attributes:
         picture: PNG.
-        table: CSV or Parquet, a row a point.
+        table: CSV or Parquet, one row per point.
         boundary: JSON: ``about``, ``paragraph``, ``points``, ``failed`` and ``boundary``.
-        finding: What it shows.
-        failed: Points that could not be computed; their reasons are in the table.
+        finding: Figure, paragraph and limits.
+        failed: Number of points that could not be computed; their reasons are in the table.
     """
 
     picture: Path
@@ -147,15 +147,15 @@ def run_map(
 ) -> MapFiles:
     """Computes a map and writes its picture, table and boundary.
 
-    What is done is kept in ``folder/NAME.parts``; the same map, begun again after a kill, goes on
+    Results are kept in ``folder/NAME.parts``. After an interruption a new run of the map continues
     from there.
 
     Args:
-        stability_map: Which.
-        folder: Made if missing.
-        points: About how many, 4 to 1 000 000; None for the map's own number.
-        form: Of the table: ``csv`` or ``parquet`` (needs the extra ``tables``).
-        executor: Where points are computed; by default a pool of processes.
+        stability_map: The map.
+        folder: Folder to write into; made if missing.
+        points: Approximate number, 4 to 1 000 000; None for the map's own number.
+        form: Format of the table: ``csv`` or ``parquet`` (needs the extra ``tables``).
+        executor: Executor for the points; by default a pool of processes.
         scheduler: Address of a dask.distributed cluster instead.
         progress: Called with the points done and all points.
 
@@ -178,7 +178,7 @@ def run_map(
         scheduler=scheduler,
         progress=progress,
     )
-    table.write(files[form])  # first: it is what cost the time
+    table.write(files[form])  # the table first: computing it took the time
     failed = int(table.failed.sum())
     finding = stability_map.read(table)
     write_picture(finding.figure, files["png"])
@@ -199,17 +199,18 @@ def run_map(
 
 
 WIDTH = 1e-3
-"""Relative width of a bracket, without unit, at which maps end a search: a tenth of a per cent. An
-agreement is never quoted below half of it. Halving it costs one run more."""
+"""Relative width of a bracket, without unit, at which maps end a search: a tenth of a per cent. No
+agreement below half of it is reported. Halving it costs one run more."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bracket:
-    """Between what a search ended.
+    """Bracket around a stability limit.
 
     Attributes:
-        lower: Largest value that was seen stable; 0 if the lower end of the search was not.
-        upper: Smallest value above it that was not; inf if the upper end of the search was stable.
+        lower: Largest value that was stable; 0 if the lower end of the search was not.
+        upper: Smallest value above it that was not; inf if the upper end of the search was
+            stable.
     """
 
     lower: float
@@ -217,7 +218,7 @@ class Bracket:
 
     @property
     def middle(self) -> float:
-        """The geometric middle: at most half the relative width away from the limit."""
+        """Geometric mean of the ends; it is within half the relative width of the limit."""
         if self.lower == 0 or math.isinf(self.upper):
             return self.lower if self.lower == 0 else self.upper
         return math.sqrt(self.lower * self.upper)
@@ -226,18 +227,19 @@ class Bracket:
 def largest_stable(
     is_stable: Callable[[float], bool], lower: float, upper: float, width: float = WIDTH
 ) -> Bracket:
-    """Searches by bisection, even in the logarithm, for where stability ends.
+    """Finds the limit of stability by bisection, even in the logarithm.
 
     Args:
-        is_stable: Whether a value is stable; stable below one limit and not above it. Where it
-            changes more than once, one of the changes is found.
-        lower: Where the search begins, > 0.
-        upper: Where it ends, > lower. Ends that have nothing to do with a prediction make the
-            search independent of it.
-        width: Relative width at which it ends, > 0.
+        is_stable: Returns True for a stable value: stable below one limit and not above it. If
+            stability changes more than once, one of the changes is found.
+        lower: Lower end of the search, > 0.
+        upper: Upper end, > lower. Ends that are independent of a prediction keep the search
+            independent of it.
+        width: Relative width at which the search ends, > 0.
 
     Returns:
-        The bracket; ``Bracket(0, lower)`` if nothing was stable and ``Bracket(upper, inf)`` if all
+        The bracket; ``Bracket(0, lower)`` if nothing was stable and ``Bracket(upper, inf)`` if
+        all
         was.
 
     Raises:
@@ -259,13 +261,13 @@ def largest_stable(
 
 
 def agreement(measured: ArrayLike, predicted: ArrayLike, width: float = WIDTH) -> float | None:
-    """Returns the largest relative deviation that a search of that width can tell.
+    """Returns the largest relative deviation, at least the resolution of the search.
 
     That is max(deviation, width/2), without unit; None where nothing can be compared.
 
     Args:
         measured: Middles of brackets, any shape.
-        predicted: Broadcasts with them.
+        predicted: Predicted values, broadcastable with ``measured``.
         width: Relative width of the brackets.
     """
     ratio = np.asarray(measured, dtype=np.float64) / np.asarray(predicted, dtype=np.float64)
@@ -283,7 +285,7 @@ def used_damping(
     Args:
         name: The method; a is its ``lag``.
         stiffness: K in N/m.
-        damping: B in N s/m as asked for; broadcasts with K.
+        damping: Requested B in N s/m; broadcasts with K.
         period: T in s.
     """
     taken = METHODS[name].lag * period * np.asarray(stiffness, dtype=np.float64)
@@ -291,11 +293,11 @@ def used_damping(
 
 
 def law_in_words(name: str, subscript: str = "") -> str:
-    """Returns which damping a method's law uses, as titles and legends say it.
+    """Returns the damping of a method's law, as titles and legends name it.
 
     Args:
         name: The method.
-        subscript: Of K and B: empty, or ``_r`` in rotation.
+        subscript: Subscript of K and B: empty, or ``_r`` in rotation.
     """
     lag = METHODS[name].lag
     taken = {0.0: "", 0.5: f" − K{subscript} T/2"}.get(lag, f" − K{subscript} T")
@@ -305,7 +307,7 @@ def law_in_words(name: str, subscript: str = "") -> str:
 def needed_by_6(
     name: str, stiffness: ArrayLike, damping: ArrayLike, period: float
 ) -> NDArray[np.float64]:
-    """Returns the device damping in N s/m that (6) asks for, K T/2 + B'."""
+    """Returns the device damping in N s/m that (6) requires, K T/2 + B'."""
     spring = np.asarray(stiffness, dtype=np.float64) * period / 2
     return np.asarray(spring + used_damping(name, stiffness, damping, period))
 
@@ -326,11 +328,11 @@ METHOD_COLOURS = {name: f"C{place}" for place, name in enumerate(METHODS)}
 """Colour of each rendering method's lines."""
 
 THEORY_COLOUR = "#1a5fb4"
-"""Colour of what was computed and not measured, unless it is black."""
+"""Colour of computed curves that were not measured, unless they are black."""
 
 
 STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
-"""The path of a hand that wants to stay where it is."""
+"""Path of a hand that pulls towards its place."""
 
 
 def swinging(amplitude: float, frequency: float, duration: float, count: int) -> Motion:
@@ -339,8 +341,8 @@ def swinging(amplitude: float, frequency: float, duration: float, count: int) ->
     Args:
         amplitude: A in m; it goes 2A far and back.
         frequency: f in Hz.
-        duration: In s.
-        count: Rows, evenly over the duration; between them the path is straight.
+        duration: Duration in s.
+        count: Number of rows, evenly over the duration; between them the path is straight.
     """
     time = np.linspace(0.0, duration, count)
     path = np.zeros((count, 3))
@@ -352,7 +354,7 @@ _of_this_thread = threading.local()
 
 
 def scene_of(mjcf: str) -> Scene:
-    """Loads a scene from the text of an MJCF file that refers to no other."""
+    """Loads a scene from MJCF text that refers to no other file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rig.xml"
         path.write_text(mjcf, encoding="utf-8")
@@ -360,10 +362,10 @@ def scene_of(mjcf: str) -> Scene:
 
 
 def free_body(mass: float, inertia: ArrayLike) -> str:
-    """Returns the MJCF of a free tool in nothing: no gravity, no contact, held by its centre.
+    """Returns the MJCF of a tool in free space: no gravity, no contact, held at its centre.
 
     Args:
-        mass: In kg.
+        mass: Mass in kg.
         inertia: Principal moments about its centre in kg m², shape (3,).
     """
     moments = " ".join(map(repr, np.asarray(inertia, float).tolist()))
@@ -382,7 +384,7 @@ def free_body(mass: float, inertia: ArrayLike) -> str:
 
 
 def free_tool_and_wall() -> Scene:
-    """Loads ``virtual_wall`` with its rail taken away: a tool of six degrees of freedom."""
+    """Loads ``virtual_wall`` without its rail: a tool with six degrees of freedom."""
     text = scene_path("virtual_wall").read_text(encoding="utf-8")
     freed, count = re.subn(r"<joint [^>]*type=\"slide\"[^>]*/>", "<freejoint/>", text)
     assert count == 1, "virtual_wall has one slide joint"
@@ -397,9 +399,9 @@ def loop_in(
     """Returns a closed loop on a scene, made once per thread.
 
     Args:
-        scene: The name of a shipped one, or what loads it.
-        key: What tells this change from others; loops are kept by scene and key.
-        change: Applied to the model before the first run; derived constants are set again.
+        scene: Name of a shipped scene, or a function that loads one.
+        key: Key of this change; loops are kept by scene and key.
+        change: Applied to the model before the first run; derived constants are then recomputed.
     """
     loops: dict[object, ClosedLoop] = _of_this_thread.__dict__.setdefault("loops", {})
     if (scene, key) not in loops:
@@ -412,25 +414,25 @@ def loop_in(
 
 
 def wall_loop(mass: float, scene: str | Callable[[], Scene] = "virtual_wall") -> ClosedLoop:
-    """Returns a closed loop whose tool is a wall: so heavy that no hand moves it.
+    """Returns a closed loop whose tool is a wall, too heavy for any hand to move.
 
     Args:
-        mass: Of the tool in kg.
-        scene: As for ``loop_in``, its tool called ``tool``.
+        mass: Mass of the tool in kg.
+        scene: Scene as for ``loop_in``; its tool is called ``tool``.
     """
     return loop_in(scene, ("wall", mass), lambda model: set_tool_mass(model, "tool", mass))
 
 
 def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:
-    """Gives a body another mass and scales its inertia alike.
+    """Sets the mass of a body and scales its inertia in proportion.
 
-    The inertia per kg is rounded to single precision, so that a mass set before leaves no trace:
-    what a point gives must not depend, even in its last bit, on the points before it.
+    The inertia per kg is rounded to single precision, so that a mass set before leaves no trace.
+    The result of a point must not depend on earlier points, even in its last bit.
 
     Args:
         model: Changed in place; ``mj_setConst`` must follow.
         body: The tool's name.
-        mass: In kg.
+        mass: Mass in kg.
     """
     body_id = model.body(body).id
     per_kg = model.body_inertia[body_id] / model.body_mass[body_id]
@@ -439,17 +441,18 @@ def set_tool_mass(model: mujoco.MjModel, body: str, mass: float) -> None:
 
 
 VERDICTS = ("strict", "within slack", "active", "unstable")
-"""From safe to unsafe. The first three are the environment's; ``unstable`` is the loop's."""
+"""Verdicts from safe to unsafe. The first three describe the environment; ``unstable`` describes
+the loop."""
 
 MISSING = "no point could be computed"
-"""What a picture or a paragraph says where every point of a group failed."""
+"""Text of a picture or a paragraph if every point of a group failed."""
 
 COLOURS = ("#a8d5ba", "#f4e3a1", "#f0a868", "#c0504d")
-"""Of the verdicts; told apart by lightness as well as by hue."""
+"""Colours of the verdicts; lightness differs as well as hue."""
 
 
 def verdict_numbers(is_stable: ArrayLike, environment: NDArray[np.object_]) -> NDArray[np.int64]:
-    """Returns the place of each run's verdict in ``VERDICTS``."""
+    """Returns the index of each run's verdict in ``VERDICTS``."""
     numbers = np.array([VERDICTS.index(name) for name in environment], dtype=np.int64)
     return np.where(np.asarray(is_stable, dtype=bool), numbers, VERDICTS.index("unstable"))
 
@@ -471,14 +474,14 @@ def draw_verdicts(
     """Colours a grid of runs by verdict.
 
     Args:
-        axes: Where.
-        x: Of each run, shape (n,); the runs fill a grid.
-        y: Likewise.
-        verdict: From ``verdict_numbers``.
-        log_x: Whether x is even in its logarithm.
-        log_y: Whether y is.
+        axes: Axes to draw into.
+        x: Abscissa of each run, shape (n,); the runs fill a grid.
+        y: Ordinate of each run, shape (n,).
+        verdict: Numbers from ``verdict_numbers``.
+        log_x: True if x is even in its logarithm.
+        log_y: True if y is even in its logarithm.
 
-    Without a run the axes say that no point could be computed.
+    Without a run the axes state that no point could be computed.
     """
     if log_x:
         axes.set_xscale("log")
@@ -502,12 +505,12 @@ def draw_verdicts(
 
 
 def say_missing(axes: Axes) -> None:
-    """Writes into axes that there is nothing to show, because every point of a group failed."""
+    """Writes into empty axes that every point of a group failed."""
     axes.text(0.5, 0.5, MISSING, ha="center", va="center", transform=axes.transAxes)
 
 
 def _edges(centres: NDArray[np.float64], *, is_log: bool) -> NDArray[np.float64]:
-    """Returns the borders between cells, and as far outside the first and the last."""
+    """Returns the borders between cells, and an equal distance outside the first and the last."""
     at = np.log(centres) if is_log else centres
     if at.size == 1:
         middle = np.array([at[0] - 0.5, at[0] + 0.5])
@@ -523,10 +526,10 @@ def verdict_legend(
     """Names the colours, and the lines of theory, below a figure.
 
     Args:
-        figure: Drawn already.
+        figure: A complete figure.
         lines: Label, colour and line style each; the styles ``o`` and ``s`` are white circles and
             squares.
-        columns: Of the legend.
+        columns: Number of columns of the legend.
     """
     handles: list[object] = [
         Patch(facecolor=colour, label=name) for name, colour in zip(VERDICTS, COLOURS, strict=True)

@@ -33,7 +33,7 @@ from hapticbridge.scene.contacts import (
 from hapticbridge.sweep.results import Table
 
 HEAVY = 0.1
-"""Tool mass in kg from which the rule's line for heavier tools counts."""
+"""Tool mass in kg from which the rule's line for heavier tools applies."""
 
 LINES = (
     ("strict", "-", f"rule: strict above (τ = {STRICT_STEPS:g} T or more)"),
@@ -44,7 +44,7 @@ LINES = (
 
 
 def is_in(region: str, numbers: ContactNumbers) -> bool:
-    """Tells whether the rule has a setting in a region; ``abrupt`` is where it promises nothing."""
+    """Returns True if the rule places a setting in a region; in ``abrupt`` it promises nothing."""
     if region == "strict":
         return numbers.grade == "strict"
     if region == "relaxed":
@@ -53,18 +53,18 @@ def is_in(region: str, numbers: ContactNumbers) -> bool:
 
 
 def verdicts(table: Table) -> NDArray[np.int64]:
-    """Returns the worst verdict of each row, by its place in ``VERDICTS``."""
+    """Returns the worst verdict of each row as an index in ``VERDICTS``."""
     return np.where(table["active"] > 0, 2, np.where(table["within_slack"] > 0, 1, 0))
 
 
 def agreement(table: Table) -> dict[str, Any]:
-    """Counts, on the peg's grid, what the rule says against what was measured."""
-    mine = table.select(table["rig"] == "peg")
+    """Compares the rule with the measurement on the peg's grid, in counts."""
+    selected = table.select(table["rig"] == "peg")
     numbers = [
         contact_numbers((s * PERIOD, d), contact_rigs.SHIPPED_SOLIMP, PERIOD)
-        for s, d in zip(mine["steps"], mine["dampratio"], strict=True)
+        for s, d in zip(selected["steps"], selected["dampratio"], strict=True)
     ]
-    measured = verdicts(mine)
+    measured = verdicts(selected)
     regions = {
         name: np.array([is_in(name, n) for n in numbers], dtype=bool)
         for name in ("strict", "relaxed", "abrupt")
@@ -82,11 +82,13 @@ def agreement(table: Table) -> dict[str, Any]:
 
 
 def exceptions(table: Table) -> list[dict[str, Any]]:
-    """Returns where the search was worse than the rule says, by treatment and tool mass in kg."""
+    """Returns the search results worse than the rule, by treatment and tool mass in kg."""
     found = []
     for name, treatment in TREATMENTS.items():
-        mine = table.select(table["treatment"] == name)
-        for mass, verdict in zip(mine["mass"].tolist(), verdicts(mine).tolist(), strict=True):
+        selected = table.select(table["treatment"] == name)
+        for mass, verdict in zip(
+            selected["mass"].tolist(), verdicts(selected).tolist(), strict=True
+        ):
             numbers = treatment.numbers
             grade = numbers.grade if mass >= HEAVY else numbers.light_grade
             if treatment.is_ruled and verdict > base.VERDICTS.index(grade):
@@ -110,13 +112,13 @@ def draw_bars(axes: Axes, found: Sequence[Mapping[str, Any]], names: Sequence[st
 
 
 SEARCH_MASSES = (0.03, 0.1, 0.3)
-"""In kg."""
+"""Tool masses in kg."""
 
 SEARCH_STIFFNESS = (1000.0, 6000.0)
-"""K in N/m."""
+"""Stiffnesses K in N/m."""
 
 SEARCH_HANDS = (0, 1, 2)
-"""The recorded one and two seeds."""
+"""Hands: the recorded one and two seeds."""
 
 FRICTION = (0.0, 0.42)
 
@@ -130,14 +132,14 @@ def search(name: str, mass: float) -> dict[str, float | int]:
     )
 
 
-def totals(mine: Table) -> dict[str, Any]:
-    """Adds up runs by verdict; takes the largest of what else was measured, and median depth."""
+def totals(selected: Table) -> dict[str, Any]:
+    """Sums runs by verdict, with the largest of the other quantities and the median depth."""
     counts = ("runs", "strict", "within_slack", "active")
     worst = ("created", "slack_share", "peak_force", "largest_depth")
     return {
-        **{name: int(mine[name].sum()) for name in counts},
-        **{name: float(mine[name].max()) for name in worst},
-        "median_depth": float(np.median(mine["median_depth"])),
+        **{name: int(selected[name].sum()) for name in counts},
+        **{name: float(selected[name].max()) for name in worst},
+        "median_depth": float(np.median(selected["median_depth"])),
     }
 
 
@@ -153,23 +155,23 @@ def searched(table: Table, name: str) -> dict[str, Any]:
 
 
 COMPARED = ("implicit", "compensated", "lossless")
-"""The methods that are passive behind the coupling. They differ away from contact, and in the
-damping of their law: so the hands here come and go."""
+"""Methods that are passive behind the coupling. They differ away from contact, and in the damping
+of their law. The hands here therefore make and break contact."""
 
 HANDS = 20
-"""A rig. At the mouth the first is the recorded one, the others are seeds."""
+"""Rigs. At the mouth the first hand is the recorded one, the others are seeds."""
 
 FELT_DAMPING = 1.25
-"""B over K T, no unit: more than 1, so that every method has some of its law left (B > K T)."""
+"""Ratio B/(K T), without unit. Above 1, every method keeps some damping in its law (B > K T)."""
 
 MOUTH = 0.0275
-"""Height of the peg's centre at the start in m, 2.5 mm of it in the hole: where the recorded hand
-is when its part begins, and where a random one goes in and out."""
+"""Height of the peg's centre at the start in m, with 2.5 mm of the peg in the hole. The recorded
+hand is there when its part begins, and a random hand passes in and out there."""
 
 RIGS = ("taps", "mouth")
 
 Case = tuple[float, float, float, int]
-"""K in N/m, tool mass in kg, friction and hand."""
+"""Cases: K in N/m, tool mass in kg, friction and hand."""
 
 
 def method_points() -> list[tuple[str, str, float]]:
@@ -178,7 +180,7 @@ def method_points() -> list[tuple[str, str, float]]:
 
 
 def cases_of(rig: str, mass: float) -> list[Case]:
-    """Returns what each method is run through on a rig with a tool mass in kg."""
+    """Returns the cases for each method on a rig with a tool mass in kg."""
     friction = FRICTION if rig == "mouth" else (0.0,)
     return list(itertools.product(SEARCH_STIFFNESS, [mass], friction, range(HANDS)))
 
@@ -195,10 +197,11 @@ def method_runs(
 
     Args:
         rig: One of ``RIGS``.
-        method: Its name.
-        cases: What to run it through.
-        same_law: Whether it is asked for what gives it the K and B' that ``lossless`` uses, which
-            need the same device. By default all methods are asked for the same K and B.
+        method: Name of the method.
+        cases: Cases to run.
+        same_law: True requests the coupling for which the method's law has the K and B' of
+            ``lossless``, and thus needs the same device. By default the requested K and B are equal
+            for all methods.
     """
     treatment = Treatment(method=method)
     for stiffness, mass, friction, hand in cases:
@@ -241,9 +244,9 @@ def methods_found(table: Table) -> list[dict[str, Any]]:
     """Returns the totals of each method on each rig over all tools."""
     found = []
     for rig, method in itertools.product(RIGS, COMPARED):
-        mine = table.select((table["rig"] == rig) & (table["method"] == method))
-        if len(mine):
-            found.append({"rig": rig, "method": method, **totals(mine)})
+        selected = table.select((table["rig"] == rig) & (table["method"] == method))
+        if len(selected):
+            found.append({"rig": rig, "method": method, **totals(selected)})
     return found
 
 
@@ -251,14 +254,14 @@ STEPS = (0.25, 20.0)
 """Range of timeconst/T, even in its logarithm."""
 
 DAMPING_RATIO = (0.05, 12.8)
-"""Range of dampratio, even in its logarithm; six times beyond the usual ones, for there it ends."""
+"""Range of dampratio, even in its logarithm; it extends to six times the usual values."""
 
 PANELS = (
     ("wall", "implicit", (2000.0, 20_000.0), "one mass on a wall, discrete"),
     ("wall", "implicitfast", (2000.0, 20_000.0), "one mass on a wall, implicitfast"),
     ("peg", "implicit", (1000.0, 6000.0), "peg in the hole, discrete"),
 )
-"""Rig, method, K in N/m and title."""
+"""Panels: rig, method, K in N/m and title."""
 
 CONTOUR = 160
 """Points along each axis from which the rule's lines are drawn; more make them smoother."""
@@ -315,10 +318,10 @@ def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
 
 
 def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: float) -> None:
-    is_mine = (table["rig"] == rig) & (table["method"] == method)
-    mine = table.select(is_mine & (table["stiffness"] == stiffness))
+    is_selected = (table["rig"] == rig) & (table["method"] == method)
+    selected = table.select(is_selected & (table["stiffness"] == stiffness))
     base.draw_verdicts(
-        axes, mine["steps"], mine["dampratio"], verdicts(mine), log_x=True, log_y=True
+        axes, selected["steps"], selected["dampratio"], verdicts(selected), log_x=True, log_y=True
     )
     steps, ratio, regions = _rule()
     for (_, style, _), is_above in zip(LINES, regions, strict=True):
@@ -340,9 +343,9 @@ def _draw_panel(axes: Axes, table: Table, rig: str, method: str, stiffness: floa
 
 @cache
 def _rule() -> tuple[Array, Array, list[Array]]:
-    """Returns timeconst/T, dampratio, and where each line's region of the rule is.
+    """Returns timeconst/T, dampratio, and the region of each line of the rule.
 
-    The regions have a row a dampratio. Kept, because every panel shows the same.
+    The regions have one row per dampratio. The result is cached, because every panel needs it.
     """
     steps, ratio = (np.geomspace(*ends, CONTOUR) for ends in (STEPS, DAMPING_RATIO))
     numbers = [
@@ -357,7 +360,7 @@ def _rule() -> tuple[Array, Array, list[Array]]:
 
 
 def points(count: int) -> Sequence[Point]:
-    """Returns timeconst by dampratio a panel and K, search and methods, ``count`` in all."""
+    """Returns timeconst by dampratio per panel and K, search and methods, ``count`` in all."""
     searches: list[Point] = [
         _point("search", name, "implicit", mass=mass)
         for name in TREATMENTS
@@ -383,7 +386,7 @@ def _point(rig: str, name: str, method: str, **numbers: float) -> Point:
 def evaluate(point: Point) -> Mapping[str, float | int]:
     """Runs a setting with light and heavy tools, with and without friction, and several hands.
 
-    The worst run is the verdict of a cell, so its runs end with the first that is active.
+    The worst run gives the verdict of a cell, so its runs end with the first active one.
     """
     if point["rig"] == "search":
         return search(str(point["treatment"]), float(point["mass"]))
@@ -398,7 +401,7 @@ def evaluate(point: Point) -> Mapping[str, float | int]:
 
 
 def summarize(table: Table) -> dict[str, Any]:
-    """Compares the rule with the grid and the search, and adds up treatments and methods."""
+    """Compares the rule with the grid and the search, and sums treatments and methods."""
     fast = table.select((table["rig"] == "wall") & (table["method"] == "implicitfast"))
     return {
         "period": PERIOD,
@@ -411,7 +414,7 @@ def summarize(table: Table) -> dict[str, Any]:
 
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
-    """States how far the rule held, and the verdicts of treatments and methods."""
+    """States the agreement with the rule, and the verdicts of treatments and methods."""
     if boundary["rule"]["relaxed"]["cells"] + boundary["rule"]["abrupt"]["cells"]:
         yield (
             "On the peg's grid {strict[strict]} of {strict[cells]} settings that the rule calls "

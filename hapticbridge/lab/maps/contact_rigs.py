@@ -23,14 +23,14 @@ from hapticbridge.scene import scene_path
 from hapticbridge.scene.contacts import ContactNumbers, contact_numbers
 
 RECORDED = (3.5, 6.0)
-"""Part of the recorded hand in s: into the hole and to the bottom, pressing to the sides."""
+"""Part of the recorded hand in s: into the hole, to the bottom, and pressing to the sides."""
 
 
 @cache
 def tapping(frequency: float) -> Motion:
     """Returns the path of a hand that taps at a frequency in Hz.
 
-    It wants to go 6 mm behind the wall's face.
+    Its target lies up to 6 mm behind the wall's face.
     """
     return base.swinging(0.008, frequency, duration=1.0, count=301)
 
@@ -59,7 +59,7 @@ def recorded() -> tuple[Motion, Hand]:
 def random_push(seed: int) -> tuple[Motion, Hand]:
     """Returns a random firm hand and its path.
 
-    It wants to go up to 8 mm and 0.15 rad out of place, at 0.5 to 3 Hz.
+    Its target moves by up to 8 mm and 0.15 rad, at 0.5 to 3 Hz.
     """
     random = np.random.default_rng(seed)
     time = np.linspace(0.0, 2.0, 81)
@@ -83,28 +83,28 @@ def random_push(seed: int) -> tuple[Motion, Hand]:
 
 
 PERIOD = 1e-3
-"""T in s, of every run of the map."""
+"""Period T in s of every run of the map."""
 
 SHIPPED_SOLIMP = (0.9, 0.95, 0.001)
-"""d₀, d_w and width in m of the shipped scenes."""
+"""Impedance d₀, d_w and width in m of the shipped scenes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Treatment:
-    """A way to have MuJoCo treat a contact.
+    """A treatment of a contact by MuJoCo.
 
     Attributes:
         solref: (timeconst in s, dampratio) or (−k in 1/s², −b in 1/s).
         solimp: d₀, d_w and width in m.
         cone: ``elliptic`` or ``pyramidal``.
-        diagexact: Whether the diagonal of the constraint inertia is exact.
-        refsafe: Whether MuJoCo may replace rows that the step cannot resolve.
-        speculative: Whether contacts are added before impact.
-        condim: 1 takes friction out; else 3.
-        impratio: Of friction to normal impedance.
-        margin: At which contacts begin, in m.
-        substeps: MuJoCo steps a tick.
-        method: How the tool is rendered.
+        diagexact: True for the exact diagonal of the constraint inertia.
+        refsafe: True if MuJoCo may replace rows that the step cannot resolve.
+        speculative: True if contacts are added before impact.
+        condim: 1 removes friction; else 3.
+        impratio: Ratio of friction to normal impedance.
+        margin: Distance in m at which contacts begin.
+        substeps: MuJoCo steps per tick.
+        method: Rendering method.
     """
 
     solref: tuple[float, float] = (0.002, 1.0)
@@ -121,12 +121,12 @@ class Treatment:
 
     @property
     def relaxation(self) -> float:
-        """τ in s: how long the contact takes to come back after a push, as b/k."""
+        """Time constant τ in s of the contact's return after a push, b/k."""
         return self.numbers.relaxation * self._step
 
     @property
     def static_depth(self) -> float:
-        """How deep a steady force sinks in, over what it does as shipped: (1 − d) d_w²/(d² k)."""
+        """Static penetration relative to the shipped settings: (1 − d) d_w²/(d² k)."""
         depth = self._depth(self.numbers, self.solimp[1], self._step)
         shipped = contact_numbers((0.002, 1.0), SHIPPED_SOLIMP, PERIOD)
         return depth / self._depth(shipped, SHIPPED_SOLIMP[1], PERIOD)
@@ -138,12 +138,12 @@ class Treatment:
 
     @property
     def numbers(self) -> ContactNumbers:
-        """What the rule sees of it."""
+        """Input of the rule for this setting."""
         return contact_numbers(self.solref, self.solimp, self._step, refsafe=self.refsafe)
 
     @property
     def is_ruled(self) -> bool:
-        """Whether the rule is about it: implicit, elliptic, with the exact diagonal."""
+        """True if the rule covers it: implicit, elliptic, with the exact diagonal."""
         return self.method == "implicit" and self.cone == "elliptic" and self.diagexact
 
     @property
@@ -219,33 +219,35 @@ TREATMENTS: Mapping[str, Treatment] = {
     "damped, pyramidal cone": Treatment((0.0005, 8.0), cone="pyramidal"),
     "damped hard: 0.00002 100": Treatment((0.00002, 100.0)),
 }
-"""The search: what the peg's contact is treated with at 1 kHz, all under ``implicit`` but one."""
+"""Treatments of the peg's contact in the search at 1 kHz, all but one under ``implicit``."""
 
 
 DEVICE_MARGIN = 1.25
-"""Device damping over the KT/2 + B of (6): the device is never what fails here."""
+"""Ratio of the device damping to KT/2 + B of (6), without unit. The device never limits these
+runs."""
 
 WALL_DAMPING = 2.0
-"""B on the wall, in N s/m."""
+"""Damping B on the wall, in N s/m."""
 
 PEG_DAMPING = 0.5
-"""B on the peg, in N s/m; soft, so that the coupling hides little of what contacts create."""
+"""Damping B on the peg, in N s/m; low, so that the coupling hides little of the created energy."""
 
 PEG_ROTATION = (1e-3, 5e-4)
-"""K_r over K, in m²/rad, and B_r in N m s/rad: the README's 2 N m/rad at 2000 N/m."""
+"""Ratio K_r/K in m²/rad, and B_r in N m s/rad: the README's 2 N m/rad at 2000 N/m."""
 
 PEG_START = 0.005
 """Height of the peg's centre at the start in m: 25 mm of the 60 mm peg stand in the hole."""
 
 DEPTH_EVERY = 20
-"""Ticks in contact between two looks at the depth: the peak of a push lasts longer, and every look
-costs as much as five ticks."""
+"""Ticks in contact between two samples of the depth. The peak of a push lasts longer, and every
+sample costs as much as five ticks."""
 
 WALL_RUNS = tuple(itertools.product((0.01, 0.05, 0.2), (0, 1)))
-"""Tool mass in kg and hand, the most often active first."""
+"""Cases of the wall, tool mass in kg and hand, the most often active first."""
 
 PEG_RUNS = tuple(itertools.product((0.03, 0.1), (0.0, 0.42), (1, 2)))
-"""Tool mass in kg, friction and hand (0 is the recorded one, others are seeds), likewise."""
+"""Cases of the peg, tool mass in kg, friction and hand (0 is the recorded one, others are seeds),
+the most often active first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,8 +258,8 @@ class ContactRun:
         environment: The ledger's verdict.
         created: Largest Σ E_k in J.
         slack_share: Largest share of the slack that was used.
-        first_active: Tick at which the environment went beyond the slack, −1 for none.
-        peak_force: In N.
+        first_active: Tick at which the environment exceeded the slack, −1 for none.
+        peak_force: Largest force in N.
         depth: Largest penetration in m.
     """
 
@@ -270,7 +272,7 @@ class ContactRun:
 
 
 def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
-    """Returns how many runs had each verdict, and the worst and the usual of them."""
+    """Returns the number of runs per verdict, with their worst and median values."""
     verdicts = [run.environment for run in runs]
     failed = [run.first_active for run in runs if run.first_active >= 0]
     depths = [run.depth for run in runs]
@@ -289,9 +291,9 @@ def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
 
 
 def until_active(runs: Iterable[ContactRun]) -> list[ContactRun]:
-    """Returns runs to the first that is active: no later one can make their verdict worse.
+    """Returns runs up to the first active one; no later run can make their verdict worse.
 
-    Given runs that are made as they are asked for, no later one is made.
+    A lazy iterable makes no run after that one.
     """
     made = []
     for run in runs:
@@ -306,10 +308,10 @@ def wall_runs(
 ) -> Iterator[ContactRun]:
     """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m.
 
-    Every run is made when it is asked for.
+    Each run is made on demand.
     """
     loop = base.loop_in("virtual_wall", "contact")
-    coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail lets nothing turn
+    coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail prevents rotation
     for mass, hand in cases:
         treatment.apply(loop.scene.model, 0.0)
         set_mass(loop, "tool", mass)
@@ -346,7 +348,7 @@ def peg_device(stiffness: float, hand: int) -> tuple[SimulatedDevice, Coupling]:
 
 
 def ticks_of(device: SimulatedDevice) -> int:
-    """Returns how many ticks a hand's path takes."""
+    """Returns the number of ticks of a hand's path."""
     return int((device.info.duration or 0.0) / PERIOD)
 
 
@@ -357,7 +359,7 @@ def run_once(
     treatment: Treatment,
     ticks: int,
 ) -> tuple[NDArray[np.void], ContactRun]:
-    """Returns a run's records, and what it came to but for its depth."""
+    """Returns a run's records, and its outcome without the depth."""
     outcome = loop.run(
         device,
         coupling,
@@ -393,7 +395,7 @@ def firm_device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice
 
 
 def set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
-    """Gives a tool a mass in kg."""
+    """Sets the mass of a tool in kg."""
     base.set_tool_mass(loop.scene.model, body, mass)
     mujoco.mj_setConst(loop.scene.model, loop.scene.data)
 

@@ -23,20 +23,21 @@ from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 DEVICE_DAMPING = 2.0
-"""b in N s/m, that of the default simulated device."""
+"""Device damping b in N s/m, that of the default simulated device."""
 
 TOOL_MASS = 0.05
-"""In kg, that of the scene ``virtual_wall``, whose tool and wall these are, without the rail."""
+"""Mass in kg of the tool of the scene ``virtual_wall``. Tool and wall are from there, without the
+rail."""
 
 WALL_MASS = 1e6
-"""In kg: a tool that moves for no hand, and so a wall of known place without MuJoCo's contact. Its
-limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9; a lighter one drifts, which is no decay."""
+"""Mass in kg of a tool that no hand moves: a wall at a known place without MuJoCo's contact. Its
+limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9. A lighter tool drifts, which is no decay."""
 
 STABLE = ("stable_on_wall", "stable_free", "stable_tapping")
-"""Columns that must all be true where a loop is stable; one that was not measured is left out."""
+"""Columns that must all be true for a stable loop; a column without measurement is left out."""
 
 TICKS = 2000
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -53,23 +54,23 @@ THEORIES: Mapping[str, str] = {
     "explicit:rk4": "explicit:rk4",
     "weld": "implicit",
 }
-"""Which theory of a free tool a method's worst hand is tuned with. The weld's law is not the
-coupling's: its hand is that of the nominal K and B. On a heavy tool it is stiffer by the mass, so
-for it there is no wall without contact."""
+"""Theory of a free tool that tunes a method's worst hand. The law of ``weld`` is not that of the
+coupling; its hand is that of the nominal K and B. On a heavy tool the weld is stiffer by the mass,
+so it has no wall without contact."""
 
 STIFFNESS = (100.0, 20_000.0)
 """Range of K in N/m, even in its logarithm: from soft to five times the bound at B = 0."""
 
 DAMPING = (0.0, 3.0)
-"""Range of B in N s/m, up to one and a half times b, beyond which nothing is passive."""
+"""Range of B in N s/m, up to one and a half times b; beyond b nothing is passive."""
 
 SEARCHED = (1.0, 200_000.0)
-"""Range of K in N/m in which a limit on a wall is searched: far beyond the picture's on both sides,
-and the same for every B."""
+"""Range of K in N/m for the search of a limit on a wall. It is far wider than the picture's and
+equal for every B."""
 
 
 PATH = base.swinging(0.0075, 1.5, duration=2.0, count=201)
-"""Of a hand that goes 5 mm deep into the wall three times in 2 s."""
+"""Path of a hand that goes 5 mm deep into the wall three times in 2 s."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -98,12 +99,14 @@ def points(count: int) -> Sequence[Point]:
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     """Runs one coupling three times for 2 s, or finds the largest K that is stable on a wall.
 
-    A wall and a free tool, each with its worst hand, say whether the loop is stable. A wall without
-    contact exists only where there is a coupling law: for the weld it is not run, and the value is
-    missing. An ordinary hand that taps a wall says what the environment creates, and whether the
-    device is given what nobody pays for: its run fails where it diverges, or where the first fault
-    is the device's port. ``fault_tick`` and ``fault_port`` name the first fault, −1 and nothing if
-    there is none.
+    A wall and a free tool, each with its worst hand, show if the loop is stable. A wall without
+    contact requires a coupling law. The weld has none: that run is left out and its value is
+    missing.
+
+    An ordinary hand that taps a wall shows the energy that the environment creates, and any excess
+    energy to the device. Its run fails if it diverges, or if the first fault is at the device's
+    port. ``fault_tick`` and ``fault_port`` name the first fault; they are −1 and empty without a
+    fault.
     """
     name, damping = str(point["method"]), float(point["damping"])
     if point["what"] == "limit":
@@ -134,11 +137,11 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 
 
 def _coupling(stiffness: float, damping: float) -> Coupling:
-    return Coupling(stiffness, damping, 1.0, 1e-3)  # the rail lets nothing turn
+    return Coupling(stiffness, damping, 1.0, 1e-3)  # the rail prevents rotation
 
 
 def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcome:
-    """Runs the hand that is worst for a method on a wall (no mass) or with a free tool."""
+    """Runs the worst hand of a method on a wall (no mass) or with a free tool."""
     used = METHODS[name].used(coupling, PERIOD)
     k, b = used.stiffness, used.damping
     if mass is None:  # at Nyquist, where the damper alone is the worst hand
@@ -175,9 +178,9 @@ def _limit_on_wall(name: str, damping: float) -> float:
 
 
 def verdicts_of(cells: Table) -> NDArray[np.int64]:
-    """Returns the verdict of each cell: its place in ``VERDICTS``, shape (n,).
+    """Returns the verdict of each cell as an index in ``VERDICTS``, shape (n,).
 
-    Unstable is where a run that was measured failed; a missing value is no measurement.
+    A cell is unstable if a measured run failed; a missing value is no measurement.
     """
     is_stable = np.ones(len(cells), dtype=bool)
     for column in STABLE:
@@ -234,7 +237,7 @@ def _draw_cells(axes: Axes, cells: Table) -> None:
 
 
 def _note(name: str) -> str:
-    """Returns what a panel's title says beside the method's name."""
+    """Returns the text of a panel's title after the method's name."""
     method = METHODS[name]
     if not method.has_law:
         return ": free, and tapping"
@@ -242,7 +245,7 @@ def _note(name: str) -> str:
 
 
 def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
-    """Draws what was measured against: (6) and (7) only where a wall was."""
+    """Draws the references of the measurement: (6) and (7) only with a wall."""
     b = DEVICE_DAMPING
     if has_wall:
         fine = np.linspace(*DAMPING, FINE), np.geomspace(*STIFFNESS, FINE)
@@ -265,14 +268,14 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
 
 
 def _first_alike(name: str) -> str:
-    """Returns the first method with the same free tool's bound, which is so computed once."""
-    mine = THEORIES[name], METHODS[name].lag
-    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == mine)
+    """Returns the first method with an equal bound of the free tool, computed once."""
+    selected = THEORIES[name], METHODS[name].lag
+    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == selected)
 
 
 @cache
 def _needed(name: str) -> NDArray[np.float64]:
-    """Returns the device damping in N s/m that a free tool needs, rows of K by columns of B."""
+    """Returns the device damping in N s/m that a free tool needs, rows by K and columns by B."""
     stiffness, damping = np.geomspace(*STIFFNESS, CONTOUR), np.linspace(*DAMPING, CONTOUR)
     used = base.used_damping(name, stiffness[:, None], damping, PERIOD)
     return np.array(
@@ -294,19 +297,19 @@ def summarize(table: Table) -> dict[str, Any]:
 
 
 def _cells_below(name: str, cells: Table) -> dict[str, Any]:
-    """Counts what happened at a method's points below (6), where a device bears the coupling."""
+    """Counts the outcomes at a method's points below (6), where a device bears the coupling."""
     needed = base.needed_by_6(name, cells["stiffness"], cells["damping"], PERIOD)
     below = needed < DEVICE_DAMPING
-    mine = cells.select(below)
-    is_passive = verdicts_of(mine) <= base.VERDICTS.index("within slack")
-    ports = mine.texts("fault_port")
+    selected = cells.select(below)
+    is_passive = verdicts_of(selected) <= base.VERDICTS.index("within slack")
+    ports = selected.texts("fault_port")
     return {
-        "passive_share_below_6": float(np.mean(is_passive)) if len(mine) else None,
-        "runs_below_6": len(mine),
+        "passive_share_below_6": float(np.mean(is_passive)) if len(selected) else None,
+        "runs_below_6": len(selected),
         "environment_faults_below_6": int((ports == "environment").sum()),
         "device_faults_below_6": int((ports == "device").sum()),
-        "most_slack_used_below_6": float(mine.numbers("slack_share").max(initial=0.0)),
-        "largest_tapping_force_below_6": float(mine.numbers("peak_force").max(initial=0.0)),
+        "most_slack_used_below_6": float(selected.numbers("slack_share").max(initial=0.0)),
+        "largest_tapping_force_below_6": float(selected.numbers("peak_force").max(initial=0.0)),
     }
 
 
@@ -325,20 +328,20 @@ def _limits(name: str, limits: Table) -> dict[str, Any]:
 
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
-    """States the agreement with (6), and what happened below it by method."""
+    """States the agreement with (6), and the outcomes below it by method."""
     methods = boundary["methods"]
     yield (
         "On a wall the worst hand turns 'implicit' unstable within {largest_deviation:.2%} of "
         "K = 2 (b − B)/T, eq. (6)",
         methods["implicit"],
     )
-    for name, mine in methods.items():
+    for name, selected in methods.items():
         yield (
             "'{name}' is stable and passive at {passive_share_below_6:.0%} of the {runs_below_6} "
             "points below (6); the hand that taps finds the environment at fault at "
             "{environment_faults_below_6}, the device at {device_faults_below_6}, and at most "
             "{most_slack_used_below_6:.0%} of the slack used",
-            mine | {"name": name},
+            selected | {"name": name},
         )
     yield (
         "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "

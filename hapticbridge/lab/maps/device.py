@@ -1,8 +1,8 @@
 """Map ``device``: effect of encoder steps and dry friction of a device on a wall.
 
-Diolaiti's regions are those of a spring alone, B = 0, of which no method takes anything off: the
-law is one for ``implicit``, ``compensated`` and ``lossless``, and one of them is run. With a damper
-they differ by their B', and each is measured.
+Diolaiti's regions are those of a spring alone, B = 0, where no method reduces the damping. The law
+is then equal for ``implicit``, ``compensated`` and ``lossless``, and one of them is run. With a
+damper they differ by their B', and each is measured.
 """
 
 from __future__ import annotations
@@ -29,80 +29,81 @@ from hapticbridge.sweep.results import Table
 from hapticbridge.theory.device_limits import quantization_limit
 
 RANGE = (0.1, 2.0)
-"""Of β and of σ, even in their logarithms."""
+"""Ranges of β and of σ, even in their logarithms."""
 
 METHODS_SHOWN = ("implicit", "compensated", "lossless")
-"""Methods whose need for friction is measured, which the bounds allow on a real device."""
+"""Methods whose required friction is measured; the bounds allow them on a real device."""
 
 DAMPERS = (0.0, 3.0)
-"""Range of B in N s/m asked for, for the friction that a coupling's damper needs: K T/2 and K T,
+"""Range of requested B in N s/m for the friction that a coupling's damper needs. K T/2 and K T,
 below which ``lossless`` and ``compensated`` use none, are 1 and 2."""
 
 REGIONS = ("passive", "locally stable", "bounded limit cycle", "unstable")
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 STIFFNESS = 2000.0
-"""K in N/m. Only β = b/(K T) and σ = f_c/(K Δ) count, and the mass a little."""
+"""Stiffness K in N/m. Results depend on β = b/(K T) and σ = f_c/(K Δ), and slightly on the mass."""
 
 RESOLUTION = 1e-5
-"""Δ in m: an encoder of 10 µm at the handle."""
+"""Resolution Δ in m: an encoder of 10 µm at the handle."""
 
 QUANTUM = STIFFNESS * RESOLUTION
-"""K Δ in N, the step of the force."""
+"""Step K Δ of the force in N."""
 
 DEVICE_MASS = 0.1
-"""m_d in kg, that of the default simulated device."""
+"""Mass m_d in kg of the default simulated device."""
 
 PULL = 1.0
-"""Stiffness of the hand in N/m: a five hundredth of K's step in force is what it varies by, so that
-it presses with a steady force."""
+"""Stiffness of the hand in N/m. Its force varies by a five hundredth of K's step in force, so it
+presses with a steady force."""
 
 PRESSED = 5.5
 """Force of the hand in steps of K Δ. The half matters: the wall can answer with five or six steps,
-each wrong by half of one, and half a step is the friction that then holds the device."""
+each wrong by half a step. Friction of half a step then holds the device."""
 
 LARGE = 3000.0
-"""Knock of the second run in steps of the encoder: 3 cm. Friction alone can stop a smaller one even
-where damping does not suffice: it takes 4 σ steps a swing from any motion."""
+"""Knock of the second run in steps of the encoder: 3 cm. Friction takes 4 σ steps per swing from
+any motion. It alone can stop a smaller knock even where the damping does not suffice."""
 
 WALL_MASS = 1e9
-"""In kg: a tool that the hand's press moves by 2e-9 m in a run, a five thousandth of a step."""
+"""Mass in kg of a tool that the hand's press moves by 2e-9 m in a run, a five thousandth of a
+step."""
 
 TICKS = 6000
-"""Of a knocked run; one that is only pressed has settled in half of them."""
+"""Ticks of a knocked run; a run that is only pressed has settled after half of them."""
 
 CHANGED = 0.02
-"""Share by which the range of motion must rise or fall between the last two sixths of a run to
-count as doing so, without unit; less would take the beat of a cycle with the samples for it."""
+"""Share by which the range of motion must rise or fall between the last two sixths of a run,
+without unit. A smaller share would count the beat of a cycle with the samples."""
 
 NOTHING = 2.0
-"""Range in steps of the encoder up to which motion is the cycle across one border, and neither
-rises nor falls."""
+"""Range in steps of the encoder up to which motion counts as the cycle across one border, neither
+rising nor falling."""
 
 DIVERGED = 3.0
-"""Multiple of the knock beyond which motion has diverged, without unit; a free device overshoots at
-most to its start."""
+"""Multiple of the knock beyond which motion counts as diverged, without unit. A free device
+overshoots at most to its start."""
 
 FRICTION = (0.01, 10.0)
-"""Range of σ in which that at which a pressed device rests is searched."""
+"""Range of the search for the σ at which a pressed device rests."""
 
 DAMPED = 5.0
-"""b in N s/m while B is varied, above K T/2 + B throughout."""
+"""Device damping b in N s/m while B is varied, above K T/2 + B throughout."""
 
 SHAKEN = 0.05
-"""Stroke of the shaken hand, in steps of the encoder: small, so that the device's own damping takes
-nothing, which would otherwise help friction."""
+"""Stroke of the shaken hand in steps of the encoder. It is small, so that the device's own damping
+absorbs nothing and does not help friction."""
 
 
 def region_of(small: str, large: str) -> str:
-    """Returns the region that two runs show, from what they did alone.
+    """Returns the region that two runs show.
 
     Args:
-        small: What became of a device that was only pressed, as ``settle`` names it.
-        large: The same of one that was knocked as well; where it ``falls`` until the end, the
-            small one says what it falls to.
+        small: Outcome for a device that was only pressed, as ``settle`` names it.
+        large: Outcome for a device that was knocked as well. If it ``falls`` until the end,
+            ``small`` gives the state that it falls to.
     """
     if "diverges" in {small, large}:
         return "locally stable" if small == "rest" else "unstable"
@@ -119,13 +120,13 @@ def settle(
         beta: b/(K T), without unit, >= 0.
         sigma: f_c/(K Δ), without unit, >= 0.
         knock: Displacement at the start in steps of the encoder.
-        damping: B in N s/m asked for, >= 0. At 0 all of ``METHODS_SHOWN`` have one law.
+        damping: Requested B in N s/m, >= 0. At 0 all of ``METHODS_SHOWN`` have one law.
         name: The method.
 
     Returns:
-        ``rest``, ``cycle`` (motion that neither ends nor grows), ``falls`` (it is still on its way
-        down) or ``diverges``; the range of the
-        reported position in the last sixth in steps of the encoder; and the run.
+        ``rest``, ``cycle`` (motion that neither ends nor grows), ``falls`` (motion still decreases)
+        or ``diverges``; the range of the reported position in the last sixth in steps of the
+        encoder; and the run.
     """
     device = pressed_device(beta, sigma)
     start = np.array([knock * RESOLUTION, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -151,7 +152,7 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
     Args:
         beta: b/(K T), without unit, >= 0.
         sigma: f_c/(K Δ), without unit, >= 0.
-        limit: Of its data sheet, in N and N m.
+        limit: Limit of its data sheet, in N and N m.
     """
     time = [0.0, 0.02, 100.0]
     target = np.zeros((3, 3))
@@ -191,11 +192,11 @@ def _wall(
 
 
 def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the σ that theory asks for, ½ + B'/(K T): f_c = K Δ/2 + B' Δ/T.
+    """Returns the σ that theory requires, ½ + B'/(K T): f_c = K Δ/2 + B' Δ/T.
 
     Args:
         name: The method, whose law uses B'.
-        damping: B in N s/m asked for, >= 0.
+        damping: Requested B in N s/m, >= 0.
 
     References:
         Abbott & Okamura 2005.
@@ -206,12 +207,12 @@ def friction_needed(name: str, damping: NDArray[np.float64]) -> NDArray[np.float
 def friction_to_rest(name: str, damping: float) -> float:
     """Returns a σ at which a pressed device begins to come to rest.
 
-    0 where it rests at the least that is tried, inf where it never does. With a damper rest and
-    cycle take turns between K Δ/2 and a little above; one of the changes is found.
+    The result is 0 if the device rests at the smallest σ tried, and inf if it never rests. With a
+    damper, rest and cycle alternate between K Δ/2 and slightly above; one of the changes is found.
 
     Args:
         name: The method.
-        damping: B in N s/m asked for, >= 0.
+        damping: Requested B in N s/m, >= 0.
     """
     beta = DAMPED / (STIFFNESS * PERIOD)
     return base.largest_stable(
@@ -220,19 +221,19 @@ def friction_to_rest(name: str, damping: float) -> float:
 
 
 def shaken(name: str, damping: float) -> float:
-    """Returns the σ that pays for what the motor gives a hand that shakes it across one step.
+    """Returns the σ that absorbs the motor's work on a hand that shakes it across one step.
 
     The hand is stiff and moves the device to and fro across a border between two encoder steps,
     once a tick; the motor's work on it, over the way, is the friction that would take it.
 
     Args:
         name: The method.
-        damping: B in N s/m asked for, >= 0.
+        damping: Requested B in N s/m, >= 0.
     """
     ticks = 400
     side = np.where(np.arange(ticks + 2) % 2 == 0, -0.5, 0.5) * SHAKEN
     side[0] = 0.0
-    # a border lies half a step from where the device starts, and it goes there first
+    # a border lies half a step from the device's start, and the hand goes there first
     way = np.concatenate([[0.0, 0.0], np.full(50, 0.5), 0.5 + side]) * RESOLUTION
     path = np.zeros((way.size, 3))
     path[:, 0] = way
@@ -251,21 +252,21 @@ def shaken(name: str, damping: float) -> float:
 
 
 COLOURS = (base.COLOURS[0], "#8fb8de", base.COLOURS[1], base.COLOURS[3])
-"""Of the regions: those of the verdicts from strict to unstable, and one that no verdict has for
-what depends on the knock."""
+"""Colours of the regions: those of the verdicts from strict to unstable, and a separate one where
+the outcome depends on the knock."""
 
 MARKERS = {"shaken": "o", "pressed": "s"}
 
 WORDS = {"shaken": "shaken across a step", "pressed": "pressed, comes to rest"}
-"""What a marker stands for."""
+"""Meaning of each marker."""
 
 SIZES = (7.0, 5.5, 3.5)
-"""Of the methods' markers in points, and three times their lines' widths: where ``compensated`` and
-``lossless`` use no damper they lie on each other, and all must be seen."""
+"""Sizes of the methods' markers in points, and three times their lines' widths. ``compensated`` and
+``lossless`` coincide where they use no damper, and all must be visible."""
 
 
 def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
-    """Draws the regions, and beside them the friction that was found at each damper."""
+    """Draws the regions, and beside them the required friction at each damper."""
     figure = new_figure(8, 5.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
     _draw_regions(left, table.select(table["what"] == "cell"))
@@ -331,21 +332,21 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
         return
     for name, size in zip(METHODS_SHOWN, SIZES, strict=True):
         if name in found:
-            mine, colour = found[name], base.METHOD_COLOURS[name]
+            selected, colour = found[name], base.METHOD_COLOURS[name]
             style: dict[str, Any] = {"color": colour, "mfc": "white", "ls": "", "ms": size}
             axes.plot(
-                mine["damping"],
-                mine["predicted"],
+                selected["damping"],
+                selected["predicted"],
                 color=colour,
                 lw=size / 3,
                 label=f"{name}: {base.law_in_words(name)}",
             )
             for what, marker in MARKERS.items():
-                axes.plot(mine["damping"], mine[what], marker, **style)
+                axes.plot(selected["damping"], selected[what], marker, **style)
     for what, marker in MARKERS.items():
         axes.plot([], [], marker, color="black", mfc="white", label=f"measured: {WORDS[what]}")
     # room above for the names
-    axes.set_ylim(0, 1.75 * max(max(mine["predicted"]) for mine in found.values()))
+    axes.set_ylim(0, 1.75 * max(max(selected["predicted"]) for selected in found.values()))
     lines = Line2D([], [], ls="", label="lines: f_c = K Δ/2 + B′ Δ/T")
     axes.legend(
         handles=[lines, *axes.get_legend_handles_labels()[0]], fontsize="small", loc="upper left"
@@ -353,7 +354,7 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
 
 
 SMALLEST = 1e-4
-"""Deviation in per cent below which rounding alone is left, and nothing smaller is quoted."""
+"""Deviation in per cent that stems from rounding alone; no smaller one is quoted."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -378,9 +379,9 @@ def _point(what: str, method: str, beta: float, sigma: float, damping: float) ->
 
 
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
-    """Lets a pressed device settle from where it is and from a large knock, and says what it did.
+    """Lets a pressed device settle from rest and from a large knock, and names the outcome.
 
-    Or measures the friction that pays for a coupling's damper.
+    A point with a damper measures the friction that absorbs its energy instead.
     """
     if point["what"] == "friction":
         law = str(point["method"]), float(point["damping"])
@@ -408,7 +409,9 @@ def summarize(table: Table) -> dict[str, Any]:
         "stiffness": STIFFNESS,
         "resolution": RESOLUTION,
         "regions": _regions(cells) if len(cells) else {},
-        "friction": {name: _friction(name, mine) for name, mine in dampers.items() if len(mine)},
+        "friction": {
+            name: _friction(name, selected) for name, selected in dampers.items() if len(selected)
+        },
     }
 
 
@@ -452,18 +455,18 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "one {median_cycle_steps:.0f}",
         regions,
     )
-    for name, mine in boundary["friction"].items():
+    for name, selected in boundary["friction"].items():
         yield (
             "Shaken across one encoder step, '{name}' needs f_c = K Δ/2 + B′ Δ/T within "
             "{worst_ratio_error:.2%}",
-            mine | {"name": name},
+            selected | {"name": name},
         )
 
 
 def _edges(cells: Table) -> dict[str, Any]:
-    """Returns between which β divergence ends, and between which σ motion from a press ends.
+    """Returns brackets: β where divergence ends, σ where motion from a press ends.
 
-    None where no run was bad, or the largest value had a bad one.
+    None if no run was bad, or the largest value had a bad one.
     """
     return {
         "beta": _edge(cells["beta"], cells["large"] == "diverges"),
@@ -472,7 +475,7 @@ def _edges(cells: Table) -> dict[str, Any]:
 
 
 def _edge(values: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> dict[str, float] | None:
-    """Returns the ``last`` value with a bad run, and the ``first`` one from which none is bad."""
+    """Returns the ``last`` value with a bad run, and the ``first`` value from which none is bad."""
     if not is_bad.any() or not (values > values[is_bad].max()).any():
         return None
     last = float(values[is_bad].max())

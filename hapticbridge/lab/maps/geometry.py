@@ -1,7 +1,7 @@
 """Map ``geometry``: longest stable peg, rendered directly and through the coupling.
 
-The peg touches both walls of its hole throughout, where ``lossless`` is in its implicit form: what
-tells the methods behind the coupling apart is the B' that their law uses, with (6) in B'.
+The peg touches both walls of its hole throughout, so ``lossless`` is in its implicit form. The
+methods behind the coupling then differ only in the B' that their law uses, with (6) in B'.
 """
 
 from __future__ import annotations
@@ -27,35 +27,37 @@ from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 DEVICE_DAMPING = 2e-3
-"""b_θ in N m s/rad, that of the default simulated device."""
+"""Rotational damping b_θ in N m s/rad, that of the default simulated device."""
 
 ROTATIONAL_DAMPING = 5e-4
-"""B_r of the coupling in N m s/rad: b_θ/4, what the bridge itself would choose."""
+"""Damping B_r of the coupling in N m s/rad: b_θ/4, the bridge's own choice."""
 
 COUPLING_STIFFNESS = 2000.0
-"""K of the coupling in N/m, well below its own limit 2b/T: translation must not be what fails."""
+"""Stiffness K of the coupling in N/m. It is well below its own limit 2b/T, so that translation does
+not fail."""
 
 GROWTH = 1.001
-"""Share of the knock's torque beyond which it has grown, without unit: above the rounding of depths
-of less than a micrometre."""
+"""Multiple of the knock's torque above which it counts as grown, without unit. It is above the
+rounding of depths of less than a micrometre."""
 
 TICKS = 500
-"""A run. One per cent beyond the limit the knock has grown a thousandfold by then, and more."""
+"""Ticks of a run. One per cent beyond the limit the knock has grown more than a thousandfold by
+then."""
 
 KNOCK = np.array([0.0, 0.0, 0.0, 0.0, 1e-4, 0.0])
-"""Turn that starts a run, in rad: at every length less deep than the walls are thick."""
+"""Turn that starts a run, in rad. At every length its depth is below the thickness of the walls."""
 
 
 def length_limit(contact_stiffness: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Returns the longest L in m that ``direct`` bears: 2 √(b_θ/(T K_c)), K_c in N/m."""
+    """Returns the largest L in m at which ``direct`` is stable: 2 √(b_θ/(T K_c)), K_c in N/m."""
     return np.asarray(2 * np.sqrt(DEVICE_DAMPING / (PERIOD * np.asarray(contact_stiffness))))
 
 
 def contact_stiffness_limit(length: NDArray[np.float64] | float) -> NDArray[np.float64]:
-    """Returns the largest K_c in N/m that ``direct`` bears: 4 b_θ/(T L²), L in m."""
+    """Returns the largest K_c in N/m at which ``direct`` is stable: 4 b_θ/(T L²), L in m."""
     return np.asarray(4 * DEVICE_DAMPING / (PERIOD * np.asarray(length) ** 2))
 
 
@@ -63,7 +65,7 @@ def device_and_coupling(name: str, stiffness: float) -> tuple[SimulatedDevice, C
     """Returns the rotational damper behind which a peg is run, and its coupling.
 
     At Nyquist, where a spring is worst, that damper is device and worst hand in one. The damper of
-    the translation is four times what two contacts could need: translation is not what fails.
+    the translation is four times the need of two contacts, so that translation does not fail.
 
     Args:
         name: ``direct``, or a method with a coupling.
@@ -93,7 +95,7 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
 
     Args:
         name: ``direct``, or a method with a coupling.
-        length: L in m: of the peg, and so between contacts on opposite walls.
+        length: L in m, length of the peg, and so the distance between contacts on opposite walls.
         stiffness: K_c in N/m per wall, or K_r in N m/rad.
 
     Returns:
@@ -115,7 +117,7 @@ def run(name: str, length: float, stiffness: float) -> LoopOutcome:
 
 
 def set_length(model: mujoco.MjModel, length: float) -> None:
-    """Makes the peg of ``planar_peg`` as long as asked, midway in a hole that it just fills.
+    """Sets the length of the peg of ``planar_peg``, midway in a hole that it just fills.
 
     Mass and inertia stay, so that nothing but the geometry changes with L.
 
@@ -128,7 +130,7 @@ def set_length(model: mujoco.MjModel, length: float) -> None:
     model.body_pos[model.body("peg").id] = 0.0
     walls = [model.geom("hole_east").id, model.geom("hole_west").id]
     for side, wall in zip((1.0, -1.0), walls, strict=True):
-        model.geom_size[wall, 2] = length  # twice the peg's, so that its ends meet no edge
+        model.geom_size[wall, 2] = length  # twice the peg's length, so that its ends meet no edge
         model.geom_pos[wall] = [side * (model.geom_size[peg, 0] + model.geom_size[wall, 0]), 0, 0]
     bottom = model.geom("hole_bottom").id
     model.geom_pos[bottom, 2] = -2 * length - model.geom_size[bottom, 2]
@@ -138,21 +140,21 @@ def set_length(model: mujoco.MjModel, length: float) -> None:
 
 
 def is_stable(name: str, length: float, stiffness: float) -> bool:
-    """Returns whether what a knock in rotation leaves falls, and was never its double."""
+    """Returns True if the response to a knock in rotation falls and never reached its double."""
     return has_calmed(run(name, length, stiffness), name, length, stiffness)
 
 
 def has_calmed(outcome: LoopOutcome, name: str, length: float, stiffness: float) -> bool:
-    """Returns whether a run's torque falls, and was never the double of what the knock left.
+    """Returns True if a run's torque falls and never reached double its value after the knock.
 
-    What is thrown out of the hole is calm too, but had grown before.
+    A peg that was thrown out of the hole is calm too, but its torque had grown before.
     """
     largest = torque(outcome).max(initial=0.0)
     return outcome.is_stable and bool(largest < 2 * knocked(name, length, stiffness))
 
 
 def first_growth(outcome: LoopOutcome, name: str, length: float, stiffness: float) -> int:
-    """Returns the first tick at which the device feels more than the knock left, −1 for none."""
+    """Returns the first tick at which the device torque exceeds that of the knock, −1 for none."""
     grown = np.flatnonzero(torque(outcome) > GROWTH * knocked(name, length, stiffness))
     return int(grown[0]) if grown.size else -1
 
@@ -163,7 +165,7 @@ def torque(outcome: LoopOutcome) -> NDArray[np.float64]:
 
 
 def knocked(name: str, length: float, stiffness: float) -> float:
-    """Returns the torque in N m that the knock leaves before the loop answers."""
+    """Returns the torque in N m that the knock causes before the loop responds."""
     twist = float(KNOCK[4])
     if name == "direct":
         return 0.5 * stiffness * length**2 * twist
@@ -174,16 +176,16 @@ LENGTH = (5e-3, 0.5)
 """Range of L in m, even in its logarithm."""
 
 CONTACT_STIFFNESS = (10.0, 1e6)
-"""Range of K_c in N/m, even in its logarithm: its limit at both ends of ``LENGTH`` lies within."""
+"""Range of K_c in N/m, even in its logarithm. It contains the limit at both ends of ``LENGTH``."""
 
 ROTATIONAL_STIFFNESS = (0.1, 10.0)
 """Range of K_r in N m/rad, even in its logarithm, about the bounds of 3 and 4 N m/rad."""
 
 LIMITS_AMONG = 60
-"""One limit is searched for every so many cells; a search takes about a dozen runs."""
+"""Number of cells per search for a limit; a search takes about a dozen runs."""
 
 BEHIND = ("implicit", "compensated", "lossless")
-"""Methods with a coupling, which all get the same B_r asked for."""
+"""Methods with a coupling, all with an equal requested B_r."""
 
 METHODS_SHOWN = ("direct", *BEHIND)
 
@@ -191,8 +193,8 @@ BOUNDS = {
     name: float(base.limit_by_6(name, DEVICE_DAMPING, PERIOD, ROTATIONAL_DAMPING))
     for name in BEHIND
 }
-"""The largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T for ``implicit``; 2 b_θ/T for the others, of
-whose B' nothing is left there."""
+"""Largest K_r in N m/rad by (6): 2 (b_θ − B_r)/T for ``implicit``; 2 b_θ/T for the others, whose B'
+is 0 there."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -258,16 +260,16 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(2, 2, sharex=True).ravel()
     for axes, name in zip(panels, METHODS_SHOWN, strict=True):
         _draw_cells(axes, table, name)
-        mine = base.of_method(table, "limit", name)
+        selected = base.of_method(table, "limit", name)
         if name == "direct":
             lengths = np.geomspace(*LENGTH, 100)
             axes.plot(1e3 * lengths, contact_stiffness_limit(lengths), color="black", lw=1.8)
-            x, y = mine.numbers("limit"), mine["stiffness"]
+            x, y = selected.numbers("limit"), selected["stiffness"]
             axes.set_title("direct: no coupling", fontsize="medium")
             axes.set(ylabel="contact stiffness K_c (N/m)", ylim=CONTACT_STIFFNESS)
         else:
             axes.axhline(BOUNDS[name], color=base.THEORY_COLOUR, lw=1.8, ls="--")
-            x, y = mine["length"], mine.numbers("limit")
+            x, y = selected["length"], selected.numbers("limit")
             axes.set_title(f"{name}, {base.law_in_words(name, '_r')}", fontsize="medium")
             axes.set(ylabel="coupling stiffness K_r (N m/rad)", ylim=ROTATIONAL_STIFFNESS)
         axes.plot(1e3 * x, y, "o", color="black", ms=4, mfc="white")
@@ -322,7 +324,7 @@ def _of_direct(limits: Table) -> dict[str, Any]:
 def _behind(name: str, limits: Table) -> dict[str, Any]:
     """Compares the largest K_r that were found, each at its length, with (6) and each other."""
     measured = limits.numbers("limit")
-    # 0 and infinity: nothing or everything that was searched is stable, which is no limit
+    # 0 and infinity: all or nothing in the search range is stable, which is no limit
     known = measured[np.isfinite(measured) & (measured > 0)]
     return {
         "coupling_rotational_damping": ROTATIONAL_DAMPING,

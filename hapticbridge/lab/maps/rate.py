@@ -1,6 +1,6 @@
 """Map ``rate``: largest stiffness of a wall against period, delay, jitter and lost ticks.
 
-At even ticks for ``implicit``, ``compensated`` and ``lossless`` at the same B asked for, each
+At even ticks ``implicit``, ``compensated`` and ``lossless`` run with an equal requested B, each
 against the bound for the B' that its law uses.
 """
 
@@ -28,18 +28,18 @@ from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 THEORY_WIDTH = base.WIDTH / 100
-"""Relative width of the search for what theory says: far below that of a measurement."""
+"""Relative width of the search for the theoretical limit, far below that of a measurement."""
 
 DEVICE_DAMPING = 2.0
-"""b in N s/m, that of the default simulated device."""
+"""Device damping b in N s/m, that of the default simulated device."""
 
 DAMPING = 1.0
-"""B in N s/m asked for where even ticks are measured: half of b, for then the worst hand behind
-``implicit`` is at a frequency above zero at every delay. With less, as where a method takes some
-off, it is a mass without bound, which takes longer to show (``SWINGS``)."""
+"""Requested B in N s/m at even ticks: half of b. The worst hand behind ``implicit`` is then at a
+frequency above zero at every delay. With less, as in a method that reduces B, it is an unlimited
+mass, which takes longer to show (``SWINGS``)."""
 
 METHODS_SHOWN = ("implicit", "compensated", "lossless")
-"""Methods whose limit is searched at even ticks, which the bounds allow on a real device."""
+"""Methods whose limit is searched at even ticks; the bounds allow them on a real device."""
 
 PERIODS = (1e-4, 5e-3)
 """Range of T in s, even in its logarithm."""
@@ -48,47 +48,49 @@ DELAYS = 6
 """Delays of 0 to 5 samples."""
 
 UNEVEN_PERIOD = 1e-3
-"""T in s for jitter and lost ticks, where the coupling is a spring alone (B = 0): with a damper the
-bound at the longest interval, K = 2 (b/T_max − B/T), is gone after the first lost ticks. Of B = 0
-no method takes anything off: on a wall all of ``METHODS_SHOWN`` have one law, and one is run."""
+"""Period T in s for jitter and lost ticks. The coupling is a spring alone there (B = 0). With a
+damper the bound at the longest interval, K = 2 (b/T_max − B/T), vanishes after the first lost
+ticks. At B = 0 no method reduces the damping: on a wall all of ``METHODS_SHOWN`` have one law, and
+one is run."""
 
 JITTER, DROPS = 0.9, 0.5
-"""Largest share of a period by which ticks are late, and of ticks that are lost."""
+"""Largest lateness as a share of the period, and largest share of lost ticks."""
 
 UNEVEN = ("jitter", "drops")
-"""Ways in which ticks are uneven."""
+"""Kinds of uneven ticks."""
 
 HANDS: Mapping[str, Hand | None] = {"no hand": None, "ordinary hand": Hand()}
 
 SEEDS = 3
-"""Runs with other random numbers that must all be stable; more find a lower limit, slowly."""
+"""Number of runs with different random numbers that must all be stable. More find a lower limit and
+take longer."""
 
 WALL_MASS = 1e6
-"""In kg: a tool that moves for no hand (see the map ``coupling``)."""
+"""Mass in kg of a tool that no hand moves (see the map ``coupling``)."""
 
 EVEN_SHARE = 0.65
-"""Share of all searches that is at even ticks: 4 periods a line and 10 shares, of 110."""
+"""Share of the searches at even ticks: 4 periods per line and 10 shares, of 110."""
 
 TICKS = 2000
 SWINGS = 16.0
-"""Swings of the worst hand that a run must hold at least, a fifth of which is judged. Where B' is
-small, or K far above the limit, the hand that needs most damping swings once in 600 ticks and grows
-slowly: a window shorter than a swing takes that for decay. With 8 a limit is found up to 3 % too
-low, with 16 and with 64 within 0.04 % of theory."""
+"""Smallest number of swings of the worst hand in a run, a fifth of which is judged. Where B' is
+small, or K far above the limit, the critical hand swings once in 600 ticks and grows slowly. A
+window shorter than a swing mistakes that for decay. With 8 a limit is found up to 3 % too low, with
+16 and with 64 within 0.04 % of theory."""
 
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Displacement that starts a run, in m."""
 
 SEARCHED = (10.0, 1e6)
-"""Ends of every search for K in N/m, at every period alike: what is expected lies between 105 and
-20 000, and nothing expected goes into it. A softer wall decays too slowly for a run; a much stiffer
-one asks for another kind of hand, and longer runs to show it."""
+"""Range of every search for K in N/m, equal at all periods. Expected limits lie between 105 and 20
+000, and do not enter the search. A softer wall decays too slowly for a run. A much stiffer one
+needs another kind of hand, and longer runs to show it."""
 
 
 def points(count: int) -> Sequence[Point]:
     """Returns searches for the largest K: by method, period and delay, and by jitter and drops.
 
-    Even ticks get the smaller part of ``count`` for each line: over T a limit is as good as
+    Even ticks get the smaller part of ``count`` for each line, because a limit over T is almost
     straight.
     """
     steps = max(2, round(EVEN_SHARE * count / (len(METHODS_SHOWN) * DELAYS)))
@@ -120,7 +122,7 @@ def _point(what: str, method: str, hand: str, period: float, delay: int, share: 
 
 
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
-    """Searches for the largest K that is stable, and measures how uneven the ticks were."""
+    """Searches for the largest stable K, and measures the unevenness of the ticks."""
     period, delay, share = float(point["period"]), int(point["delay"]), float(point["share"])
     name = str(point["method"])
     if point["what"] == "delay":
@@ -143,14 +145,15 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 
 
 def unevenness(intervals: ArrayLike) -> dict[str, float]:
-    """Returns what intervals T_k between ticks come to: three periods to put into 2 b/T.
+    """Returns characteristic periods of intervals T_k between ticks, for use in 2 b/T.
 
     Args:
-        intervals: In s, > 0, shape (n,).
+        intervals: Intervals in s, > 0, shape (n,).
 
     Returns:
-        In s: ``mean``; ``longest``, with which K = 2 b/T suffices for any hand, because a hold of
-        T_k leaks at most ½ K δh_k² and the damping takes b δh_k²/T_k at least; and ``balanced``,
+        Periods in s. ``mean``. ``longest``, with which K = 2 b/T suffices for any hand: a hold of
+        T_k
+        leaks at most ½ K δh_k², and the damping absorbs at least b δh_k²/T_k. ``balanced``,
         ΣT_k²/ΣT_k, with which a device that moves evenly over many ticks loses its balance.
     """
     each = np.asarray(intervals, dtype=np.float64)
@@ -166,7 +169,7 @@ def _timing(what: str, share: float, seed: int) -> Timing:
 
 
 def worst_hand(name: str, stiffness: float, period: float, delay: int) -> LoopOutcome:
-    """Runs the hand that is worst for a method's law on a wall that is felt whole samples late."""
+    """Runs the worst hand of a method's law on a wall whose force arrives whole samples late."""
     coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
     theory = SampledLoop(METHODS[name].used(coupling, period), period, delay=delay)
     frequency = theory.worst_frequency()
@@ -210,7 +213,7 @@ def wall_limit(name: str, period: float, delay: int) -> float:
     """Returns the largest K in N/m on a wall for any hand: ``minimum_damping`` solved for K.
 
     Args:
-        name: The method, whose law uses B' where ``DAMPING`` is asked for.
+        name: The method, whose law uses B' where ``DAMPING`` is requested.
         period: T in s, finite and > 0.
         delay: d in whole samples, >= 0.
 
@@ -250,7 +253,7 @@ SHOWN = (15.0, 7e4)
 
 
 def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
-    """Draws what ``rate.read`` found."""
+    """Draws the numbers of ``summarize``."""
     figure = new_figure(8, 8.4)
     grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
     above: list[Axes] = []
@@ -295,13 +298,13 @@ def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
 
 
 def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
-    # one hue, lighter the later: a delay is a quantity, and verdicts own the other colours
+    # one hue, lighter with delay: a delay is a quantity, and verdicts have the other colours
     shade = matplotlib.colormaps["Blues_r"]
     axes.set(xscale="log", yscale="log")
-    for delay, mine in by_delay.items():
-        colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(mine["period"])
-        axes.plot(period, mine["predicted"], color=colour, label=delay)
-        axes.plot(period, _drawable(mine["measured"]), "o", color=colour, mfc="white", ms=5)
+    for delay, selected in by_delay.items():
+        colour, period = shade(0.65 * int(delay) / (DELAYS - 1)), 1e3 * np.array(selected["period"])
+        axes.plot(period, selected["predicted"], color=colour, label=delay)
+        axes.plot(period, _drawable(selected["measured"]), "o", color=colour, mfc="white", ms=5)
     if by_delay:
         axes.legend(
             title="bound, delay in samples",
@@ -325,17 +328,17 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
 
 def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
     axes.set_yscale("log")
-    for name, mine in found.items():
+    for name, selected in found.items():
         axes.plot(
-            mine["share"],
-            _drawable(mine["measured"]),
+            selected["share"],
+            _drawable(selected["measured"]),
             MARKERS[name],
             color="black",
             mfc="white",
             ms=5,
         )
     if found:
-        lines = next(iter(found.values()))  # the ticks were the same for every hand
+        lines = next(iter(found.values()))  # the ticks were equal for every hand
         for key, (_, style) in STYLES.items():
             axes.plot(lines["share"], lines[key], style, color=base.THEORY_COLOUR)
     else:
@@ -345,7 +348,7 @@ def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
 
 
 def _drawable(values: list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Returns values for a logarithmic axis, which has no place for 0 and infinity."""
+    """Returns values for a logarithmic axis, which cannot show 0 and infinity."""
     numbers = np.array(values, dtype=np.float64)
     return np.where(np.isfinite(numbers) & (numbers > 0), numbers, np.nan)
 
@@ -368,8 +371,8 @@ def _by_delay(name: str, table: Table) -> dict[str, Any]:
     rows = base.of_method(table, "delay", name)
     found: dict[str, Any] = {}
     for delay in np.unique(rows["delay"]):
-        mine = rows.select(rows["delay"] == delay)
-        period, limit = mine["period"], mine.numbers("limit")
+        selected = rows.select(rows["delay"] == delay)
+        period, limit = selected["period"], selected.numbers("limit")
         predicted = np.array([wall_limit(name, float(t), int(delay)) for t in period])
         found[str(int(delay))] = {
             "period": period.tolist(),
@@ -382,7 +385,7 @@ def _by_delay(name: str, table: Table) -> dict[str, Any]:
 
 
 def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | None:
-    """Returns the power of T with which K goes; None where fewer than two K are known."""
+    """Returns the exponent of T in K; None where fewer than two K are known."""
     is_known = np.isfinite(limit) & (limit > 0)
     if is_known.sum() < 2:
         return None
@@ -392,12 +395,12 @@ def _slope(period: NDArray[np.float64], limit: NDArray[np.float64]) -> float | N
 def _uneven(rows: Table) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in HANDS:
-        mine = rows.select(rows["hand"] == name)
-        if len(mine):
+        selected = rows.select(rows["hand"] == name)
+        if len(selected):
             found[name] = {
-                "share": mine["share"].tolist(),
-                "measured": mine.numbers("limit").tolist(),
-                **{f"at_{line}": uneven_bound(mine.numbers(line)).tolist() for line in LINES},
+                "share": selected["share"].tolist(),
+                "measured": selected.numbers("limit").tolist(),
+                **{f"at_{line}": uneven_bound(selected.numbers(line)).tolist() for line in LINES},
             }
     return found
 
@@ -405,7 +408,7 @@ def _uneven(rows: Table) -> dict[str, Any]:
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States the agreement with the bounds at even ticks, and the limits at uneven ones."""
     for name, by_delay in boundary["methods"].items():
-        errors = [mine["worst_ratio_error"] for mine in by_delay.values()]
+        errors = [selected["worst_ratio_error"] for selected in by_delay.values()]
         yield (
             "'{name}': the worst hand turns the wall unstable within {error:.2%} of the bound for "
             "its delay",
@@ -416,12 +419,12 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             by_delay.get("0", {}) | {"name": name},
         )
     for what, by_hand in boundary["uneven"].items():
-        for hand, mine in by_hand.items():
+        for hand, selected in by_hand.items():
             yield (
                 "{axis}, {share:g}: with {hand} the wall is stable up to {measured:.0f} N/m; "
                 "2b ΣT/ΣT² by the balance of energy is {at_balanced:.0f} N/m, 2b/T at the mean "
                 "interval {at_mean:.0f} and at the longest {at_longest:.0f}, enough for any hand",
-                {key: values[-1] for key, values in mine.items()}
+                {key: values[-1] for key, values in selected.items()}
                 | {"axis": AXES[what].capitalize(), "hand": hand},
             )
 

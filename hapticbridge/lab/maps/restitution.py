@@ -1,7 +1,7 @@
 """Map ``restitution``: a rod after one contact of MuJoCo's, against three laws of impact.
 
-No rendering method plays a part: the rod has no handle and no coupling, and what its contact does
-is MuJoCo's alone, by integrator and contact setting.
+No rendering method is involved: the rod has no handle and no coupling. Its contact depends on
+MuJoCo's integrator and contact setting alone.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from hapticbridge.sweep.results import Table
 from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
 
 MASS, LENGTH = 1.0, 1.0
-"""Of the uniform rod, in kg and m."""
+"""Mass in kg and length in m of the uniform rod."""
 INERTIA = MASS * LENGTH**2 / 12
-"""About its centre of mass, in kg m²."""
+"""Moment of inertia about its centre of mass, in kg m²."""
 
 TIP = 1e-3
-"""Radius in m of the sphere that is the rod's lower end: a point, next to 1 m."""
+"""Radius in m of the sphere at the rod's lower end; it is a point beside 1 m."""
 
 APPROACH = 1.0
-"""Speed in m/s at which the rod falls, without turning. Gravity is off: only the contact acts."""
+"""Speed in m/s at which the rod falls, without turning. Gravity is off, so only the contact
+acts."""
 
 LONGEST = 0.2
-"""Time in s after which a contact that has not ended is read as it is: four times the longest."""
+"""Time in s after which an unfinished contact is read as it is: four times the longest."""
 
 ROD = f"""
 <mujoco>
@@ -58,13 +59,13 @@ ROD = f"""
 
 @dataclass(frozen=True, slots=True)
 class ContactSetting:
-    """How MuJoCo is asked to make the contact.
+    """Contact setting of MuJoCo.
 
     Attributes:
         solref: Time constant in s and damping ratio, or minus stiffness and damping.
         impedance: ``dmin`` and ``dmax``, without unit.
-        integrator: By its name in MJCF.
-        timestep: In s.
+        integrator: Name of the integrator in MJCF.
+        timestep: Timestep in s.
     """
 
     solref: tuple[float, float]
@@ -82,8 +83,8 @@ SETTINGS: Mapping[str, ContactSetting] = {
     "bouncy, implicitfast, 0.1 ms": ContactSetting((0.02, 0.1), (0.9, 0.95), "implicitfast", 1e-4),
     "hard spring": ContactSetting((-1e5, -5.0), (0.99, 0.99), "discrete"),
 }
-"""``scenes`` is that of the scenes that come with hapticbridge, ``soft`` has MuJoCo's default
-``solref``; the others show what rebounds."""
+"""Contact settings. ``scenes`` is that of the scenes shipped with hapticbridge, ``soft`` has
+MuJoCo's default ``solref``; the others rebound."""
 
 _INTEGRATORS = {
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
@@ -93,13 +94,14 @@ _INTEGRATORS = {
 
 @dataclass(frozen=True, slots=True)
 class Rebound:
-    """What one contact did to the rod.
+    """Effect of one contact on the rod.
 
     Attributes:
-        velocity: Of the tip along t and n afterwards in m/s.
+        velocity: Velocity of the tip along t and n afterwards in m/s.
         energy_change: Kinetic energy after minus before in J.
-        first_gain: First step after which the rod had more than at the start, −1 for none.
-        steps: How many the contact took.
+        first_gain: First step after which the rod had more energy than at the start, −1 for
+            none.
+        steps: Number of steps of the contact.
     """
 
     velocity: tuple[float, float]
@@ -112,7 +114,7 @@ class Rebound:
 def restitution_of(setting: str) -> float:
     """Returns e of a contact setting, from a rod that falls upright without friction.
 
-    Held in [0, 1], as the laws want it.
+    The value is clipped to [0, 1], the range of the laws.
     """
     return min(1.0, max(0.0, drop(setting, np.pi / 2, 0.0, 0.0).velocity[1] / APPROACH))
 
@@ -125,7 +127,7 @@ def drop(setting: str, angle: float, friction: float, slide: float) -> Rebound:
 
     Args:
         setting: One of ``SETTINGS``.
-        angle: Of the rod above the floor in rad; π/2 stands upright.
+        angle: Angle of the rod above the floor in rad; π/2 is upright.
         friction: μ, >= 0, without unit.
         slide: Speed along the floor in m/s, > 0 towards the rod's upper end.
 
@@ -140,7 +142,7 @@ def drop(setting: str, angle: float, friction: float, slide: float) -> Rebound:
     model.opt.integrator = _INTEGRATORS[chosen.integrator]
     model.geom_solref[:] = chosen.solref
     model.geom_solimp[:] = (*chosen.impedance, 0.001, 0.5, 2)
-    model.geom_friction[:, 0] = max(friction, 1e-9)  # MuJoCo refuses 0 with a cone
+    model.geom_friction[:, 0] = max(friction, 1e-9)  # MuJoCo refuses a friction of 0 with a cone
     mujoco.mj_resetData(model, data)
     height = LENGTH / 2 * np.sin(angle) + TIP + APPROACH * chosen.timestep / 2
     data.qpos[:] = 0.0, height, -angle
@@ -170,10 +172,11 @@ def _rod() -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 SLIDE = 0.8
-"""Speed in m/s along the floor, forwards, backwards or none."""
+"""Speeds in m/s along the floor: forwards, backwards and none."""
 
 SHOWN = 0.75
-"""The friction coefficient whose curves are drawn, that of the example in which Newton gains."""
+"""Friction coefficient of the drawn curves, that of the example in which Newton's law gains
+energy."""
 
 DRAWN = ("scenes", "bouncy, implicitfast")
 
@@ -183,8 +186,8 @@ COLOURS = {
     "poisson": "#7fb2ee",
     "stronge": "#0d2c54",
 }
-"""Of the laws, tints of theory's; ``inelastic`` is any of them with e = 0. What was measured is
-black."""
+"""Colours of the laws, tints of the theory's colour; ``inelastic`` is any of them with e = 0. The
+measurement is black."""
 
 STYLES = {"inelastic": ":", "newton": "-", "poisson": "--", "stronge": "-."}
 MEASURED: Mapping[str, Any] = {
@@ -196,11 +199,11 @@ MEASURED: Mapping[str, Any] = {
 }
 
 Summary = dict[str, Any]
-"""What one contact setting came to."""
+"""Results of one contact setting."""
 
 
 def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
-    """Draws the energy over the angle, and how far each law is from MuJoCo."""
+    """Draws the energy over the angle, and the distance of each law from MuJoCo."""
     by_setting = boundary["settings"]
     figure = new_figure(8, 7.2)
     panels = figure.subplots(2, 2, gridspec_kw={"height_ratios": [1, 1.1]})
@@ -227,21 +230,21 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
 
 def _draw_curves(axes: Axes, table: Table, name: str) -> None:
     rows = (table["setting"] == name) & (table["friction"] == SHOWN) & (table["slide"] == SLIDE)
-    mine = table.select(rows)
-    if not len(mine):
+    selected = table.select(rows)
+    if not len(selected):
         base.say_missing(axes)
         return
-    angle = np.degrees(mine["angle"])
+    angle = np.degrees(selected["angle"])
     for law, colour in COLOURS.items():
-        axes.plot(angle, mine[law], color=colour, ls=STYLES[law], lw=1.6)
-    axes.plot(angle, mine["energy_change"], **MEASURED)
+        axes.plot(angle, selected[law], color=colour, ls=STYLES[law], lw=1.6)
+    axes.plot(angle, selected["energy_change"], **MEASURED)
     axes.axhline(0.0, color="black", lw=0.6)
     axes.set_xlabel("angle of the rod above the floor (°)")
-    axes.set_title(f"{name}: e = {mine['restitution'][0]:.2g}", fontsize="medium")
+    axes.set_title(f"{name}: e = {selected['restitution'][0]:.2g}", fontsize="medium")
 
 
 def _legend(figure: Figure) -> None:
-    """Names laws and measurement, whether or not a panel shows them."""
+    """Names laws and measurement in a legend, also those that no panel shows."""
     handles = [
         Line2D([], [], color=colour, ls=STYLES[law], lw=1.6, label=_named(law))
         for law, colour in COLOURS.items()
@@ -274,15 +277,15 @@ def _draw_bars(
 RESTITUTION_LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
 
 FRICTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Coulomb's μ, without unit."""
+"""Coulomb's coefficients μ, without unit."""
 
 LEAD = 0.2
-"""Share by which a law must be nearer to MuJoCo than the second to be named the nearest, without
-unit; with less, laws that a soft contact cannot tell apart would be named by chance."""
+"""Lead by which the nearest law must be nearer to MuJoCo than the second, without unit. With less,
+laws that a soft contact cannot distinguish would be named by chance."""
 
 
 def points(count: int) -> Sequence[Point]:
-    """Returns every contact setting, friction and slide at angles that make about ``count``."""
+    """Returns contact settings, frictions and slides at angles that make about ``count``."""
     angles = np.linspace(0.05, 1.52, max(2, round(count / (len(SETTINGS) * len(FRICTIONS) * 3))))
     return [
         {"setting": name, "friction": friction, "slide": slide, "angle": float(angle)}
@@ -326,40 +329,42 @@ def _by_law(law: Law, angle: float, friction: float, slide: float, restitution: 
 def summarize(table: Table) -> dict[str, Any]:
     """Compares each contact setting with the laws of impact."""
     groups = {name: table.select(table["setting"] == name) for name in SETTINGS}
-    return {"settings": {name: _summary(mine) for name, mine in groups.items() if len(mine)}}
-
-
-def _summary(mine: Table) -> Summary:
-    measured = mine["energy_change"]
-    distances = {law: float(np.sqrt(np.mean((measured - mine[law]) ** 2))) for law in COLOURS}
     return {
-        "restitution": float(mine["restitution"][0]),
+        "settings": {name: _summary(selected) for name, selected in groups.items() if len(selected)}
+    }
+
+
+def _summary(selected: Table) -> Summary:
+    measured = selected["energy_change"]
+    distances = {law: float(np.sqrt(np.mean((measured - selected[law]) ** 2))) for law in COLOURS}
+    return {
+        "restitution": float(selected["restitution"][0]),
         "rms_distance_to_law": distances,
         "nearest_law": _nearest(distances),
         "largest_energy_change": float(measured.max()),
-        "largest_by_newton": float(mine["newton"].max()),
-        "share_that_gained": float(np.mean(mine["first_gain"] >= 0)),
+        "largest_by_newton": float(selected["newton"].max()),
+        "share_that_gained": float(np.mean(selected["first_gain"] >= 0)),
         "at_the_largest": {
-            key: float(mine[key][measured.argmax()]) for key in ("angle", "friction", "slide")
+            key: float(selected[key][measured.argmax()]) for key in ("angle", "friction", "slide")
         },
-        "largest_own_restitution": float(mine["own_restitution"].max()),
+        "largest_own_restitution": float(selected["own_restitution"].max()),
     }
 
 
 def _nearest(distances: Mapping[str, float]) -> str | None:
-    """Returns the law that leads the second by more than ``LEAD``; None where none does."""
+    """Returns the law that leads the second by more than ``LEAD``; None without such a lead."""
     first, second = sorted(distances, key=distances.__getitem__)[:2]
     return first if distances[first] < (1 - LEAD) * distances[second] else None
 
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States e, the energy and the nearest law of each contact setting."""
-    for name, mine in boundary["settings"].items():
+    for name, selected in boundary["settings"].items():
         yield (
             "With '{name}' a rod that falls upright comes back with e = {restitution:.2g}; at any "
             "angle and friction its energy changes by {largest_energy_change:+.2g} J at most, by "
             "Newton's law {largest_by_newton:+.2g} J; the nearest law is {nearest}",
-            mine | {"name": name, "nearest": mine["nearest_law"] or "none"},
+            selected | {"name": name, "nearest": selected["nearest_law"] or "none"},
         )
 
 

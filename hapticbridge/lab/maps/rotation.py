@@ -29,11 +29,11 @@ from hapticbridge.summary import Ledger
 from hapticbridge.sweep.results import Table
 
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
-"""Of the tool about its principal axes x, y, z in kg m²: all different, so that it tumbles,
-and near those of a hand tool with a long handle."""
+"""Principal moments of inertia of the tool about x, y, z in kg m². They all differ, so that it
+tumbles, and are near those of a hand tool with a long handle."""
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 TICKS = 1000
 
@@ -46,8 +46,8 @@ MIDDLE = np.array([0.0, 1.0, 0.0])
 def cut_speed(stiffness: float) -> float:
     """Returns the speed ω = π √(K_r/I) in rad/s at which a sudden turn winds the spring to π.
 
-    The tool starts at rest and the handle turns about the middle axis: relative to the handle it
-    swings with the amplitude ω √(I/K_r). The damping, also the numerical one, is left out.
+    The tool starts at rest and the handle turns about the middle axis. Relative to the handle the
+    tool swings with the amplitude ω √(I/K_r). The damping, also the numerical one, is left out.
     """
     return float(np.pi * np.sqrt(stiffness / INERTIA[1]))
 
@@ -62,19 +62,19 @@ def gyroscopic_speed(stiffness: float) -> float:
 
 
 def free_creation(speed: float, ticks: int = TICKS) -> float:
-    """Returns what the explicit gyroscopic term creates in a free tool, in J.
+    """Returns the energy in J that the explicit gyroscopic term creates in a free tool.
 
     With the term at the start of the step, v⁺ = v − T I⁻¹(ω × Iω), the kinetic energy grows by
 
         ½ T² (ω × Iω)ᵀ I⁻¹ (ω × Iω)
 
     a step, since ω·(ω × Iω) = 0. Summed over the exact motion (fourth order) from a spin about
-    ``OBLIQUE``; beyond a few per cent of the kinetic energy what was created spins faster, and
-    creates more than this.
+    ``OBLIQUE``. Beyond a few per cent of the kinetic energy, the created energy increases the spin,
+    and the true creation is larger.
 
     Args:
-        speed: In rad/s.
-        ticks: How many.
+        speed: Speed in rad/s.
+        ticks: Number of ticks.
     """
     omega = speed * OBLIQUE / np.linalg.norm(OBLIQUE)
     total = 0.0
@@ -94,34 +94,36 @@ def _torque_free(omega: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 MASS = 0.3
-"""In kg."""
+"""Mass of the tool in kg."""
 
 STIFFNESS, DAMPING = 2000.0, 0.5
-"""K in N/m and B in N s/m of the coupling's translation: it only keeps the tool in its place."""
+"""Translational K in N/m and B in N s/m of the coupling. They only keep the tool in its place."""
 
 ROTATIONAL_DAMPING = 5e-4
-"""B_r in N m s/rad; none where K_r = 0."""
+"""Rotational damping B_r in N m s/rad; 0 where K_r = 0."""
 
 DIVERGED = 1e3
-"""Kinetic energy in J that ends a run: ten times what the tool has at 200 rad/s, so that it has
-diverged beyond doubt, and before MuJoCo warns of numbers that are not finite."""
+"""Kinetic energy in J that ends a run. It is ten times that of the tool at 200 rad/s, a sure sign
+of divergence. It is reached before MuJoCo warns of numbers that are not finite."""
 
 CHUNK = 2
-"""Ticks after which that is looked at; five beyond it, MuJoCo would warn."""
+"""Ticks between two checks of the kinetic energy. Five ticks beyond the limit, MuJoCo would
+warn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spin:
-    """What a run with a spinning handle came to.
+    """Outcome of a run with a spinning handle.
 
     Attributes:
-        ticks: How many were done; fewer than ``TICKS`` where it diverged.
+        ticks: Number of completed ticks; fewer than ``TICKS`` if it diverged.
         environment: ``strict``, ``within slack`` or ``active``.
-        created: The largest Σ E_k so far at any tick, in J.
+        created: Largest Σ E_k so far at any tick, in J.
         slack_share: Largest share of the slack that was used, without unit.
         first_active: Tick of the first violation of the slack, −1 for none.
-        largest_angle: Between handle and tool in rad, at most π.
-        crossed: Tick at which the angle had passed π since the tick before, −1 for never.
+        largest_angle: Angle between handle and tool in rad, at most π.
+        crossed: First tick after which the angle had passed π since the previous tick, −1 for
+            never.
         torque_jump: Largest change of the torque on the tool within a tick in N m.
     """
 
@@ -149,10 +151,10 @@ def spin(
     Args:
         method: One of ``rendering.METHODS`` that has a coupling.
         coupling: K and B.
-        speed: Of the handle in rad/s.
-        angle: By which the handle is ahead of the tool at the start, about x, in rad.
-        axis: Of the handle's turning, in the world frame, shape (3,), of any length > 0.
-        spins_at_start: Whether the tool turns with the handle from the start, or is at rest.
+        speed: Speed of the handle in rad/s.
+        angle: Lead of the handle over the tool at the start, about x, in rad.
+        axis: Axis of the handle's rotation in the world frame, shape (3,), any length > 0.
+        spins_at_start: True if the tool turns with the handle from the start; else it is at rest.
 
     Raises:
         HapticBridgeError: A value is out of range, or the method cannot render a free tool.
@@ -169,7 +171,7 @@ def spin(
     first["quaternion"] = quaternions[0]
     setup = RunSetup(scene=scene, coupling=coupling, method=chosen, period=PERIOD)
     parameters = setup.parameters(first, effective)
-    # the grip is where the device would be without the angle, not where it starts
+    # the grip is at the device's pose without the angle, not at the device's start
     parameters = replace(parameters, device_origin=IDENTITY_POSE)
     binding = BoundKernel(scene.model, scene.data, parameters)
     records = np.zeros(TICKS, TICK_DTYPE)
@@ -183,9 +185,9 @@ def turning(
     """Returns the handle's unit quaternions (w, x, y, z) at the ticks, shape (``TICKS`` + 1, 4).
 
     Args:
-        speed: In rad/s.
-        angle: By which it is turned about x at the start, in rad.
-        axis: Of the turning, in the world frame, shape (3,), of any length > 0.
+        speed: Speed in rad/s.
+        angle: Rotation about x at the start, in rad.
+        axis: Axis of rotation in the world frame, shape (3,), any length > 0.
     """
     time = PERIOD * np.arange(TICKS + 1)
     about = axis / np.linalg.norm(axis)
@@ -196,7 +198,7 @@ def turning(
 
 
 def coupling_of(stiffness: float) -> Coupling:
-    """Returns the coupling with a K_r in N m/rad; with 0 it does not hold the tool's turning."""
+    """Returns the coupling with a K_r in N m/rad; with 0 the tool's rotation is free."""
     return Coupling(STIFFNESS, DAMPING, stiffness, ROTATIONAL_DAMPING if stiffness else 0.0)
 
 
@@ -237,7 +239,7 @@ def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
     tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])
     between = (handle * tool.inv()).as_rotvec()
     angles = np.linalg.norm(between, axis=1)
-    # just before the cut and just behind it the rotation vectors point opposite ways
+    # just before and behind the cut the rotation vectors have opposite directions
     opposite = np.sum(between[1:] * between[:-1], axis=1) < 0
     crossed = np.flatnonzero(opposite & (angles[1:] > np.pi / 2) & (angles[:-1] > np.pi / 2))
     jumps = np.linalg.norm(np.diff(records["wrench_on_tool"][:, 3:], axis=0), axis=1)
@@ -254,16 +256,16 @@ def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
 
 
 SOFT, HARD = 2.0, 20.0
-"""K_r in N m/rad: that of the simulated device, and one ten times stiffer."""
+"""Stiffnesses K_r in N m/rad: that of the simulated device, and one ten times stiffer."""
 
 METHODS_SHOWN = ("implicit", "compensated", "lossless", "implicitfast", "explicit", "weld")
 
 SPEED = (0.0, 200.0)
 ANGLE = (0.0, 3.1)
-"""Ranges in rad/s and rad: the angle ends short of the cut."""
+"""Ranges in rad/s and rad; the angle ends before the cut."""
 
 SLOWEST = 2.0
-"""In rad/s, where the lines over the logarithm of the speed begin."""
+"""Speed in rad/s at which the lines over the logarithm of the speed begin."""
 
 LINES = (
     ("implicit", 0.0),
@@ -274,8 +276,8 @@ LINES = (
     ("implicitfast", SOFT),
     ("explicit", SOFT),
 )
-"""Method and K_r in N m/rad of what is drawn over the speed; with 0 the coupling is one of
-translation alone."""
+"""Method and K_r in N m/rad of the curves over the speed; with 0 the coupling acts on translation
+alone."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -314,8 +316,8 @@ def _point(what: str, method: str, stiffness: float, speed: float, angle: float 
 def evaluate(point: Point) -> Mapping[str, float | int | str]:
     """Spins a handle for 1 s, or searches for the speed at which the angle passes π.
 
-    In a ``cell`` or on a ``line`` the tool spins with the handle from the start, in a ``cut`` it is
-    at rest.
+    The tool spins with the handle from the start in a ``cell`` or on a ``line``, and is at rest in
+    a ``cut``.
     """
     method, stiffness = str(point["method"]), float(point["rotational_stiffness"])
     if point["what"] == "limit":
@@ -342,7 +344,7 @@ STYLES = {0.0: "s:", SOFT: "o-", HARD: "^--"}
 """Marker and line by K_r in N m/rad."""
 
 LEAST = 1e-12
-"""Energy in J that stands for none on a logarithmic axis."""
+"""Energy in J that represents zero on a logarithmic axis."""
 
 HIGHEST = 5 * np.pi * SOFT
 """Upper end of the axis of torque in N m: the jump at the cut, and room for the names above it."""
@@ -391,13 +393,13 @@ def _draw_cells(axes: Axes, table: Table, method: str) -> None:
 def _draw_creation(axes: Axes, table: Table) -> None:
     lines = table.select(table["what"] == "line")
     for method, stiffness in LINES:
-        mine = lines.select(
+        selected = lines.select(
             (lines["method"] == method) & (lines["rotational_stiffness"] == stiffness)
         )
         if stiffness == 0:
-            predicted = [max(free_creation(float(speed)), LEAST) for speed in mine["speed"]]
+            predicted = [max(free_creation(float(speed)), LEAST) for speed in selected["speed"]]
             axes.plot(
-                mine["speed"],
+                selected["speed"],
                 predicted,
                 color=base.THEORY_COLOUR,
                 lw=4,
@@ -405,8 +407,8 @@ def _draw_creation(axes: Axes, table: Table) -> None:
                 label=r"½T²|ω×Iω|²/I",
             )
         axes.plot(
-            mine["speed"],
-            np.maximum(mine.numbers("created"), LEAST),
+            selected["speed"],
+            np.maximum(selected.numbers("created"), LEAST),
             STYLES[stiffness],
             color=base.METHOD_COLOURS[method],
             ms=3,
@@ -423,13 +425,13 @@ def _draw_creation(axes: Axes, table: Table) -> None:
 
 def _draw_cut(axes: Axes, table: Table) -> None:
     cuts = table.select(table["what"] == "cut")
-    widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last lie on each other
+    widths = (7, 5.5, 4, 2.5, 1, 1)  # all but the last coincide
     for method, width in zip(METHODS_SHOWN, widths, strict=True):
-        mine = cuts.select(cuts["method"] == method)
-        # the weld's jumps lie far beyond the others': they are drawn at the upper edge
-        jump = np.minimum(mine.numbers("torque_jump"), 0.97 * HIGHEST)
+        selected = cuts.select(cuts["method"] == method)
+        # the weld's jumps are far larger: they are drawn at the upper edge
+        jump = np.minimum(selected.numbers("torque_jump"), 0.97 * HIGHEST)
         colour = base.METHOD_COLOURS[method]
-        axes.plot(mine["speed"], jump, "o-", color=colour, ms=3, lw=width, label=method)
+        axes.plot(selected["speed"], jump, "o-", color=colour, ms=3, lw=width, label=method)
     axes.axvline(cut_speed(SOFT), color=base.THEORY_COLOUR, ls="--", lw=1.2, label="ω = π √(K_r/I)")
     axes.axhline(2 * np.pi * SOFT, color=base.THEORY_COLOUR, ls=":", lw=1.2, label="2π K_r")
     axes.set(
@@ -441,23 +443,23 @@ def _draw_cut(axes: Axes, table: Table) -> None:
 
 
 TELLING = (1e-4, 0.05)
-"""Share of the kinetic energy within which creation is compared with theory: above rounding, and
-below what changes the motion."""
+"""Share of the kinetic energy within which creation is compared with theory. It is above rounding,
+and too small to change the motion."""
 
 
 def summarize(table: Table) -> dict[str, Any]:
-    """Finds where each method is passive, what translation alone creates, and the cut at π."""
+    """Finds passive ranges, the creation with translation alone, and the cut at π."""
     cells = table.select(table["what"] == "cell")
     free = table.select((table["what"] == "line") & (table["rotational_stiffness"] == 0))
     predicted = np.array([free_creation(float(speed)) for speed in free["speed"]])
     kinetic = 0.5 * INERTIA[1] * free["speed"] ** 2
     share = predicted / kinetic
-    told = (share > TELLING[0]) & (share < TELLING[1])
+    comparable = (share > TELLING[0]) & (share < TELLING[1])
     created = free.numbers("created")
-    ratio = created[told] / predicted[told]
+    ratio = created[comparable] / predicted[comparable]
     cuts = table.select(table["what"] == "cut")
-    mine = cuts.select(cuts["method"] == "implicit")
-    passed = mine.select(mine.numbers("crossed") >= 0)
+    selected = cuts.select(cuts["method"] == "implicit")
+    passed = selected.select(selected.numbers("crossed") >= 0)
     limit = table.select(table["what"] == "limit").numbers("limit")
     return {
         "period": PERIOD,
@@ -471,7 +473,7 @@ def summarize(table: Table) -> dict[str, Any]:
             "created": created.tolist(),
             "predicted": predicted.tolist(),
             "grows_up_to": _grows_up_to(free),
-            "compared_up_to": float(free["speed"][told].max()) if told.any() else None,
+            "compared_up_to": float(free["speed"][comparable].max()) if comparable.any() else None,
             "largest_deviation": float(np.abs(ratio - 1).max()) if ratio.size else None,
         },
         "cut": {
@@ -486,13 +488,13 @@ def summarize(table: Table) -> dict[str, Any]:
 
 
 def _largest_jump(cuts: Table, method: str) -> float | None:
-    """Returns the largest jump of torque of a method in N m; None where nothing was run."""
+    """Returns the largest jump of torque of a method in N m; None without a run."""
     jump = cuts.select(cuts["method"] == method).numbers("torque_jump")
     return float(jump.max()) if jump.size else None
 
 
 def _grows_up_to(free: Table) -> float | None:
-    """Returns the speed in rad/s up to which more is created at every faster point."""
+    """Returns the speed in rad/s above which every faster point creates more."""
     if not len(free):
         return None
     falls = np.flatnonzero(np.diff(free.numbers("created")) <= 0)
@@ -501,17 +503,17 @@ def _grows_up_to(free: Table) -> float | None:
 
 def _first_passed(cells: Table, method: str) -> float | None:
     """Returns the slowest speed in rad/s at which the angle passed π in a run; None for none."""
-    mine = cells.select((cells["method"] == method) & (cells.numbers("crossed") >= 0))
-    return float(mine["speed"].min()) if len(mine) else None
+    selected = cells.select((cells["method"] == method) & (cells.numbers("crossed") >= 0))
+    return float(selected["speed"].min()) if len(selected) else None
 
 
 def _fastest(cells: Table, method: str) -> float | None:
     """Returns the speed in rad/s up to which a method is passive at every angle; None for none."""
-    mine = cells.select(cells["method"] == method)
-    is_good = (mine.texts("environment") != "active") & (mine.numbers("ticks") == TICKS)
-    bad = mine["speed"][~is_good].min(initial=np.inf)
-    # at rest nothing moves and nothing can be created: that is no speed
-    good = mine["speed"][(mine["speed"] < bad) & (mine["speed"] > 0)]
+    selected = cells.select(cells["method"] == method)
+    is_good = (selected.texts("environment") != "active") & (selected.numbers("ticks") == TICKS)
+    bad = selected["speed"][~is_good].min(initial=np.inf)
+    # a tool at rest creates nothing; 0 is no speed
+    good = selected["speed"][(selected["speed"] < bad) & (selected["speed"] > 0)]
     return float(good.max()) if good.size else None
 
 
@@ -522,18 +524,18 @@ def _strict_share(cells: Table, method: str) -> float | None:
 
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
-    """States where each method is passive, what translation alone creates, and the cut at π."""
+    """States passive ranges, the creation with translation alone, and the cut at π."""
     for name in METHODS_SHOWN:
-        mine = {"name": name, "gyroscopic_speed": boundary["gyroscopic_speed"]}
-        mine |= {key: boundary[key][name] for key in ("fastest_passive", "first_passed")}
-        mine |= {"strict": boundary["share_strict_below"][name]}
-        yield "'{name}' is passive at every angle up to {fastest_passive:.3g} rad/s", mine
+        selected = {"name": name, "gyroscopic_speed": boundary["gyroscopic_speed"]}
+        selected |= {key: boundary[key][name] for key in ("fastest_passive", "first_passed")}
+        selected |= {"strict": boundary["share_strict_below"][name]}
+        yield "'{name}' is passive at every angle up to {fastest_passive:.3g} rad/s", selected
         yield (
             "'{name}' is strict in {strict:.0%} of its runs below {gyroscopic_speed:.3g} rad/s, "
             "where the gyroscopic torque reaches what the spring gives at π",
-            mine,
+            selected,
         )
-        yield "The angle of '{name}' first passes π at {first_passed:.3g} rad/s", mine
+        yield "The angle of '{name}' first passes π at {first_passed:.3g} rad/s", selected
     yield (
         "Coupled in translation alone, the tool creates ½T²|ω × Iω|²/I a step within "
         "{largest_deviation:.2%} up to {compared_up_to:.3g} rad/s, and more the faster up to "

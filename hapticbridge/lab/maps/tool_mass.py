@@ -25,11 +25,11 @@ from hapticbridge.theory.sampled_loop import WorstHand
 from hapticbridge.theory.spectrum import needed_for_fixed_environment
 
 NAMES = ("implicit", "lossless", "implicitfast", "explicit", "explicit:rk4")
-"""Methods that have a theory here."""
+"""Methods with a theory in this module."""
 
 ANGLES = np.union1d(np.linspace(0.01, np.pi, 2000), np.geomspace(0.01, np.pi, 1000))
-"""θ in rad at which theory is evaluated, even in θ and in log θ; to be finer than resonances of a
-heavy tool, which are B/m wide."""
+"""Angles θ in rad for the theory, even in θ and in log θ. The spacing is finer than the resonances
+of a heavy tool, which are B/m wide."""
 
 
 def least_mass(method: str, stiffness: float, damping: float, period: float) -> float:
@@ -58,7 +58,7 @@ def least_mass(method: str, stiffness: float, damping: float, period: float) -> 
 
     References:
         Brown & Colgate 1997, conditions that belong to eq. (19), for the semi-implicit step; the
-        other two are derived here alike.
+        other two are derived here by the same test.
     """
     _check(method)
     kt, b = stiffness * period, damping
@@ -74,7 +74,7 @@ def least_mass(method: str, stiffness: float, damping: float, period: float) -> 
 def felt(
     method: str, stiffness: float, damping: float, mass: float, period: float, angle: ArrayLike
 ) -> NDArray[np.complex128]:
-    """Returns what the device feels of a free tool, force per displacement of the handle.
+    """Returns the transfer function of a free tool, force per displacement of the handle.
 
         H = C / (1 + C P),    C = K + B D/T,    D = 1 − z⁻¹,    P = (T²/m) n / D²
         n = 1 (implicit),  (1 + z⁻¹)/2 (lossless),  z⁻¹ (explicit),
@@ -117,8 +117,8 @@ def worst_angle(
 ) -> tuple[float, float]:
     """Returns θ in rad at which a free tool needs most device damping, and that b in N s/m.
 
-    The damping is what any passive hand may ask for, provided that the tool is stable behind a
-    handle held still (``least_mass``); else inf.
+    The damping covers every passive hand if the tool is stable behind a handle held still
+    (``least_mass``); else it is inf.
 
     Raises:
         StudyError: The method is none of ``NAMES``.
@@ -139,14 +139,14 @@ def _check(method: str) -> None:
 
 
 PERIOD = 1e-3
-"""T in s."""
+"""Period T in s."""
 
 DEVICE_DAMPING = 20.0
-"""b in N s/m: a well damped device, so that stiff couplings are in play. The loop is linear: with a
-tenth of b, B and K everything here happens at a tenth of the tool's mass."""
+"""Device damping b in N s/m: a well damped device, so that stiff couplings are possible. The loop
+is linear. With a tenth of b, B and K everything here happens at a tenth of the tool's mass."""
 
 DAMPING = 5.0
-"""B in N s/m, a quarter of b, as a default coupling has it."""
+"""Damping B in N s/m, a quarter of b, as in a default coupling."""
 
 MASS = (1e-3, 10.0)
 """Range of the tool's mass in kg, even in its logarithm."""
@@ -156,17 +156,17 @@ STIFFNESS = (1000.0, 60_000.0)
 
 TICKS = 2000
 SWINGS = 8.0
-"""Swings of the tool on the coupling that a run must hold at least: a fifth of it is judged, and a
-fraction of a swing would be taken for growth or decay. More takes longer."""
+"""Smallest number of swings of the tool on the coupling in a run. A fifth of the run is judged, and
+a fraction of a swing would be mistaken for growth or decay. More takes longer."""
 
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Displacement that starts a run, in m."""
 
 HELD_STILL = 1e9
-"""Mass in kg of a device that nobody moves: the handle is held still to 1e-12 m."""
+"""Mass in kg of a device that holds the handle still, to 1e-12 m."""
 
 PATH = base.swinging(0.0025, 3.0, duration=2.0, count=401)
-"""Of a hand that swings the tool by 5 mm at 3 Hz, and turns nothing."""
+"""Path of a hand that swings the tool by 5 mm at 3 Hz, without rotation."""
 
 THEORIES: Mapping[str, str] = {
     "implicit": "implicit",
@@ -176,13 +176,13 @@ THEORIES: Mapping[str, str] = {
     "explicit": "explicit",
     "explicit:rk4": "explicit:rk4",
 }
-"""Methods shown, and the theory of a free tool of each."""
+"""Methods shown, each with its theory of a free tool."""
 
 LIMITS = 9
-"""Values of K per method at which the limits in mass are searched."""
+"""Number of K per method at which the limits in mass are searched."""
 
 SEARCHES = ("held still", "worst hand")
-"""How the handle is held where a limit in mass is searched."""
+"""Ways to hold the handle in a search for a limit in mass."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -208,7 +208,8 @@ def points(count: int) -> Sequence[Point]:
 def evaluate(point: Point) -> Mapping[str, float | str | bool]:
     """Runs one tool behind a handle held still, in the worst hand and in an ordinary one.
 
-    Or searches for the mass from which on it is stable in one of the first two.
+    A limit point searches for the mass above which it is stable with one of the first two
+    instead.
     """
     name, stiffness = str(point["method"]), float(point["stiffness"])
     if point["what"] != "cell":
@@ -233,7 +234,7 @@ def held_still(name: str, stiffness: float, mass: float) -> LoopOutcome:
 
 
 def worst_hand(name: str, stiffness: float, mass: float) -> LoopOutcome:
-    """Runs a free tool in the hand that is worst for this method, mass and stiffness."""
+    """Runs a free tool in the worst hand for this method, mass and stiffness."""
     device = SimulatedDevice(hand=hand_worst_for(name, stiffness, mass))
     return _run(device, name, stiffness, mass)
 
@@ -247,12 +248,12 @@ def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
 
 
 def law_damping(name: str, stiffness: float) -> float:
-    """Returns B' in N s/m, which a method's law uses where ``DAMPING`` is asked for."""
+    """Returns B' in N s/m of a method's law where ``DAMPING`` is requested."""
     return float(base.used_damping(name, stiffness, DAMPING, PERIOD))
 
 
 def coupling_of(stiffness: float) -> Coupling:
-    """Returns the coupling of every run at a stiffness; nothing turns."""
+    """Returns the coupling of every run at a stiffness, without rotation."""
     return Coupling(stiffness, DAMPING, 0.0, 0.0)
 
 
@@ -275,10 +276,10 @@ def _run(
 
 
 def _limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
-    """Searches for the mass at which stability changes; NaN where it does not."""
+    """Searches for the mass at which stability changes; NaN without a change."""
 
     def is_stable(mass: float) -> bool:
-        # a tool that is unstable by itself has no worst hand: theory tunes it to a stable one
+        # an unstable tool has no worst hand: theory tunes it to a stable one
         return held_still(name, stiffness, mass).is_stable and (
             is_held or worst_hand(name, stiffness, mass).is_stable
         )
@@ -287,12 +288,12 @@ def _limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float 
 
 
 def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[str, float | bool]:
-    """Returns where theory has the mass at which stability changes, within ``MASS``.
+    """Returns the theoretical mass at which stability changes, within ``MASS``.
 
     Args:
         name: One of ``THEORIES``.
         stiffness: K in N/m, > 0.
-        is_held: Whether the handle is held still, or held by the worst hand of the device.
+        is_held: True for a handle that is held still; False for the worst hand of the device.
 
     Returns:
         ``limit`` in kg, NaN where there is none; ``stable_if_light`` and ``stable_if_heavy``: at
@@ -317,7 +318,7 @@ def _change(is_stable: Callable[[float], bool], width: float) -> Mapping[str, fl
 
 
 def is_stable(cells: Table) -> NDArray[np.bool_]:
-    """Returns where a tool was stable, held still and in the worst hand."""
+    """Returns the stable points of a tool, held still and in the worst hand."""
     return np.asarray(
         (cells.numbers("stable_held_still") == 1) & (cells.numbers("stable_worst_hand") == 1)
     )
@@ -326,7 +327,7 @@ def is_stable(cells: Table) -> NDArray[np.bool_]:
 Array = NDArray[np.float64]
 
 CONTOUR = 61
-"""Points along each axis from which the worst hand's bound is drawn; more make it smoother and take
+"""Points along each axis from which the worst hand's bound is drawn. More make it smoother and take
 a tenth of a millisecond each."""
 
 _MARKERS = {"held still": "s", "worst hand": "o"}
@@ -373,7 +374,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
 
 @cache
 def _needed(name: str) -> tuple[Array, Array, Array]:
-    """Returns mass, stiffness and the device damping that theory asks for, (n,), (n,), (n, n)."""
+    """Returns mass, stiffness and the required device damping in theory, (n,), (n,), (n, n)."""
     mass, stiffness = np.geomspace(*MASS, CONTOUR), np.geomspace(*STIFFNESS, CONTOUR)
     needed = [
         [worst_angle(THEORIES[name], k, law_damping(name, k), m, PERIOD)[1] for m in mass]
@@ -392,7 +393,7 @@ def _draw_theory(axes: Axes, name: str) -> None:
     axes.contour(
         mass,
         stiffness,
-        # where the tool is unstable by itself no damping is enough; the cap makes that a number
+        # no damping suffices for an unstable tool; the cap makes that a number
         np.minimum(needed, 3 * DEVICE_DAMPING),
         levels=[DEVICE_DAMPING],
         colors=base.THEORY_COLOUR,
@@ -408,7 +409,7 @@ def _draw_theory(axes: Axes, name: str) -> None:
 
 
 def summarize(table: Table) -> dict[str, Any]:
-    """Counts what failed by method, and compares the limits in mass with theory."""
+    """Counts failures by method, and compares the limits in mass with theory."""
     methods: dict[str, dict[str, Any]] = {}
     for name in THEORIES:
         cells = base.of_method(table, "cell", name)
@@ -426,7 +427,7 @@ def summarize(table: Table) -> dict[str, Any]:
 
 
 def _counts(name: str, cells: Table) -> dict[str, Any]:
-    """Returns how many tools of the grid were unstable, and what the stable ones created."""
+    """Returns the number of unstable tools, and the energy that the stable ones created."""
     stable = is_stable(cells)
     is_below = base.needed_by_6(name, cells["stiffness"], DAMPING, PERIOD) < DEVICE_DAMPING
     return {
@@ -439,7 +440,7 @@ def _counts(name: str, cells: Table) -> dict[str, Any]:
 
 
 def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
-    """Returns the limits that were found beside theory's; None where there is none."""
+    """Returns the measured limits beside theory's; None where there is none."""
     predicted = [predicted_limit(name, float(k), is_held=is_held) for k in rows["stiffness"]]
     theory = np.array([p["limit"] for p in predicted], dtype=np.float64)
     limit = rows.numbers("limit")
@@ -458,20 +459,20 @@ def _compare(name: str, rows: Table, *, is_held: bool) -> dict[str, Any]:
 
 
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
-    """States by method what was unstable, and how far the limits in mass agree with theory."""
-    for name, mine in boundary["methods"].items():
+    """States by method the unstable range, and the agreement of the limits in mass with theory."""
+    for name, selected in boundary["methods"].items():
         yield (
             "'{name}': held still, a tool is unstable at {unstable_held_still} of {points} points "
             "of the grid; below (6), held still or in its worst hand, at {unstable_below_6} of "
             "{points_below_6}; where stable, it creates at most {most_created:.2g} J",
-            mine | {"name": name},
+            selected | {"name": name},
         )
         for what in SEARCHES:
             yield (
                 "'{name}', {what}: limits in mass agree with theory within "
                 "{worst_ratio_error:.2%}; on whether there is one they disagree "
                 "{disagreements} times",
-                mine.get(what, {}) | {"name": name, "what": what},
+                selected.get(what, {}) | {"name": name, "what": what},
             )
 
 
