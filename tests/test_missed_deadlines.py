@@ -22,8 +22,6 @@ from hapticbridge.commands import Couple
 from hapticbridge.guard import Limits
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import Recording, Timeline, due_times, read_recording
-from hapticbridge.report.evidence import Evidence, draw_recording
-from hapticbridge.report.plots import draw_motion
 from hapticbridge.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}
