@@ -15,7 +15,6 @@ from hapticbridge.audit import audit as audit  # beside it stands the package of
 from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from hapticbridge import theory as passivity  # noqa: F401 - the public name
     from hapticbridge import theory as theory
     from hapticbridge.audit import AuditReport as AuditReport
     from hapticbridge.bridge import Bridge as Bridge
@@ -42,6 +41,8 @@ if TYPE_CHECKING:
     from hapticbridge.scene import load_scene as load_scene
     from hapticbridge.scene import scene_names as scene_names
     from hapticbridge.summary import Summary as Summary
+
+    passivity = theory
 else:
     __getattr__, __dir__, __all__ = lazy_exports(
         __name__,

@@ -69,7 +69,7 @@ def damping_for_delay(
     return max(0.0, late - minimum_damping(coupling, felt, axis=axis))
 
 
-# Device damping required by a coupling.
+# Device damping required by a coupling
 
 LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
 """Lowest frequency in rad per tick, and number of frequencies, of the search for the damping that
@@ -138,7 +138,7 @@ def required_damping(
     return most * period
 
 
-def required_damping_with_substeps(
+def required_damping_with_delay(
     info: DeviceInfo,
     coupling: Coupling,
     period: float,
@@ -150,7 +150,7 @@ def required_damping_with_substeps(
     return needed + damping_for_delay(info, coupling, period, axis)
 
 
-# Default coupling of a device.
+# Default coupling of a device
 
 UNKNOWN_DAMPING, UNKNOWN_ROTATIONAL_DAMPING = 2.0, 2e-3
 """Damping in N s/m and N m s/rad assumed for a device of unknown damping: that of the default
@@ -219,11 +219,11 @@ def default_coupling(
     if laws == 1 and not delay_ticks(info, period):
         return method.rendered(coupling, period)
     shrink = min(
-        1.0, NEEDED_SHARE * damping / required_damping_with_substeps(info, coupling, period, laws)
+        1.0, NEEDED_SHARE * damping / required_damping_with_delay(info, coupling, period, laws)
     )
     needed = required_damping(coupling, period, laws, "rotation")
     if info.turns:
-        needed = required_damping_with_substeps(info, coupling, period, laws, "rotation")
+        needed = required_damping_with_delay(info, coupling, period, laws, "rotation")
     shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
     shrunk = Coupling(
         stiffness=shrink * coupling.stiffness,
@@ -288,7 +288,7 @@ def device_conditions(
 
     For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
     not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
-    count (``device.lateness_above_baseline``).
+    count (``damping_for_delay``).
 
     Args:
         info: The device.
@@ -306,14 +306,14 @@ def device_conditions(
     conditions = []
     if info.damping is not None:
         delay = delay_ticks(info, period)
-        needed = scale * force_scale * required_damping_with_substeps(info, coupling, period, laws)
+        needed = scale * force_scale * required_damping_with_delay(info, coupling, period, laws)
         remedy = _remedy(method, coupling.damping)
         conditions.append(DampingCondition("translation", needed, info.damping, remedy, delay))
         if info.turns:
             needed = (
                 force_scale
                 / scale
-                * required_damping_with_substeps(info, coupling, period, laws, "rotation")
+                * required_damping_with_delay(info, coupling, period, laws, "rotation")
             )
             remedy = _remedy(method, coupling.rotational_damping)
             conditions.append(

@@ -41,7 +41,7 @@ def column_values(ticks: NDArray[np.void], column: Column) -> NDArray[Any]:
     return np.ascontiguousarray(field if column.part is None else field[:, column.part])
 
 
-# CSV format.
+# CSV format
 
 SIDECAR = ".json"
 """Extension of the file beside the CSV, appended to its whole name."""
@@ -82,7 +82,7 @@ class CsvSink:
         self._file.close()
 
 
-# HDF5 format.
+# HDF5 format
 
 _CHUNK = 8192
 """Rows per chunk, 64 kB. Larger chunks compress better; smaller ones read faster for few rows."""
@@ -137,7 +137,7 @@ class Hdf5Sink:
         self._file.close()
 
 
-# Parquet format.
+# Parquet format
 
 
 class ParquetSink:

@@ -1,4 +1,4 @@
-"""Atomic file replacement."""
+"""Files: atomic replacement, JSON without NaN, imports of optional packages."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def import_extra(
         ) from None
 
 
-# JSON without NaN and infinity, and JSON from other programs.
+# JSON without NaN and infinity, and JSON from other programs
 
 
 def finite_or_null(value: Any) -> Any:

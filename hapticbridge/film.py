@@ -30,7 +30,7 @@ ENDINGS = (".mp4", ".png")
 PATIENCE = 120.0
 """Longest wait for a renderer in s. A machine that compiles the code first needs half a minute."""
 
-MOST_PIXELS = 4096
+MAX_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
 
 _BOOTSTRAP = """
@@ -82,7 +82,7 @@ class Shot:
     def __post_init__(self) -> None:
         check = Arguments(HapticBridgeError)
         for name in ("width", "height"):
-            side = check.whole(name, getattr(self, name), least=16, most=MOST_PIXELS)
+            side = check.whole(name, getattr(self, name), least=16, most=MAX_PIXELS)
             if side % 2:
                 raise HapticBridgeError(f"{name} is {side} pixels; films need an even number")
         check.whole("fps", self.fps, least=1, most=120)

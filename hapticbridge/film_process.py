@@ -31,7 +31,7 @@ LONGEST_ARROW = 0.8
 """Length of the arrow of the largest force, as a share of the scene's extent. A longer one leaves
 the picture."""
 
-LEAST_REFERENCE = 0.1
+MIN_REFERENCE = 0.1
 """Force in N at which the arrow has its full length in a run with smaller forces. Such forces are
 drawn small."""
 
@@ -84,7 +84,7 @@ class Stage:
         data: State at the tick last shown, with contacts as they were solved.
         row: Record of that tick, one element of ``TICK_DTYPE``.
         passed: Records after the tick shown before and before this one.
-        reference: Largest force on the tool in the run, in N, or ``LEAST_REFERENCE``.
+        reference: Largest force on the tool in the run, in N, or ``MIN_REFERENCE``.
 
     Raises:
         RecordingError: The file is no recording, or cannot be simulated again here.
@@ -107,7 +107,7 @@ class Stage:
         self.row = self.passed = self._block[:1]
         forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
         largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
-        self.reference = max(LEAST_REFERENCE, *largest)
+        self.reference = max(MIN_REFERENCE, *largest)
         self._line = Timeline(self.recording.blocks(), self.parameters.period)
         self._scale_contact_forces()
 

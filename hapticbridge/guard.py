@@ -1,4 +1,4 @@
-"""Guard parameters of a run on a given device."""
+"""Guard of a run: limits, parameters for a device, checks before force, reasons of a trip."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
     return limits
 
 
-# Checks before force is enabled.
+# Checks before force is enabled
 
 STILL_TIME, PATIENCE = 0.1, 5.0
 """Time in s for which a real device must be still before force is enabled, and time in s after
@@ -239,7 +239,7 @@ def refuse_stretched_start(
         )
 
 
-# Reasons of a guard's stop, in words.
+# Reasons of a guard's stop, in words
 
 _REASONS = {
     BAD_SAMPLE: "the device's pose is not finite or not a rotation",
@@ -266,7 +266,7 @@ _DIVERGED = (
 def trip_reason(code: int, tick: int) -> str:
     """Describes why the kernel refused a tick.
 
-    ``code`` is a result of ``before_step`` or ``after_step``, not ``OK``.
+    ``code`` is a result of a function of ``kernel.tick``, not ``OK``.
     """
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
 

@@ -194,7 +194,7 @@ class OptionChanges(TypedDict, total=False):
     live: bool
 
 
-# Setup of a run.
+# Setup of a run
 
 PRESCRIBED_MOTION = DeviceInfo(
     name="prescribed motion", axes=AXES, force_limit=0.0, is_prescribed=True, is_real=False

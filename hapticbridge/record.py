@@ -87,7 +87,11 @@ and ``injected_rotational_damping`` in N m s/rad are the passivity controller's 
 of that kind. ``share`` is the share of the wrench that ramp and fade transmitted, 0 to 1."""
 
 LATER_FIELDS = ("share",)
-"""Fields that recordings of earlier versions lack; such a recording is read without them."""
+"""Fields that recordings of earlier versions lack; such a recording is read without them.
+
+A new field needs an entry here, in ``TICK_DTYPE`` and in ``UNITS``, a line in ``kernel.tick`` that
+writes it, and a check in the audit.
+"""
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Description of a rendering method."""
+"""Rendering methods: description, registry, and preparation of a scene."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> No
         )
 
 
-# Rendering methods of the product, and the registry of all methods.
+# Rendering methods of the product, and the registry of all methods
 
 IMPLICIT = Method(
     name="implicit",
@@ -221,7 +221,7 @@ def method_named(name: str) -> Method:
     return METHODS[name]
 
 
-# Preparation of a scene for a method.
+# Preparation of a scene for a method
 
 _INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,

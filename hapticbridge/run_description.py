@@ -83,9 +83,9 @@ def start_of(state: NDArray[np.void], name: str) -> list[float]:
     return [float(value) for value in numbers]
 
 
-# Numbers of a recording's metadata.
+# Numbers of a recording's metadata
 
-_MOST_TICKS = 2**31
+_MAX_TICKS = 2**31
 
 
 def meta_float(meta: Mapping[str, str], name: str) -> float:
@@ -143,12 +143,12 @@ def meta_count(meta: Mapping[str, str], name: str) -> int:
         RecordingError: It is missing, not a whole number, or out of range.
     """
     value = meta_float(meta, name)
-    if not value.is_integer() or not 0 <= value < _MOST_TICKS:
+    if not value.is_integer() or not 0 <= value < _MAX_TICKS:
         raise RecordingError(f"metadata '{name}' is {value:g}; it must be a whole number >= 0")
     return int(value)
 
 
-# Software versions and processor of a run.
+# Software versions and processor of a run
 
 
 def versions() -> dict[str, str]:

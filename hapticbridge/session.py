@@ -162,9 +162,6 @@ class TickKernel:
         is_ahead: True if a tick computes the first half of the next one.
     """
 
-    first_half: MujocoStep = staticmethod(mujoco.mj_fwdPosition)
-    second_half: MujocoStep = staticmethod(mujoco.mj_step2)
-
     def __init__(self, sample: NDArray[np.void], stream: RecordStream) -> None:
         self.sample, self.rows, self.cursors = sample, stream.rows, stream.cursors
         state, row = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE)
@@ -180,6 +177,7 @@ class TickKernel:
         """Attaches the arrays of a scene and the steps of a method."""
         method = setup.method
         self.bound, self.step, self.substeps = bound, method.step, range(setup.substeps)
+        self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
         self.is_ahead = setup.is_pipelined and can_split(setup.scene.model, method.scheme)
         self.external_flags = bound.external_flags
         self.wrench = bound.wrench_on_device

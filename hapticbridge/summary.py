@@ -99,7 +99,7 @@ def _sentence(name: str, adds: float | None, step: float, substeps: int, gains: 
     )
 
 
-# Energies metered by the kernel, and the environment's verdict.
+# Energies metered by the kernel, and the environment's verdict
 
 Environment = Literal["strict", "within slack", "active"]
 

@@ -30,7 +30,7 @@ DEVICE_POSE = ("device_position", "device_quaternion")
 
 # A device pose matters only as far as it moves the handle. The handle's coordinates reach 0.05 m,
 # where doubles are 7e-18 m apart: below that a changed device pose is another honest run's.
-LEAST_DEVICE_CHANGE = 2e-17
+MIN_DEVICE_CHANGE = 2e-17
 
 
 SIZES = st.sampled_from([10.0**-exponent for exponent in range(-1, 13)])
@@ -45,7 +45,7 @@ def changed(
     old = values[tick, index]
     values[tick, index] = old * factor if old != 0 else factor - 1
     difference = abs(values[tick, index] - old)
-    least = LEAST_DEVICE_CHANGE if name in DEVICE_POSE else 0.0
+    least = MIN_DEVICE_CHANGE if name in DEVICE_POSE else 0.0
     return ticks if difference > least else None
 
 

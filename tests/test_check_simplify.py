@@ -17,8 +17,8 @@ from hapticbridge.check.case import motion_for
 from hapticbridge.check.lean import (
     CREATES,
     IS_FELT,
-    LEAST_SAVING,
     MAY_GO,
+    MIN_SAVING,
     NOT_BORNE,
     SAVES_NOTHING,
     WARNS,
@@ -119,7 +119,7 @@ def tried(
             judge = Judge(
                 draft, motion, budget, damping, lambda a, b, _: (1.0, 0.5 + 0.5 * (a is b))
             )
-            judge.least_saving = LEAST_SAVING
+            judge.min_saving = MIN_SAVING
         return judge.judge(name, "", changed, loses=each.loses)
 
 
@@ -352,7 +352,7 @@ def test_substeps_go_where_they_were_not_needed(tmp_path: Path) -> None:
 def test_change_that_saves_nothing_is_not_taken(tmp_path: Path) -> None:
     draft = draft_of(tmp_path, ball_on_floor())
     judge = Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 0.97))
-    judge.least_saving = LEAST_SAVING
+    judge.min_saving = MIN_SAVING
     changed = draft.copy()
     assert all_of(draft, PRESS)["no friction"].edit(changed)
     assert judge.judge("", "", changed).verdict == SAVES_NOTHING
@@ -360,9 +360,9 @@ def test_change_that_saves_nothing_is_not_taken(tmp_path: Path) -> None:
 
 def test_noise_of_the_measurement_raises_what_counts_as_a_saving(tmp_path: Path) -> None:
     draft = draft_of(tmp_path, ball_on_floor())
-    assert Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 1.0)).least_saving == LEAST_SAVING
+    assert Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 1.0)).min_saving == MIN_SAVING
     noisy = Judge(draft, PRESS, 1.0, 2.0, lambda *_: (1.0, 0.9))
-    assert noisy.least_saving == pytest.approx(0.3)
+    assert noisy.min_saving == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("turn", [Rotation.identity(), Rotation.from_rotvec([0.3, -0.8, 0.5])])

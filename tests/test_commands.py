@@ -23,7 +23,7 @@ from hapticbridge.commands import (
     command_of,
 )
 from hapticbridge.commands.command import LONGEST_LINE, Stop, line_of
-from hapticbridge.commands.execution import INTERVAL, MOST_WAITING, RESET_INTERVAL
+from hapticbridge.commands.execution import INTERVAL, MAX_WAITING, RESET_INTERVAL
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import method_named
@@ -61,29 +61,29 @@ def test_the_sliders_end_where_the_bound_does(method: str, spent: int, back: flo
         (allowed.rotation, 2e-3, 1.0, 5e-4),
     ):
         stiffest = 2 * (device - spent * other) / T
-        most_damped = device + (back - 0.5) * gain * T
-        assert span.most_stiffness(other) == pytest.approx(stiffest, rel=1e-9)
-        assert span.most_damping(gain) == pytest.approx(most_damped, rel=1e-9)
+        max_damped = device + (back - 0.5) * gain * T
+        assert span.max_stiffness(other) == pytest.approx(stiffest, rel=1e-9)
+        assert span.most_damping(gain) == pytest.approx(max_damped, rel=1e-9)
         span.check(0.9999 * stiffest, other)
-        span.check(gain, 0.9999 * most_damped)
-        for couple in ((1.0001 * stiffest, other), (gain, 1.0001 * most_damped)):
+        span.check(gain, 0.9999 * max_damped)
+        for couple in ((1.0001 * stiffest, other), (gain, 1.0001 * max_damped)):
             with pytest.raises(CommandError, match=f"needs a device of .* {device:g}"):
                 span.check(*couple)
 
 
 def test_bounds_scale_with_motion_and_force_and_angles_do_not() -> None:
-    assert allowance(scale=2.0).translation.most_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
+    assert allowance(scale=2.0).translation.max_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
     for scales in ((2.0, 2.0), (2.0, 1.0), (1.0, 2.0)):
         scaled = replace(allowance(), scale=scales[0], force_scale=scales[1]).rotation
         assert scaled is not None
         most = 2 * 2e-3 / T * scales[0] / scales[1]
-        assert scaled.most_stiffness(0.0) == pytest.approx(most, rel=1e-9)
+        assert scaled.max_stiffness(0.0) == pytest.approx(most, rel=1e-9)
 
 
 def test_an_unknown_damping_is_the_one_that_the_default_coupling_takes() -> None:
     allowed = allowance(damping=None)
     span = allowed.translation
-    assert span.most_stiffness(0.0) == pytest.approx(2 * span.damping / T, rel=1e-9)
+    assert span.max_stiffness(0.0) == pytest.approx(2 * span.damping / T, rel=1e-9)
     assert "(assumed; it is unknown)" in allowed.reason()
     assert "assumed" not in allowance().reason()
 
@@ -93,7 +93,7 @@ def test_the_softest_coupling_shows_the_whole_force_unless_the_run_began_softer(
     soft = replace(allowance(damping=50.0), start=began)
     # 10 N within 0.2 m, or a share of the stiffest
     for allowed, least in ((hard, max(10.0 / 0.2, 0.05 * 4000)), (soft, 300.0)):
-        assert allowed.translation.least_stiffness == pytest.approx(least)
+        assert allowed.translation.min_stiffness == pytest.approx(least)
         allowed.translation.check(least, 0.0)
         with pytest.raises(CommandError, match="no longer feels"):
             allowed.translation.check(0.999 * least, 0.0)
@@ -139,7 +139,7 @@ OFF, ON = Switch(force=False), Switch(force=True)
     [
         ("implicit", True, [(0, OFF), (0.99 * INTERVAL, ON)], "too recent"),
         ("implicit", True, [(0, Reset()), (0.99 * RESET_INTERVAL, Reset())], "too recent"),
-        ("implicit", True, [(1.0, ON)] * MOST_WAITING + [(1.0, OFF)], "it stalls"),
+        ("implicit", True, [(1.0, ON)] * MAX_WAITING + [(1.0, OFF)], "it stalls"),
         ("implicit", False, [(0, Mark())], "not recorded"),
         ("direct", True, [(0, Reset())], "massless tool"),
     ],

@@ -119,8 +119,8 @@ def test_block_load_is_read_back(layout: Mapping[str, Report], usage: int, is_th
     assert (reports.loaded(answer)[0] == LOADED) is is_there
     assert reports.loaded(layout["load"].packed(index=4, status=0))[0] is None
     assert FULL == PID | 0x8D
-    assert reports.most_effects(layout["pool"].packed(most=2)) == 2
-    assert reports.most_effects(layout["pool"].packed(most=0)) is None
+    assert reports.max_effects(layout["pool"].packed(most=2)) == 2
+    assert reports.max_effects(layout["pool"].packed(most=0)) is None
 
 
 def test_flags_do_for_choices_where_a_device_has_flags() -> None:

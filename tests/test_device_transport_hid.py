@@ -240,7 +240,7 @@ def test_log_holds_what_went_over_wire(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_full_log_keeps_newest_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticbridge.device.transport.trace.MOST_LINES", 2)
+    monkeypatch.setattr("hapticbridge.device.transport.trace.MAX_LINES", 2)
     log = HexLog(tmp_path / "wire.log")
     for i in range(5):
         log.add(">", bytes([i]))

@@ -191,7 +191,7 @@ def test_packets_come_whole_and_as_they_are(opened: Open) -> None:
 
 
 def test_packets_not_taken_are_bounded(opened: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticbridge.device.transport.usb.MOST_PACKETS", 3)
+    monkeypatch.setattr("hapticbridge.device.transport.usb.MAX_PACKETS", 3)
     link = opened(Host(falcon()))
     enter_run_mode(link)
     time.sleep(0.1)  # the bridge reports its status every millisecond

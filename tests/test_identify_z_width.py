@@ -25,7 +25,7 @@ def clocked(device: SimulatedDevice) -> SimulatedClock:
 
 
 def limit_of(device: SimulatedDevice, damping: float, most: float = 1e6) -> MeasuredLimit:
-    how: Any = {"first_stiffness": 200.0, "most_stiffness": most, "force": 5.0}
+    how: Any = {"first_stiffness": 200.0, "max_stiffness": most, "force": 5.0}
     return measure_limit(device, clocked(device), damping=damping, period=PERIOD, **how)
 
 

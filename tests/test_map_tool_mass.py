@@ -20,7 +20,7 @@ from hapticbridge.lab.maps.tool_mass import (
     evaluate,
     felt,
     held_still,
-    least_mass,
+    min_mass,
     predicted_limit,
     worst_angle,
     worst_hand,
@@ -34,7 +34,7 @@ TWINS: dict[str, Integrator] = {"implicit": "implicit", "explicit": "semi_implic
 @pytest.mark.parametrize("method", TWINS)
 def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
     coupling, angle = Coupling(1000.0, 2.0, 0.0, 0.0), np.array([0.1, 1.0, 3.0])
-    assert least_mass(method, 1000.0, 2.0, 1e-3) == minimum_mass(coupling, 1e-3, TWINS[method])
+    assert min_mass(method, 1000.0, 2.0, 1e-3) == minimum_mass(coupling, 1e-3, TWINS[method])
     for mass in (0.005, 0.05):
         other = SampledLoop(coupling, 1e-3, mass=mass, integrator=TWINS[method])
         mine = felt(method, 1000.0, 2.0, mass, 1e-3, angle)
@@ -74,7 +74,7 @@ def largest_root(method: str, stiffness: float, damping: float, mass: float) -> 
 def test_a_tool_just_above_the_least_mass_is_stable_and_just_below_is_not(
     method: str, stiffness: float, damping: float
 ) -> None:
-    least = least_mass(method, stiffness, damping, 1e-3)
+    least = min_mass(method, stiffness, damping, 1e-3)
     if not np.isfinite(least):
         assert all(largest_root(method, stiffness, damping, m) > 1 for m in (1e-3, 0.1, 10.0))
     elif least == 0:
@@ -91,7 +91,7 @@ def test_a_tool_just_above_the_least_mass_is_stable_and_just_below_is_not(
 def test_behind_a_handle_held_still_a_method_fails_where_theory_says(
     method: str, stiffness: float
 ) -> None:
-    least = least_mass(method, stiffness, DAMPING, PERIOD)
+    least = min_mass(method, stiffness, DAMPING, PERIOD)
     failed = held_still(method, stiffness, 0.97 * least)
     assert not failed.is_stable
     assert failed.environment == "active"  # the ledger's port: what lies behind the coupling
@@ -185,4 +185,4 @@ def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
 
 def test_a_method_without_theory_is_refused() -> None:
     with pytest.raises(StudyError, match="no theory for method 'weld'"):
-        least_mass("weld", 1000.0, 1.0, 1e-3)
+        min_mass("weld", 1000.0, 1.0, 1e-3)

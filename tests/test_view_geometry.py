@@ -16,8 +16,8 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 
 
 from hapticbridge.view.geometry import (
-    MOST_SAMPLES,
-    MOST_TIMES,
+    MAX_SAMPLES,
+    MAX_TIMES,
     SHELL,
     Prop,
     Tendons,
@@ -111,9 +111,9 @@ def test_a_ray_from_any_side_meets_the_field_where_mujocos_ray_does(
 
 
 def test_a_fine_field_keeps_its_edge_and_a_coarse_one_its_facets() -> None:
-    _, prop = hills(MOST_SAMPLES + 1, 5)
+    _, prop = hills(MAX_SAMPLES + 1, 5)
     corners = prop.mesh.triangles.reshape(-1, 3)
-    assert len(np.unique(corners[:, 1])) == MOST_SAMPLES // 2 + 1
+    assert len(np.unique(corners[:, 1])) == MAX_SAMPLES // 2 + 1
     np.testing.assert_allclose(corners.max(axis=0)[:2], (RX, RY))
     np.testing.assert_allclose(corners.min(axis=0), (-RX, -RY, -BASE))
     _, prop = hills(6, 6)
@@ -248,7 +248,7 @@ def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> N
         np.testing.assert_allclose(start, seen.handle, atol=1e-6)
         np.testing.assert_allclose(end, seen.grip, atol=1e-6)
     else:
-        assert ghost.times == MOST_TIMES
+        assert ghost.times == MAX_TIMES
         # out of the box, which is turned by 20 degrees, on its side of 0.06 m or at its end
         out = min((0.06 + SHELL) / np.sin(np.radians(20)), 0.2 + SHELL + 0.05)
         assert 0.1 < start[2] - seen.handle[2] <= out
@@ -264,6 +264,6 @@ def test_a_stretch_is_drawn_as_long_as_there_is_room_in_round_numbers(
 ) -> None:
     times = enlargement(room, stretch)
     assert str(times).rstrip("0") in {"1", "2", "5"}
-    assert times <= MOST_TIMES
+    assert times <= MAX_TIMES
     assert times == 1 or times * stretch <= room * (1 + 1e-6)
-    assert times == MOST_TIMES or 2.5 * times * stretch > room * (1 - 1e-6)
+    assert times == MAX_TIMES or 2.5 * times * stretch > room * (1 - 1e-6)

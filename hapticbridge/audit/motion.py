@@ -14,7 +14,7 @@ from hapticbridge.record import TickFlag, has_flag
 Array = NDArray[np.float64]
 
 
-# Steps and rotations over rows.
+# Steps and rotations over rows
 
 
 def quaternion_product(a: Array, b: Array) -> Array:

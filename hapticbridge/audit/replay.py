@@ -113,7 +113,7 @@ def is_same_processor(recording: RecordingFile) -> bool:
         return True
 
 
-# Re-simulation.
+# Re-simulation
 
 DECISIVE = ("hapticbridge", "mujoco", "numba")
 """Packages whose versions must match for a repetition to the bit."""
@@ -255,7 +255,7 @@ def obstacle(recording: RecordingFile) -> str:
     return f"the file has no attachment '{missing[0]}'" if missing else ""
 
 
-# Comparison.
+# Comparison
 
 NOT_RUN = "not re-simulated"
 

@@ -69,13 +69,13 @@ def _shorten(reason: object) -> str:
     return rest[:200] if mark and head.startswith("tick ") else text[:200]
 
 
-# Energies over the whole recording.
+# Energies over the whole recording
 
 _RECORDED = ("kinetic", "potential", "actuator_work", "external_work")
 
 
 @dataclass(slots=True)
-class PassivityVerdict:
+class PassivityTally:
     """Energies of a recording against their bounds, collected block by block.
 
     Attributes:
@@ -127,12 +127,10 @@ def _first(
     return None if row is None else (start + row, float(joules[row]))
 
 
-# Decision.
+# Decision
 
 
-def decide(
-    fault: Fault | None, energies: PassivityVerdict | None, *, strict: bool
-) -> dict[str, Any]:
+def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool) -> dict[str, Any]:
     """Decides between ``passive``, ``active`` and ``invalid``.
 
     Args:
@@ -184,7 +182,7 @@ def decide(
         }
     (tick, joules), limit = (
         active or unstrict,
-        "its slack" if active else "(14), asked for strictly",
+        "its slack" if active else "zero, the strict limit,",
     )
     return {
         "verdict": "active",
@@ -197,7 +195,7 @@ def decide(
     }
 
 
-# Audit of one file.
+# Audit of one file
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
@@ -225,7 +223,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         facts["unchecked"] = _unchecked(run)
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
         if fault is None:
-            energies = PassivityVerdict(is_watched=facts["certified"] is not True)
+            energies = PassivityTally(is_watched=facts["certified"] is not True)
             fault, facts["duration"] = _check_records(recording, run, energies)
             facts["energies"] = energies.energies
             facts["rendered"] = rendered + run.events.sentences(energies.commanded)
@@ -247,7 +245,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
 
 
 def _check_records(
-    recording: RecordingFile, run: RecordedRun, energies: PassivityVerdict
+    recording: RecordingFile, run: RecordedRun, energies: PassivityTally
 ) -> tuple[Fault | None, float]:
     """Compares all records with their second computation and collects their energies.
 

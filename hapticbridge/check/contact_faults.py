@@ -25,14 +25,14 @@ from hapticbridge.scene.contacts import (
     tool_geoms,
 )
 
-LEAST_PUSH = 1.0
+MIN_PUSH = 1.0
 """Smallest force in N that contacts are tested with: a light touch. A motion without contact does
 not stretch the coupling, so it gives no test force."""
 
 MUJOCO_SOLREF = (0.02, 1.0)
 """Default ``solref`` of a MuJoCo geom."""
 
-_LEAST_FRICTION = float(mujoco.mjMINMU)
+_MIN_FRICTION = float(mujoco.mjMINMU)
 _TYPICAL_INERTIA = 0.1  # kg; for pairs of which neither side moves by itself
 
 
@@ -79,11 +79,11 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
 def push_of(case: SceneUnderCheck) -> float:
     """Returns the force in N that contacts are tested with.
 
-    It is the largest coupling force in the motion, at least ``LEAST_PUSH`` and at most the device's
+    It is the largest coupling force in the motion, at least ``MIN_PUSH`` and at most the device's
     force limit.
     """
     largest = float(case.observation.force.max()) if case.observation else 0.0
-    return min(max(largest, LEAST_PUSH), max(case.info.force_limit, LEAST_PUSH))
+    return min(max(largest, MIN_PUSH), max(case.info.force_limit, MIN_PUSH))
 
 
 def _rooms(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> dict[tuple[int, int], float]:
@@ -163,7 +163,7 @@ def _edges(model: mujoco.MjModel, setting: ContactSetting) -> float:
     for friction μ and a contact with equal inertia along the normal and the tangents: 198 at μ =
     0.1, 1 at μ = 1 and dim = 3. Measured with MuJoCo at rest, to 9 digits.
     """
-    friction = max(setting.friction, _LEAST_FRICTION)
+    friction = max(setting.friction, _MIN_FRICTION)
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL or setting.condim == 1:
         return 1.0
     return (setting.condim - 1) / (friction**2 * (1 + friction**2))
@@ -209,7 +209,7 @@ def _numbers(values: tuple[float, ...]) -> str:
     return f'"{" ".join(f"{value:g}" for value in values)}"'
 
 
-# Faults of contacts at the start, and of contact margins.
+# Faults of contacts at the start, and of contact margins
 
 
 def margin_faults(case: SceneUnderCheck) -> Iterator[Fault]:

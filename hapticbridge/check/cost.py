@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Statistics of tick times.
+# Statistics of tick times
 
-LEAST_GROUP = 20
+MIN_GROUP = 20
 """Smallest number of ticks with one count whose median is used."""
 
 
@@ -83,7 +83,7 @@ def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
     steps = []
     for count in np.unique(counts).tolist():
         those = times[counts == count]
-        if those.size >= LEAST_GROUP:
+        if those.size >= MIN_GROUP:
             steps.append((int(count), int(those.size), float(np.median(those))))
     if len(steps) < 2:
         return Growth(tuple(steps), None, None)
@@ -262,10 +262,10 @@ def _median(times: NDArray[np.float64]) -> float:
     return float(np.median(times)) if times.size else float("nan")
 
 
-# Plot of a scene's cost.
+# Plot of a scene's cost
 
 _FREE, _CONTACT, _LINE = "tab:blue", "tab:orange", "0.3"
-_LEAST_SHARE = 0.01  # of the tick; smaller stages are not drawn
+_MIN_SHARE = 0.01  # of the tick; smaller stages are not drawn
 
 
 def _known(seconds: float) -> float:
@@ -281,7 +281,7 @@ def draw_cost(cost: Cost, title: str) -> Figure:
     drawn = {
         name: times
         for name, times in cost.stages.items()
-        if name == BRIDGE or max(map(_known, times)) >= _LEAST_SHARE * whole
+        if name == BRIDGE or max(map(_known, times)) >= _MIN_SHARE * whole
     }
     places = range(len(drawn))
     kinds = ((0, "out of contact", cost.free, _FREE), (1, "in contact", cost.contact, _CONTACT))
@@ -326,7 +326,7 @@ def draw_cost(cost: Cost, title: str) -> Figure:
     return figure
 
 
-# Costs of two versions measured side by side.
+# Costs of two versions measured side by side
 
 CHUNKS = 40
 """Number of stretches into which a motion is cut. The two versions take turns after each, so that a

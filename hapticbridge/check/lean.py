@@ -32,7 +32,7 @@ from hapticbridge.scene import SceneSource
 
 # Judgement of one version of a scene.
 
-LEAST_SAVING = 0.05
+MIN_SAVING = 0.05
 """Share of the cost that a simplification must save, without unit. On a busy machine a scene
 measured against itself differs by at most 1 %; where it differs by more, three times that
 difference counts. A larger share keeps more of the scene."""
@@ -86,7 +86,7 @@ class Judge:
         device_damping: b of the device in N s/m.
         rehearsal: Rehearsal of the original.
         seconds: Processor time of the original in s per second of motion.
-        least_saving: Share of the cost that counts as a saving, without unit.
+        min_saving: Share of the cost that counts as a saving, without unit.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Judge:
         self.rehearsal = original.rehearsed(motion)
         first, second = cost(original, original.copy(), motion)
         self.seconds = 0.5 * (first + second)
-        self.least_saving = max(LEAST_SAVING, 3.0 * abs(second / first - 1.0))
+        self.min_saving = max(MIN_SAVING, 3.0 * abs(second / first - 1.0))
 
     def judge(
         self,
@@ -144,7 +144,7 @@ class Judge:
             verdict = SAVES_NOTHING
         if not verdict:  # a refused version needs no thorough measurement
             before, after = self._cost(base or self.original, draft, self.motion)
-            verdict = MAY_GO if after <= (1.0 - self.least_saving) * before else SAVES_NOTHING
+            verdict = MAY_GO if after <= (1.0 - self.min_saving) * before else SAVES_NOTHING
             cost = share * after / before
         return VariantVerdict(
             name=name,
@@ -274,7 +274,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
             alone.append((each, found[1]))
     # a small saving of the whole may be a large share of the rest
     order = [pair for pair in alone if pair[1].verdict in (MAY_GO, SAVES_NOTHING)]
-    order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.least_saving]
+    order = [pair for pair in order if (pair[1].cost or 0.0) < 1.0 + judge.min_saving]
     # simplifications for this motion alone go last; they may turn out not to be needed
     order.sort(key=lambda pair: (pair[0].loses == OTHER_MOTIONS, pair[1].cost or 0.0))
     best, share, together = judge.original, 1.0, []

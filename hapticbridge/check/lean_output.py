@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 
-# Plot of cost against felt error.
+# Plot of cost against felt error
 
 
 _COLOURS = {
@@ -156,7 +156,7 @@ def _legend(points: list[tuple[str, VariantVerdict, str]], lean: Lean) -> list[L
     return [*handles, Line2D([], [], color="black", linestyle="--", label=budget)]
 
 
-# Results of a search as JSON facts and CSV.
+# Results of a search as JSON facts and CSV
 
 TABLE_ENDING = ".csv"
 
@@ -223,7 +223,7 @@ def lean_facts(lean: Lean, written: VariantVerdict | None = None) -> dict[str, o
         "budget_jnd": judge.budget,
         "motion_s": judge.motion.duration,
         "cost_s_per_tick": judge.seconds * judge.original.setting.period,
-        "least_saving": judge.least_saving,
+        "min_saving": judge.min_saving,
         "device_damping_ns_per_m": judge.device_damping,
         "environment": judge.rehearsal.environment,
         "alone": [trial_facts(trial) for trial in lean.alone],

@@ -39,7 +39,7 @@ FASTEST_CREEP, FASTEST_TURN = 1e-4, 1e-3
 off it. The shipped scenes creep by at most a fifth of it; MuJoCo's default creeps by about 5 mm/s
 at 5 N/kg."""
 
-LEAST_GIVE, LEAST_TURN = 1e-4, 1e-3
+MIN_GIVE, MIN_TURN = 1e-4, 1e-3
 """Penetration in m and rad above which a limit counts as soft, under the device's full force: 0.1
 mm, on the axis or 0.1 m off it. The limit of a heavy arm is stiff even with MuJoCo's default."""
 
@@ -150,7 +150,7 @@ def _depth_words(
     step = float(case.model.opt.timestep)
     push = case.info.force_limit if is_slide else case.info.torque_limit
     depth = depth_under(push, solref, solimp, inertia, step)
-    if depth < (LEAST_GIVE if is_slide else LEAST_TURN):
+    if depth < (MIN_GIVE if is_slide else MIN_TURN):
         return ""
     stiffness = constraint_stiffness(solref, solimp, inertia, step, depth)
     if is_slide:
@@ -171,7 +171,7 @@ def _numbers(values: Sequence[float]) -> str:
     return f'"{" ".join(f"{value:g}" for value in values)}"'
 
 
-# Faults of sizes and shapes: units, filled holes, a distant grip, a small device.
+# Faults of sizes and shapes: units, filled holes, a distant grip, a small device
 
 LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
 """Length in m and mass in kg above which no hand holds a tool, so that wrong units are

@@ -98,7 +98,7 @@ def _may_be_near(
     return np.asarray(apart <= reach[first] + reach[second] + FARTHEST, dtype=bool)
 
 
-# Kinematic trees joined to the tool.
+# Kinematic trees joined to the tool
 
 
 def reached_trees(model: mujoco.MjModel, tool: int, met: set[tuple[int, int]]) -> set[int]:
@@ -156,7 +156,7 @@ def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
     }
 
 
-# Rehearsal of a scene under a motion.
+# Rehearsal of a scene under a motion
 
 _UNLIMITED = 1e30
 """Force limit in N and torque limit in N m without effect, because the full force is compared."""
@@ -271,7 +271,7 @@ ROW_KINDS: dict[str, tuple[int, ...]] = {
 
 _PYRAMIDAL = int(_TYPE.mjCNSTR_CONTACT_PYRAMIDAL)
 
-LEAST_FORCE = 0.05
+MIN_FORCE = 0.05
 """Normal force in N above which a contact's stiffness is kept; a smaller force is not felt."""
 
 POSTURES = 100
@@ -290,7 +290,7 @@ class Meeting:
         deepest: Largest penetration in m; negative if they never overlapped.
         force: Largest normal force in N of one contact.
         inertia: Smallest effective inertia in kg at a contact, with the coupling's share h B' + h²
-            K; inf if no contact carried ``LEAST_FORCE``.
+            K; inf if no contact carried ``MIN_FORCE``.
         softest: Smallest stiffness in N/m of such a contact; inf without one.
         stiffest: Largest stiffness in N/m of such a contact; 0 without one.
     """
@@ -424,7 +424,7 @@ def _note_contacts(
         normal = float(data.efc_force[adr : adr + count].sum())
         meeting.deepest = max(meeting.deepest, depths[k])
         meeting.force = max(meeting.force, normal)
-        if normal >= LEAST_FORCE:
+        if normal >= MIN_FORCE:
             spring, damper, impedance, _ = data.efc_KBIP[adr].tolist()
             spring *= impedance
             regular = float(data.efc_R[adr]) * (1.0 + step * damper + step**2 * spring)

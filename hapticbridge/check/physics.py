@@ -53,7 +53,7 @@ def pose_in(frame: Array, pose: Array) -> Array:
     return found
 
 
-# Effective inertia of joints and bodies.
+# Effective inertia of joints and bodies
 
 
 def joint_inertia(model: mujoco.MjModel, data: mujoco.MjData, dof: int) -> float:

@@ -160,7 +160,7 @@ def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
     return Fault("energy created", place, sentence, change)
 
 
-# Rules by which a scene is judged.
+# Rules by which a scene is judged
 
 RULES = (
     option_faults,

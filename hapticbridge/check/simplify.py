@@ -190,14 +190,14 @@ def _exclude_idle_bodies(spec: mujoco.MjSpec, seen: MotionTrace) -> bool:
     return bool(new)
 
 
-# Simplifications of joints: fixed joints, and free joints replaced by their used axes.
+# Simplifications of joints: fixed joints, and free joints replaced by their used axes
 
 HARDLY_FAR, HARDLY_TURNED = 5e-4, 1e-2
 """Travel in m and rad up to which fixing a joint is tried. With a grip held by the default coupling
 (2400 N/m, 2.4 N m/rad) it amounts to 1.2 N and 24 mN m. The felt error decides; larger values would
 be tried in vain."""
 
-MOST_JOINTS = 8
+MAX_JOINTS = 8
 """Largest number of nearly still joints that are fixed one by one; more are fixed together."""
 
 _FREE, _BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
@@ -222,7 +222,7 @@ def freedom_simplifications(draft: SceneVariant, seen: MotionTrace) -> list[Simp
                 simpler += _replacements(str(joint.name), far, turned, seen)
         elif way.max() <= (HARDLY_FAR if joint.type == _SLIDE else HARDLY_TURNED):
             still.append(str(joint.name))
-    groups = [[name] for name in still] if len(still) <= MOST_JOINTS else [still]
+    groups = [[name] for name in still] if len(still) <= MAX_JOINTS else [still]
     return [_fixed(group, seen) for group in groups] + simpler
 
 
@@ -373,7 +373,7 @@ def _read_keys(model: mujoco.MjModel) -> Keys:
     ]
 
 
-# Primitive shapes fitted to a mesh.
+# Primitive shapes fitted to a mesh
 
 _GEOM = mujoco.mjtGeom
 
@@ -476,7 +476,7 @@ def _volume(kind: mujoco.mjtGeom, size: Array) -> float:
     return ball + (2.0 * math.pi * radius**2 * half if kind == _GEOM.mjGEOM_CAPSULE else 0.0)
 
 
-# Simplifications of shapes: fewer hull corners, primitives, no visual geoms.
+# Simplifications of shapes: fewer hull corners, primitives, no visual geoms
 
 HULL_CORNERS = (64, 32, 16, 8)
 """Numbers of corners to which convex hulls are limited in turn."""

@@ -11,7 +11,7 @@ import tyro
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart.catalogue import Extent, open_workload
-from hapticbridge.lab.chart.chart import LEAST_REPEATS, REPEATS, measure_chart
+from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, measure_chart
 from hapticbridge.lab.chart.engine_run import peer_settings
 from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
 from hapticbridge.lab.chart.setting import chosen_methods, chosen_periods, settings_for
@@ -71,7 +71,7 @@ class Chart:
         with caught_prints(_tell), progress(f"chart {workload.name}") as show:
             settings += peer_settings(self._peers(), periods)
             chart = measure_chart(
-                workload, settings, repeats=LEAST_REPEATS if self.quick else REPEATS, progress=show
+                workload, settings, repeats=MIN_REPEATS if self.quick else REPEATS, progress=show
             )
         files = write_chart(chart, paths)
         if self.as_json:

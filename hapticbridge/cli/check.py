@@ -160,7 +160,7 @@ def _numbers(trial: VariantVerdict) -> list[str]:
     ]
 
 
-MOST_NAMED = 4
+MAX_NAMED = 4
 """Number of things of a kind that are named; the rest is counted."""
 
 _SHOWN = 0.01  # s/s; a stage that takes less of the tick is left out
@@ -221,8 +221,8 @@ def print_inventory(inventory: Inventory) -> None:
     if reasons:
         out.print("  cannot be felt")
     for reason, names in reasons.items():
-        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        out.print(f"    {reason}: {plain(', '.join(names[:MOST_NAMED]))}{more}")
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        out.print(f"    {reason}: {plain(', '.join(names[:MAX_NAMED]))}{more}")
 
 
 def print_cost(cost: Cost | None) -> None:
@@ -258,7 +258,7 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
     seen: Counter[str] = Counter()
     for number, fault in enumerate(faults, 1):
         seen[fault.kind] += 1
-        if seen[fault.kind] > MOST_NAMED:
+        if seen[fault.kind] > MAX_NAMED:
             continue
         out.print(f"  {number:>2} [yellow]{plain(fault.kind)}[/]  {plain(str(fault.place))}")
         # what stands in quotes is to be copied: it stays on one line
@@ -267,8 +267,8 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
             out.print(f"     {plain(line.replace(_GLUE, ' '))}")
         out.print(f"     [green]write:[/] {plain(fault.change)}")
     for kind, count in seen.items():
-        if count > MOST_NAMED:
-            out.print(f"  and {count - MOST_NAMED} more of '{plain(kind)}': --json lists all")
+        if count > MAX_NAMED:
+            out.print(f"  and {count - MAX_NAMED} more of '{plain(kind)}': --json lists all")
 
 
 def _medians(cost: Cost) -> tuple[float, float]:

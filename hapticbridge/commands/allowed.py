@@ -139,7 +139,7 @@ class AxisCouplingLimits:
             stiffness * float(np.interp(ratio, ratios, needs)) + float(needs[-1]) / highest * more
         )
 
-    def most_stiffness(self, damping: float) -> float:
+    def max_stiffness(self, damping: float) -> float:
         """Returns the largest stiffness for a damping; 0 if there is none."""
         most = 4.0 * self.damping / (self.period * self.leverage)
         return _largest(most, lambda stiffness: self.needed(stiffness, damping), self.damping)
@@ -150,7 +150,7 @@ class AxisCouplingLimits:
         return _largest(most, lambda damping: self.needed(stiffness, damping), self.damping)
 
     @cached_property
-    def least_stiffness(self) -> float:
+    def min_stiffness(self) -> float:
         """Smallest selectable stiffness, at most that of the run's start.
 
         K >= F/(s · reach), because the guard stops a run whose coupling is too long before its
@@ -158,9 +158,9 @@ class AxisCouplingLimits:
         change of the damping alone would stiffen the coupling.
         """
         reach = self.leverage * self.reach
-        softest = SOFTEST * self.most_stiffness(0.0)
+        softest = SOFTEST * self.max_stiffness(0.0)
         if math.isfinite(reach):
-            softest = min(max(softest, self.effort / reach), self.most_stiffness(0.0))
+            softest = min(max(softest, self.effort / reach), self.max_stiffness(0.0))
         return min(softest, self.gains(self.start)[0])
 
     def check(self, stiffness: float, damping: float) -> None:
@@ -170,7 +170,7 @@ class AxisCouplingLimits:
             CommandError: The message names the excessive value and the bound.
         """
         (unit, damper), prefix = UNITS[self.axis], _PREFIX[self.axis]
-        least = self.least_stiffness
+        least = self.min_stiffness
         if stiffness < least * (1.0 - 1e-9):
             raise CommandError(
                 f"{prefix}stiffness is {stiffness:g} {unit}; below {least:.4g} {unit} a hand no "

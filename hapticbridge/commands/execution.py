@@ -1,4 +1,4 @@
-"""Thread-safe queue of validated, rate-limited commands."""
+"""Queue of validated, rate-limited commands, their execution and their repetition."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class EventApplier:
             self._binding.handle_reset()
 
 
-MOST_WAITING = 8
+MAX_WAITING = 8
 """Largest number of waiting commands. The loop takes one per tick; more waiting ones mean that it
 stalls."""
 
@@ -132,7 +132,7 @@ class CommandQueue:
 
     Any thread may ``offer``; only the loop takes. The loop tests whether ``waiting`` is empty,
     which needs no lock and no allocation, and pops from its left end, which the interpreter does
-    atomically. The queue holds at most ``MOST_WAITING`` commands.
+    atomically. The queue holds at most ``MAX_WAITING`` commands.
 
     Args:
         limits: Limits of the coupling on the device.
@@ -153,7 +153,7 @@ class CommandQueue:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits, self.now = limits, now
-        self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MOST_WAITING)
+        self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MAX_WAITING)
         self._is_recorded = is_recorded
         self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
@@ -162,7 +162,7 @@ class CommandQueue:
         """Computes the tables of limits in advance, so that the first command is not slow."""
         if self.limits.method.has_law:
             for span in self.limits.spans:
-                span.needed(span.least_stiffness, 0.0)
+                span.needed(span.min_stiffness, 0.0)
 
     def offer(self, command: Command, by: str) -> None:
         """Adds a command, or refuses it.
@@ -183,7 +183,7 @@ class CommandQueue:
             )
             if early > 0:
                 raise CommandError(f"the last command is too recent; try again in {early:.2f} s")
-            if len(self.waiting) >= MOST_WAITING:
+            if len(self.waiting) >= MAX_WAITING:
                 raise CommandError("the loop takes no commands because it stalls; try again later")
             self._last = now
             if is_reset:
@@ -199,7 +199,7 @@ class CommandQueue:
             raise CommandError("this run is not recorded; start it with a recording to mark it")
 
 
-# Execution of waiting commands, in order and at their ticks.
+# Execution of waiting commands, in order and at their ticks
 
 NoteEvent = Callable[..., None]
 

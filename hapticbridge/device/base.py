@@ -1,4 +1,4 @@
-"""Protocol of a haptic device: four calls."""
+"""Protocol of a haptic device: four calls and a data sheet."""
 
 from __future__ import annotations
 

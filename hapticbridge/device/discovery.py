@@ -58,7 +58,7 @@ def udev_rules() -> str:
         lines += ["", f"# {family.name}: {family.about}"]
         ids = family.ids if family.recognises is None else _ids_plugged_in(family)
         if not ids:
-            lines.append("# none is plugged in: plug it in, and write these rules again")
+            lines.append("# none is connected: plug it in, and write these rules again")
         for usb_id in ids:
             vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
             if family.transport == "hid":

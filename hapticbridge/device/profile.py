@@ -220,7 +220,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-# Search of profiles: the user's own take precedence over shipped ones.
+# Search of profiles: the user's own take precedence over shipped ones
 
 SHIPPED = Path(__file__).parent / "profiles"
 

@@ -45,7 +45,7 @@ def all_families() -> tuple[Driver, ...]:
     return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)
 
 
-# Options of a device specification: ``name=value,name=value``.
+# Options of a device specification: ``name=value,name=value``
 
 FILES = ("path",)
 """Options that take all remaining text as a file's name, commas included."""

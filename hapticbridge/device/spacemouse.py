@@ -66,13 +66,13 @@ c654 to c658, c664, c665, c668) are two-dimensional mice and are left out. Sourc
 December 2025 and pyspacemouse of June 2026."""
 
 
-# Input reports of a SpaceMouse.
+# Input reports of a SpaceMouse
 
 FULL_SCALE = 350
 """Counts at full deflection of the puck (spacenavd, 2025). Slightly larger counts can come and are
 clamped."""
 
-MOST_BUTTON_BYTES = 6
+MAX_BUTTON_BYTES = 6
 """Bytes of buttons that are read. A SpaceMouse Enterprise has 31 buttons; 48 bits fit into a
 record's integer."""
 
@@ -119,7 +119,7 @@ def decoded(report: bytes) -> Deflection | Buttons | None:
         return None
     number = report[0]
     if number == _BUTTONS:
-        return Buttons(int.from_bytes(report[1 : 1 + MOST_BUTTON_BYTES], "little"))
+        return Buttons(int.from_bytes(report[1 : 1 + MAX_BUTTON_BYTES], "little"))
     if number == _TRANSLATION and len(report) >= 1 + _SIX.size:
         return Deflection(0, _SIX.unpack_from(report, 1))
     if number in (_TRANSLATION, _ROTATION) and len(report) >= 1 + _THREE.size:

@@ -225,7 +225,7 @@ def lissajous(time: float) -> tuple[Vector, Quaternion]:
     )
 
 
-# Motion from a CSV file.
+# Motion from a CSV file
 
 
 def read_motion(path: str | os.PathLike[str]) -> Motion:

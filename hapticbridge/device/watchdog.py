@@ -1,4 +1,4 @@
-"""Watchdog timeouts between host and device."""
+"""Watchdogs between host and device: timeouts, and a process that ends the force."""
 
 from __future__ import annotations
 

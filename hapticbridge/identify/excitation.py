@@ -21,12 +21,12 @@ encoder resolves; below 0.7 Hz a run of 12 s holds too few swings."""
 
 SLOW_PERIOD = 0.003
 """Loop period in s above which all times of a run are stretched in proportion. A window of the fit
-needs ``LEAST_SAMPLES`` periods within half a swing, so slower loops need slower motion."""
+needs ``MIN_SAMPLES`` periods within half a swing, so slower loops need slower motion."""
 
 _TILT, _SLOW_TILT = -0.3, -1.0
 """Exponents of a tone's amplitude over its frequency, without unit. With the first, all tones move
 a damped axis by similar amounts. The second, for slow loops, favours low tones; otherwise swings
-would be too short for ``LEAST_SAMPLES``."""
+would be too short for ``MIN_SAMPLES``."""
 
 START_SHARE = 0.03
 """Initial amplitude as a share of the force limit, without unit. It grows until the axis moves."""

@@ -84,7 +84,7 @@ def half_widths(columns: Array, right: Array) -> Array:
     return np.asarray(np.sqrt(spread) * student.ppf(0.5 + 0.5 * CONFIDENCE, BLOCKS - 1))
 
 
-# Identified parameters of one device axis.
+# Identified parameters of one device axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +133,14 @@ class AxisFit:
         )
 
 
-# Weak form of the equation of motion of one axis.
+# Weak form of the equation of motion of one axis
 
 _BUMP = Polynomial([0.0, 4.0, -4.0]) ** 6
 """Bump φ over a window of unit length, 1 in its middle. The ends of a window cause an error in sums
 of φ'' x that resembles damping. With the 4th power it was 0.06 % of force over speed at 40 samples
 a window and 1.5 % at 16; with the 6th 0.003 % and 0.17 %. Higher powers use less of a window."""
 
-LEAST_SAMPLES = 24
+MIN_SAMPLES = 24
 """Smallest number of periods in a window. The error of the sums is then below 0.03 %
 (``_BUMP``)."""
 
@@ -165,7 +165,7 @@ _ROUNDING = 0.4
 _SURE = 2.0
 """Multiple of its own RMS by which a difference of two means must exceed zero, without unit."""
 
-LEAST_STEPS = 6
+MIN_STEPS = 6
 """Smallest number of steps of resolution that a window must cross. Noise counts as a step of √12
 times its RMS. Below this number rounding is no longer small beside the motion."""
 
@@ -228,12 +228,12 @@ def windows(
         position: x in m (or an angle in rad) at the samples, shape (n,).
         force: F in N (or N m), held from each sample to the next, shape (n,).
         period: T in s.
-        length: Length of a window in s; at least ``LEAST_SAMPLES`` periods.
+        length: Length of a window in s; at least ``MIN_SAMPLES`` periods.
         resolution: Step of the position in m, 0 if it is exact.
         delay: d in s, from a write until the force acts, >= 0.
         noise: RMS of the position's noise in m, beyond its rounding; 0: none.
     """
-    count = max(round(length / period), LEAST_SAMPLES)
+    count = max(round(length / period), MIN_SAMPLES)
     length = count * period
     nodes = np.arange(count + 1) / count
     trapezoid = np.full(count + 1, period)
@@ -309,7 +309,7 @@ def _direction(x: Array, trembling: float) -> Array:
     lengths = np.diff(edges)
     steps = np.diff(np.add.reduceat(x, edges[:-1], axis=1) / lengths, axis=1)
     margin = _SURE * trembling * np.sqrt(2.0 / lengths.min())
-    is_long = np.abs(x[:, -1] - x[:, 0]) >= LEAST_STEPS * np.sqrt(12.0) * trembling
+    is_long = np.abs(x[:, -1] - x[:, 0]) >= MIN_STEPS * np.sqrt(12.0) * trembling
     up, down = (steps > margin).all(axis=1), (steps < -margin).all(axis=1)
     return np.where(is_long, up.astype(np.float64) - down.astype(np.float64), 0.0)
 
@@ -333,10 +333,10 @@ LENGTHS = (0.04, 0.06, 0.09, 0.13, 0.2)
 the position's rounding dominates; long ones find too few stretches in one direction. Loops below
 333 Hz stretch them (``stretch``)."""
 
-LEAST_WINDOWS = 60
+MIN_WINDOWS = 60
 """Smallest number of windows: five in each of ``BLOCKS``. Fewer do not show their scatter."""
 
-MOST_NOISE = 0.005
+MAX_NOISE = 0.005
 """Largest usable ``noise_share``, without unit. Below it all intervals grow by its share of the
 applied force. With 0.03, one good motor in thirty was reported as saturated."""
 
@@ -344,7 +344,7 @@ DELAY_ERROR = 1e-5
 """Half-width in s added to every delay, for errors common to all parts of a run: a hundredth of a
 tick at 1 kHz."""
 
-MOST_DELAY = 0.02
+MAX_DELAY = 0.02
 """Largest delay in s of the search. A device with more delay is of no use for haptics."""
 
 _ROUNDS = 12
@@ -406,7 +406,7 @@ def _fitted(
 ) -> AxisFit | None:
     def found_at(delay: float) -> Windows | None:
         found = windows(position, force, period, length, resolution, delay, noise)
-        is_usable = len(found.begin) >= LEAST_WINDOWS and found.noise_share <= MOST_NOISE
+        is_usable = len(found.begin) >= MIN_WINDOWS and found.noise_share <= MAX_NOISE
         return found if is_usable else None
 
     delay, found = 0.0, found_at(0.0)
@@ -414,7 +414,7 @@ def _fitted(
         if found is None:
             return None
         change = solved(found.columns, found.right)[_DELAY]
-        before, delay = delay, float(np.clip(delay + change, 0.0, MOST_DELAY))
+        before, delay = delay, float(np.clip(delay + change, 0.0, MAX_DELAY))
         found = found_at(delay)
         if abs(delay - before) < 1e-9:
             break

@@ -174,9 +174,9 @@ def _fault_message(code: int, s: np.void) -> str:
     )
 
 
-# Position resolution, found from positions.
+# Position resolution, found from positions
 
-MOST_STEPS = 2_000_000
+MAX_STEPS = 2_000_000
 """Largest number of steps in the travel. A smaller step counts as rounding of a double or a
 float."""
 
@@ -195,7 +195,7 @@ def step_of(position: Array) -> float:
         return 0.0
     gaps = np.diff(values)
     span = float(values[-1] - values[0])
-    gaps = gaps[gaps > span / MOST_STEPS]  # smaller gaps are equal positions rounded differently
+    gaps = gaps[gaps > span / MAX_STEPS]  # smaller gaps are equal positions rounded differently
     if not gaps.size:
         return 0.0
     step = float(gaps.min())
@@ -237,7 +237,7 @@ LOST_GAIN = 0.05
 PRECISION = 0.2
 """Largest usable half-width of the mass, relative to its value, without unit."""
 
-MOST_STALE = 0.5
+MAX_STALE = 0.5
 """Largest share of ticks without a new sample, without unit. Beyond it the loop is too fast for the
 device."""
 
@@ -363,7 +363,7 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
     turns = len(run.axis) == 2
     unit, spring_unit = ("N m", "N m/rad") if turns else ("N", "N/m")
     where = f"axis {run.axis}"
-    if run.stale > MOST_STALE:
+    if run.stale > MAX_STALE:
         raise IdentificationError(
             f"{where}: {run.stale:.0%} of the ticks brought no new sample; choose a rate near the "
             "device's own"

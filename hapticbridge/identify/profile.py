@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Plot of the identified law: resistance of each axis over its speed.
+# Plot of the identified law: resistance of each axis over its speed
 
 
 _COLOURS = {"x": "#a51d2d", "y": "#1b7837", "z": "#1a5fb4"}

@@ -142,7 +142,7 @@ class MeasuredLimit:
     Attributes:
         damping: B in N s/m.
         borne: Largest K in N/m whose swing decayed, 0 if none did.
-        not_borne: Smallest K in N/m whose swing did not decay; None if ``most_stiffness`` was
+        not_borne: Smallest K in N/m whose swing did not decay; None if ``max_stiffness`` was
             borne.
         trials: All trials, in order.
     """
@@ -167,7 +167,7 @@ def measure_limit(
     force: float,
     axis: str = "x",
     first_stiffness: float,
-    most_stiffness: float,
+    max_stiffness: float,
     precision: float = 0.02,
     progress: Callable[[float], None] | None = None,
 ) -> MeasuredLimit:
@@ -181,7 +181,7 @@ def measure_limit(
         force: Largest force in N.
         axis: One of x, y, z that the device has.
         first_stiffness: First trial K in N/m, > 0.
-        most_stiffness: Largest trial K in N/m.
+        max_stiffness: Largest trial K in N/m.
         precision: Relative width at which the bisection of K ends.
         progress: Called before each trial with its stiffness.
 
@@ -212,9 +212,9 @@ def measure_limit(
     borne, stiffness = 0.0, first_stiffness
     while is_borne(stiffness):
         borne = stiffness
-        if stiffness >= most_stiffness:
+        if stiffness >= max_stiffness:
             return MeasuredLimit(damping, borne, None, tuple(trials))
-        stiffness = min(STEP_UP * stiffness, most_stiffness)
+        stiffness = min(STEP_UP * stiffness, max_stiffness)
     not_borne = stiffness
     # if even the first wall is too stiff, search down to a hundredth of it
     while not_borne - borne > precision * not_borne and not_borne > 0.01 * first_stiffness:
@@ -305,12 +305,12 @@ def _silence(device: Device) -> None:
         return
 
 
-# Measured and predicted Z-width of a device.
+# Measured and predicted Z-width of a device
 
 SHARES = (0.0, 0.15, 0.3, 0.5, 0.75)
 """Trial dampings as shares of the largest damping that is passive for any hand, without unit."""
 
-FIRST_SHARE, MOST_SHARE = 0.2, 6.0
+FIRST_SHARE, MAX_SHARE = 0.2, 6.0
 """Start and end of each search as shares of the predicted stiffness at B = 0, without unit. A free
 device bears up to three times the stiffness that is safe for any hand."""
 
@@ -379,7 +379,7 @@ def measure_width(
                 force=force_share * device.info.force_limit,
                 axis=axis,
                 first_stiffness=FIRST_SHARE * float(z.limit[0]),
-                most_stiffness=MOST_SHARE * float(z.limit[0]),
+                max_stiffness=MAX_SHARE * float(z.limit[0]),
                 progress=report,
             )
         )

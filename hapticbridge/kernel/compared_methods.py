@@ -12,8 +12,8 @@ Massless: the tool is placed at the handle and pushed back by one frictionless s
 with p the penetration in m, n the contact's normal, K_c the contact stiffness in N/m. The tool has
 no mass, so the hand's wrench on it is minus the sum of the contacts' wrenches.
 
-To add a method, give it a ``Scheme``, its branch in ``drive_compared`` and ``compared_wrench``, and
-register it (``hapticbridge.lab.methods``).
+A method with a scheme that exists is registered in ``hapticbridge.lab.methods`` alone. A new scheme
+needs an entry in ``codes.Scheme`` and its branch in ``drive_compared`` and ``compared_wrench`` too.
 """
 
 from __future__ import annotations

@@ -409,7 +409,7 @@ def _solver_iterations(s: State) -> int:
 
 @compiled
 def _record(s: State, row: NDArray[np.void]) -> None:
-    """Copies the results of the tick into its record; a new field needs one line here."""
+    """Copies the results of the tick into its record; see ``record.TICK_DTYPE``."""
     r, loop, energy = row[0], s.loop, s.energy
     r.flags = loop.flags
     r.contacts = loop.active_contacts

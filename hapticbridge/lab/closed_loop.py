@@ -91,11 +91,11 @@ FLOOR = 1e-6
 """Signal in N that counts as zero. MuJoCo's solver leaves 3e-8 N on a free mass at its default
 tolerance, whatever the motion."""
 
-LEAST_TICKS = 50
+MIN_TICKS = 50
 """Smallest number of ticks of a run. A fifth of it is the window in which a decay is looked for,
 and ten samples are the fewest that show one."""
 
-MOST_TICKS = 10**9
+MAX_TICKS = 10**9
 """Largest number of ticks of a run. Beyond it the signal alone would not fit into memory."""
 
 _ARGUMENTS = Arguments(StudyError)
@@ -177,7 +177,7 @@ class ClosedLoop:
         Raises:
             HapticBridgeError: A value is out of range, or the method cannot render the scene.
         """
-        _ARGUMENTS.whole("ticks", ticks, least=LEAST_TICKS, most=MOST_TICKS)
+        _ARGUMENTS.whole("ticks", ticks, least=MIN_TICKS, most=MAX_TICKS)
         if knock is not None:
             knock = _ARGUMENTS.numbers("knock", knock, "m or rad")
             if knock.shape != (6,):

@@ -1,4 +1,4 @@
-"""Measurement, findings and verdict."""
+"""Fitness of this machine for the loop: measurement, findings and verdict."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def parsed(text: str) -> NDArray[np.int64] | None:
     return joined if joined.size else None
 
 
-# Properties of the machine that decide a loop's lateness.
+# Properties of the machine that decide a loop's lateness
 
 STOLEN_SHARE = 1e-3
 """Share of the measured time that a virtual machine's host may take, without unit. A millisecond
@@ -324,7 +324,7 @@ def _usb() -> Finding:
     return Finding(name, True, f"may be opened: {', '.join(map(str, plugged))}")
 
 
-# Wake-up times of the bridge's clock and of a bare sleep loop.
+# Wake-up times of the bridge's clock and of a bare sleep loop
 
 
 @dataclass(slots=True)

@@ -46,7 +46,7 @@ def stolen_time(proc: Path = Path("/proc")) -> float | None:
         return None
 
 
-# Statistics of a loop's lateness.
+# Statistics of a loop's lateness
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def lateness_of(late_ns: ArrayLike, missed: int) -> Lateness:
     )
 
 
-# Check that a scene's step fits into the period.
+# Check that a scene's step fits into the period
 
 STEPS, LONGEST = 50, 0.1
 """Largest number of timed steps, and time in s after which no further one starts. One interruption
@@ -162,7 +162,7 @@ def step_time(scene: Scene, method: Method) -> float:
     return float(np.median(times)) * 1e-9
 
 
-# Commands that grant refused requests.
+# Commands that grant refused requests
 
 PRIORITY = 80
 """Priority under SCHED_FIFO, 1 to 99. The kernel's interrupt threads run at 50, and the clock's

@@ -101,7 +101,7 @@ class FileBytes:
         return RecordingError(f"cannot read the recording {self._path}: {reason}")
 
 
-# Fields of one MCAP record.
+# Fields of one MCAP record
 
 
 class DamageError(Exception):

@@ -141,7 +141,8 @@ def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
 def record_dtype(schema: bytes) -> np.dtype[np.void] | None:
     """Returns the record that a schema of this or an earlier version describes, or None."""
     lines = schema.decode(errors="replace").splitlines()
-    lacking = [name for name in LATER_FIELDS if f"float64 {name}" not in lines]
+    described = {line.rpartition(" ")[2] for line in lines}
+    lacking = [name for name in LATER_FIELDS if name not in described]
     names = [name for name in TICK_DTYPE.names or () if name not in lacking]
     record = np.dtype([(name, TICK_DTYPE[name]) for name in names])
     return record if tick_schema(record) == schema else None

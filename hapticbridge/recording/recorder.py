@@ -60,7 +60,7 @@ class RingObserver(Protocol):
         """Stops reading; must not raise."""
 
 
-# Completion of a recording whose recorder died.
+# Completion of a recording whose recorder died
 
 
 def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, object]]) -> str:
@@ -318,9 +318,9 @@ def _set_blocking(stream: IO[bytes], is_blocking: bool) -> None:
         os.set_blocking(stream.fileno(), is_blocking)
 
 
-# Bridge's end of a recording.
+# Bridge's end of a recording
 
-RING_SECONDS, MOST_RECORDS = 8.0, 1 << 16
+RING_SECONDS, MAX_RECORDS = 8.0, 1 << 16
 """Capacity of the ring in s, and at most in records of 400 bytes: the lag of the recorder before a
 record is lost. A trip's exception carries its last second."""
 
@@ -376,7 +376,7 @@ class RecordStream:
     ) -> None:
         self._path, self._is_live, self._is_lossless = path, live, is_lossless
         self._is_read = path is not None or live
-        capacity = min(round(RING_SECONDS / period), MOST_RECORDS)
+        capacity = min(round(RING_SECONDS / period), MAX_RECORDS)
         self._observer, self._snapshot = observer, snapshot
         is_shared = self._is_read or observer is not None
         self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)

@@ -20,7 +20,7 @@ SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
 of the tick's record in the ring, counted from the ring's start. The third is the number of
 contacts."""
 
-MOST_CONTACTS = 32
+MAX_CONTACTS = 32
 """Largest number of contacts in a picture; in a larger heap no single one can be distinguished."""
 
 _HEAD = 8
@@ -35,7 +35,7 @@ def snapshot_dtype(model: mujoco.MjModel) -> np.dtype[np.void]:
             ("qpos", "<f8", (model.nq,)),
             ("mocap_pos", "<f8", (model.nmocap, 3)),
             ("mocap_quat", "<f8", (model.nmocap, 4)),
-            ("contacts", "<f8", (MOST_CONTACTS, 2, 3)),
+            ("contacts", "<f8", (MAX_CONTACTS, 2, 3)),
         ]
     )
 
@@ -51,7 +51,7 @@ class Picture:
         mocap_pos: Positions of mocap bodies in m, (nmocap, 3).
         mocap_quat: Orientations of mocap bodies, (nmocap, 4).
         contacts: Position in m and force in N of each contact in the world frame, (n, 2, 3) with
-            n <= ``MOST_CONTACTS``.
+            n <= ``MAX_CONTACTS``.
     """
 
     number: int

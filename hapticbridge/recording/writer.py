@@ -82,7 +82,7 @@ class _Entries:
         stream.write(self._data)
 
 
-# Locked output file with reserved space.
+# Locked output file with reserved space
 
 if sys.platform != "win32":
     import fcntl

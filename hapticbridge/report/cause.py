@@ -66,7 +66,7 @@ def window_before(evidence: Evidence, report: AuditReport) -> slice | None:
     return slice(max(0, begin), report.tick + 1)
 
 
-# Stiffness, damping or rate that a device would bear.
+# Stiffness, damping or rate that a device would bear
 
 HALVINGS = 40
 """Number of bisections of a limit; the printed three digits need a third of them."""
@@ -149,7 +149,7 @@ def _three_digits(value: float, rounded: Callable[[float], int]) -> str:
     return f"{rounded(value / digit) * digit:.6g}"
 
 
-# Causes of unpaid energy at the device.
+# Causes of unpaid energy at the device
 
 COUNTED = 2.0
 """Largest step in multiples of the device's resolution, without unit. A smaller step between two
@@ -303,7 +303,7 @@ def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.flo
     return np.concatenate([np.zeros(missing), steps])
 
 
-# Geoms that touched while energy was created.
+# Geoms that touched while energy was created
 
 Pairs = dict[frozenset[int], float]
 """Share of the energy created while two geoms touched, by pair."""
@@ -336,7 +336,7 @@ def touched_pairs(
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-# Causes of energy created in the environment.
+# Causes of energy created in the environment
 
 FAST_TURN = 0.02
 """Rotation of the tool in rad per tick above which its gyroscopic torque is suspected. At 1 kHz, 50
@@ -446,7 +446,7 @@ def _moved_bodies(evidence: Evidence, window: slice) -> int:
     )
 
 
-# Search for the likely cause.
+# Search for the likely cause
 
 
 def likely_cause(evidence: Evidence, report: AuditReport) -> Cause | None:

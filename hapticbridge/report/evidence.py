@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Curves of a recording over time, reduced without loss of peaks.
+# Curves of a recording over time, reduced without loss of peaks
 
 
 BINS = 1500

@@ -20,10 +20,10 @@ from hapticbridge.units import format_si
 
 Facts = list[tuple[str, str]]
 
-MOST_EVENTS = 200
+MAX_EVENTS = 200
 """Largest number of events on a page."""
 
-MOST_INPUTS = 10
+MAX_INPUTS = 10
 """Largest number of inputs among them. A run with scripted inputs has one per tick, which would
 hide all other events."""
 
@@ -215,13 +215,13 @@ def percent(is_on: NDArray[np.bool_]) -> str:
 def event_rows(events: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, str]]:
     """Returns name, tick, time and details of events, in their order.
 
-    At most ``MOST_EVENTS`` events are kept, at most ``MOST_INPUTS`` of them inputs. Inputs are
+    At most ``MAX_EVENTS`` events are kept, at most ``MAX_INPUTS`` of them inputs. Inputs are
     dropped first, because they are many and the event that stopped a run is last.
     """
     is_input = [event.get("event") == "input" for event in events]
-    inputs = [index for index, each in enumerate(is_input) if each][:MOST_INPUTS]
+    inputs = [index for index, each in enumerate(is_input) if each][:MAX_INPUTS]
     others = [index for index, each in enumerate(is_input) if not each]
-    kept = sorted((others + inputs)[:MOST_EVENTS])
+    kept = sorted((others + inputs)[:MAX_EVENTS])
     return [_event(events[index]) for index in kept]
 
 

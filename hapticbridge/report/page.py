@@ -77,7 +77,7 @@ def write_page(path: Path, template: str, **variables: object) -> None:
         raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
 
 
-# First sentences of a page.
+# First sentences of a page
 
 PLACES = {
     "environment": "environment: the simulated scene, as the tool meets it",

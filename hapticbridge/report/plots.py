@@ -28,7 +28,7 @@ run has half a megabyte."""
 UNITS = ((1.0, "J"), (1e-3, "mJ"), (1e-6, "µJ"), (1e-9, "nJ"))
 """Units of energy on plots; below a nanojoule there is only rounding."""
 
-LEAST_SPAN = 1e-3
+MIN_SPAN = 1e-3
 """Smallest range of a panel's axis, in its own unit. A smaller range would magnify rounding
 noise."""
 
@@ -56,12 +56,12 @@ def bounded(axes: Axes, time: Array, energy: Array, allowed: Array, label: str) 
 def widen(axes: Axes) -> None:
     """Enforces a minimum axis range so that rounding noise is not magnified."""
     low, high = axes.get_ylim()
-    if high - low < LEAST_SPAN:
+    if high - low < MIN_SPAN:
         middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * LEAST_SPAN, middle + 0.5 * LEAST_SPAN)
+        axes.set_ylim(middle - 0.5 * MIN_SPAN, middle + 0.5 * MIN_SPAN)
 
 
-# Plot of each port's energy and its bound.
+# Plot of each port's energy and its bound
 
 _PORTS = (
     ("coupling_work", "coupling", "#0072b2"),
@@ -96,7 +96,7 @@ def draw_energies(evidence: Evidence) -> Figure:
     return figure
 
 
-# Plot of the ticks around a fault.
+# Plot of the ticks around a fault
 
 ZOOM = 60
 """Number of ticks shown before and after the moment."""
@@ -129,7 +129,7 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     return figure
 
 
-# Plot of force and pose.
+# Plot of force and pose
 
 
 def draw_motion(evidence: Evidence) -> Figure:
@@ -164,7 +164,7 @@ def draw_motion(evidence: Evidence) -> Figure:
     return figure
 
 
-# Plot of lateness and of active limits.
+# Plot of lateness and of active limits
 
 
 FLAGS = (

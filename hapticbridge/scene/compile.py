@@ -29,7 +29,7 @@ def custom_numbers(model: mujoco.MjModel, name: str) -> tuple[float, ...]:
     """Returns the custom numbers of a name, finite or not; empty if the scene has none.
 
     The bridge uses ``picture``, the time in s on the hand path at which the scene is drawn. It also
-    uses ``simulated_hand``, the hand that follows the path (``device.simulated.scene_hand``).
+    uses ``simulated_hand``, the hand that follows the path (``device.simulated.device``).
     """
     number_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     if number_id < 0:
@@ -38,7 +38,7 @@ def custom_numbers(model: mujoco.MjModel, name: str) -> tuple[float, ...]:
     return tuple(model.numeric_data[start : start + size].tolist())
 
 
-# Start of a scene, with the handle at the grip.
+# Start of a scene, with the handle at the grip
 
 START_KEYFRAME = "home"
 """Name of the keyframe that a scene starts from; without it a scene starts from ``qpos0``."""

@@ -194,7 +194,7 @@ def impedance_at(solimp: Sequence[float], depth: float) -> float:
     return float(start + rise * (last - start))
 
 
-# Concerns about a contact's setting, in words.
+# Concerns about a contact's setting, in words
 
 LOW_FRICTION = 0.4
 """Coefficient of sliding, without unit, below which a pyramidal cone counts as a risk. Measured
@@ -278,7 +278,7 @@ def contact_concerns(
     return concerns
 
 
-# Contacts of a scene, checked against the measured rule.
+# Contacts of a scene, checked against the measured rule
 
 
 class ContactSetting(NamedTuple):

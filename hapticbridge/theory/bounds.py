@@ -53,7 +53,7 @@ def coupled_stability_limit(
     return plain((available + own) / (period * (0.5 + delay)))
 
 
-# Device condition in several dimensions.
+# Device condition in several dimensions
 
 SYMMETRY = 1e-9
 """Largest asymmetry of a matrix that counts as rounding, relative to its largest entry, without
@@ -135,7 +135,7 @@ def matrix_margin(
     return margin if margin.ndim else float(margin)
 
 
-# Frequency at which a coupling requires the most device damping.
+# Frequency at which a coupling requires the most device damping
 
 SAME = 1e-9
 """Relative difference, without unit, below which an end of the band counts as the supremum: the

@@ -1,4 +1,4 @@
-"""Rigid body turning about its centre of mass, with four integrators."""
+"""Point mass, coupled mass and turning rigid body, with integrators of known energy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaterni
 
 # Argument checks of the reference mechanics.
 
-MOST_STEPS = 10**8
+MAX_STEPS = 10**8
 """Largest length of a run in steps: a day at 1 kHz, which still fits into memory."""
 
 _ARGUMENTS = Arguments(MechanicsError)
@@ -44,8 +44,8 @@ def step(period: float) -> float:
 
 
 def whole(name: str, value: int, least: int) -> int:
-    """Returns a whole number in [least, ``MOST_STEPS``], or raises MechanicsError."""
-    return _ARGUMENTS.whole(name, value, least=least, most=MOST_STEPS)
+    """Returns a whole number in [least, ``MAX_STEPS``], or raises MechanicsError."""
+    return _ARGUMENTS.whole(name, value, least=least, most=MAX_STEPS)
 
 
 def chosen(name: str, value: str, valid: Iterable[str]) -> str:
@@ -68,7 +68,7 @@ def spring_and_damper(coupling: Coupling) -> tuple[float, float]:
     )
 
 
-# Point mass under a prescribed force, with four integrators and their generated energy.
+# Point mass under a prescribed force, with four integrators and their generated energy
 
 Scheme = Literal["explicit", "semi_implicit", "implicit", "midpoint"]
 SCHEMES = ("explicit", "semi_implicit", "implicit", "midpoint")
@@ -170,7 +170,7 @@ def integrate_particle(
     return ParticleMotion(mass, np.broadcast_to(force, v.shape), x, v)
 
 
-# Point mass driven by a handle through the coupling, with four integrators.
+# Point mass driven by a handle through the coupling, with four integrators
 
 CoupledScheme = Literal["held", "implicit", "compensated", "midpoint"]
 COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")

@@ -82,7 +82,7 @@ def run(
     return int(force.size)
 
 
-# Passive hand that makes a sampled loop unstable first.
+# Passive hand that makes a sampled loop unstable first
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,7 +350,7 @@ class SampledLoop:
         return LoopMotion(force[:done], handle[:done], tool[:done])
 
 
-# Stability limit of a sampled loop from time-domain runs.
+# Stability limit of a sampled loop from time-domain runs
 
 SAMPLES = 60_000
 """Length of a run in samples over which a stable loop must decay. Two windows of a fifth of it are

@@ -179,7 +179,7 @@ def _value_of_system(
     return value
 
 
-# Supremum over frequency of the damping that a delayed coupling requires against a wall.
+# Supremum over frequency of the damping that a delayed coupling requires against a wall
 
 _Array = NDArray[np.float64]
 

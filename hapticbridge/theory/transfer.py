@@ -18,11 +18,11 @@ from hapticbridge.errors import CouplingError
 Axis = Literal["translation", "rotation"]
 """Kind of axis; it selects the pair of K and B."""
 
-MOST_DELAY = 50
+MAX_DELAY = 50
 """Largest delay in samples: 50 ms at 1 kHz, where a coupling is too soft to be useful. The time to
 compute a bound grows with its square."""
 
-MOST_SAMPLES = 10**8
+MAX_SAMPLES = 10**8
 """Largest length of a run or series in samples: a day at 1 kHz, which still fits into memory."""
 
 _ARGUMENTS = Arguments(CouplingError)
@@ -52,14 +52,14 @@ def finite(name: str, value: ArrayLike, unit: str = "") -> NDArray[np.float64]:
     return _ARGUMENTS.numbers(name, value, unit)
 
 
-def whole(name: str, value: int, least: int = 0, most: int = MOST_SAMPLES) -> int:
+def whole(name: str, value: int, least: int = 0, most: int = MAX_SAMPLES) -> int:
     """Returns a whole number of samples in [least, most], or raises CouplingError."""
     return _ARGUMENTS.whole(name, value, "samples", least=least, most=most)
 
 
 def delayed_by(value: int) -> int:
-    """Returns a delay of 0 to ``MOST_DELAY`` samples, or raises CouplingError."""
-    return whole("delay", value, most=MOST_DELAY)
+    """Returns a delay of 0 to ``MAX_DELAY`` samples, or raises CouplingError."""
+    return whole("delay", value, most=MAX_DELAY)
 
 
 def one_of(name: str, value: str, valid: Iterable[str]) -> str:

@@ -87,12 +87,12 @@ WALL = "passive against a wall"
 NO_LIMIT_CYCLES = "free of limit cycles"
 WITHOUT_HAND = "stable without a hand"
 
-LEAST_FRICTION_SHARE = 0.1
+MIN_FRICTION_SHARE = 0.1
 """Smallest f_c T/Δ, as a share of the device's damping b, at which friction counts as a limit,
 without unit. Below it a coupling free of limit cycles would be softer than a tenth of the passive
 one, so the result reports limit cycles instead. A larger value reports them earlier. Our choice."""
 
-MOST_POINTS = 100_000
+MAX_POINTS = 100_000
 """Largest number of values of B: far more than the pixels of a plot."""
 
 MARGIN_OF_RANGE = 1.25
@@ -184,7 +184,7 @@ def z_width(
     against a wall is necessary but not sufficient, and the energy meter must decide.
 
     The friction line holds for a loop without delay and low-pass; a low-pass makes the damper's
-    jumps smaller. It is required only if f_c T/Δ reaches ``LEAST_FRICTION_SHARE`` of b. Otherwise a
+    jumps smaller. It is required only if f_c T/Δ reaches ``MIN_FRICTION_SHARE`` of b. Otherwise a
     note announces limit cycles, which stay bounded while β = b/(K T) > ½, that is below the first
     line.
 
@@ -215,11 +215,11 @@ def z_width(
         delayed_by(delay),
         scalar("filter time", filter_time, "s"),
     )
-    count = whole("points", points, least=2, most=MOST_POINTS)
+    count = whole("points", points, least=2, most=MAX_POINTS)
     quantum = scalar("resolution", resolution, "m")
     allowed, of_friction = _friction(friction, quantum, loop)
     passive_damping = loop.largest_damping()
-    is_kept = (allowed or 0.0) >= LEAST_FRICTION_SHARE * loop.b
+    is_kept = (allowed or 0.0) >= MIN_FRICTION_SHARE * loop.b
     available = min(passive_damping, allowed) if allowed and is_kept else passive_damping
     grid = np.linspace(0.0, MARGIN_OF_RANGE * passive_damping, count)
     # the last element of the arrays is the corner's B
@@ -285,7 +285,7 @@ def _friction(
     if known is None:
         return None, f"the friction is not known: the position's steps may cause {_CYCLES}"
     allowed = known * loop.period / quantum
-    if allowed < LEAST_FRICTION_SHARE * loop.b:
+    if allowed < MIN_FRICTION_SHARE * loop.b:
         steps = f"steps of {quantum:g} m"
         return allowed, f"friction of {known:g} N is too low for {steps}: expect {_CYCLES}"
     return allowed, "the friction line is that of a loop without delay" if loop.delay else ""

@@ -127,10 +127,10 @@ class Sliders:
         self.span = span
         stiffness, damping = span.gains(span.start)
         self._steps = (
-            _step(max(span.most_stiffness(0.0), stiffness)),
-            _step(max(span.most_damping(span.least_stiffness), damping)),
+            _step(max(span.max_stiffness(0.0), stiffness)),
+            _step(max(span.most_damping(span.min_stiffness), damping)),
         )
-        least = _up(span.least_stiffness, self._steps[0])
+        least = _up(span.min_stiffness, self._steps[0])
         most = self._ends(stiffness, damping, least)
         labels = [
             f"{word} {symbol} ({unit})"
@@ -182,7 +182,7 @@ class Sliders:
     def _ends(self, stiffness: float, damping: float, least: float) -> tuple[float, float]:
         steps, span = self._steps, self.span
         return (
-            max(_down(span.most_stiffness(damping), steps[0]), least + steps[0]),
+            max(_down(span.max_stiffness(damping), steps[0]), least + steps[0]),
             max(_down(span.most_damping(stiffness), steps[1]), steps[1]),
         )
 

@@ -31,16 +31,16 @@ CREASE = math.radians(40.0)
 """Angle in rad between triangles beyond which their edge is drawn sharp. Below it a surface is
 drawn round."""
 
-MOST_SAMPLES = 200
+MAX_SAMPLES = 200
 """Largest number of samples of a height field along a side that are drawn. 200 make 80 000
 triangles, some 2 MB that a browser loads once. A finer field is drawn with every second, third …
 sample."""
 
-MOST_PIECES = 10_000
+MAX_PIECES = 10_000
 """Largest number of straight pieces of all tendons, as in MuJoCo's own renderer. A tendon around a
 pulley has about ten."""
 
-MOST_TIMES = 500
+MAX_TIMES = 500
 """Largest enlargement of the coupling's stretch. Beyond it noise would shake the spring."""
 
 SHELL = 0.012
@@ -164,7 +164,7 @@ def terrain(model: mujoco.MjModel, field: int) -> Array:
         counter-clockwise.
     """
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
-    stride = max(1, -(-(max(rows, columns) - 1) // (MOST_SAMPLES - 1)))
+    stride = max(1, -(-(max(rows, columns) - 1) // (MAX_SAMPLES - 1)))
     first, size = int(model.hfield_adr[field]), model.hfield_size[field]
     data = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
     ups, rights = (np.unique([*range(0, n, stride), n - 1]) for n in (rows, columns))
@@ -208,7 +208,7 @@ class Tendons:
         self.widths, self.colours = np.zeros(0), np.zeros((0, 4))
         if not model.ntendon:
             return
-        self._scene = mujoco.MjvScene(model, MOST_PIECES)
+        self._scene = mujoco.MjvScene(model, MAX_PIECES)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         # tendons alone, which takes microseconds
         option = self._option
@@ -316,7 +316,7 @@ def enlargement(room: float, stretch: float) -> int:
         room: Largest drawn length in m, > 0.
         stretch: True length in m, >= 0.
     """
-    times = room / max(stretch, room / MOST_TIMES)
+    times = room / max(stretch, room / MAX_TIMES)
     if times < 2.0:
         return 1
     power = 10 ** math.floor(math.log10(times))

@@ -21,7 +21,7 @@ import numpy as np
 
 from hapticbridge.audit.replay import attached_model
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film_process import LEAST_REFERENCE
+from hapticbridge.film_process import MIN_REFERENCE
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
@@ -58,7 +58,7 @@ class LiveRun:
     Attributes:
         model: The scene.
         parameters: Parameters of the run.
-        reference: Largest force in N so far, or ``LEAST_REFERENCE``.
+        reference: Largest force in N so far, or ``MIN_REFERENCE``.
         trace: The curves so far.
     """
 
@@ -69,7 +69,7 @@ class LiveRun:
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
         self.trace = Trace(TRACE)
-        self.reference = LEAST_REFERENCE
+        self.reference = MIN_REFERENCE
 
     def look(self) -> Sight | None:
         """Returns the newest instant; None if it was returned before."""

@@ -14,7 +14,7 @@ import viser
 from numpy.typing import NDArray
 
 from hapticbridge.film_process import Stage
-from hapticbridge.recording.snapshot import MOST_CONTACTS
+from hapticbridge.recording.snapshot import MAX_CONTACTS
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
 from hapticbridge.view.server import serve, stop
@@ -71,7 +71,7 @@ class Replay:
 
 def contacts_of(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
     """Returns position in m and force in N of contacts in the world frame, (n, 2, 3)."""
-    found = np.zeros((min(data.ncon, MOST_CONTACTS), 2, 3))
+    found = np.zeros((min(data.ncon, MAX_CONTACTS), 2, 3))
     wrench = np.zeros(6)
     for index, (place, force) in enumerate(found):
         mujoco.mj_contactForce(model, data, index, wrench)

@@ -22,7 +22,7 @@ from hapticbridge.view.window import HOST, Address
 
 Process = Callable[[Any, Request], Response | Awaitable[Response | None] | None]
 
-MOST_MESSAGE = 1 << 16
+MAX_MESSAGE = 1 << 16
 """Largest message from a browser in bytes. Button presses and camera poses have some hundred."""
 
 _SERVING = threading.Lock()
@@ -95,7 +95,7 @@ def _behind(address: Address) -> Iterator[None]:
     plain = module.serve
 
     def guarded(*args: Any, process_request: Process | None = None, **options: Any) -> Any:
-        options["max_size"] = MOST_MESSAGE
+        options["max_size"] = MAX_MESSAGE
         door = _door(address, process_request)
         return plain(*args, process_request=door, **options)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Table of a what-if's runs.
+# Table of a what-if's runs
 
 _PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}
 
@@ -72,7 +72,7 @@ def _format_value(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else "none" if value is None else str(value)
 
 
-# Plot of a what-if.
+# Plot of a what-if
 
 _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 """Colour, line and width in points of each run; the recorded one lies behind the others."""

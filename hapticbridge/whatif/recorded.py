@@ -51,7 +51,7 @@ def invert_exactly(wanted: float, function: Callable[[float], float], guess: flo
     return guess
 
 
-# Scene files of a recording.
+# Scene files of a recording
 
 
 def unpack_scene(recording: Recording, folder: Path) -> Path:

@@ -195,7 +195,7 @@ def _replay_info(info: DeviceInfo, own: DeviceInfo) -> DeviceInfo:
     return replace(info, is_real=False, duration=own.duration)
 
 
-# Intended motion of a recorded hand.
+# Intended motion of a recorded hand
 
 INTENT = 8e-3
 """Standard deviation in s of the Gaussian that smooths the hand's intended motion. It halves motion
@@ -295,7 +295,7 @@ def _solve_intent(
     return np.asarray(gaussian_filter1d(wanted, INTENT / period, axis=0, mode="nearest"))
 
 
-# Repetition of a run's inputs, commands and pauses.
+# Repetition of a run's inputs, commands and pauses
 
 _BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY)
 """Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""

@@ -13,7 +13,7 @@ import hapticbridge as hb
 from emulated.guest import GuestRun
 from hapticbridge.record import COLUMNS, Column
 
-MOST_NAMED = 8
+MAX_NAMED = 8
 """How many columns are named: those in the first record that differs, before the rest is counted.
 More than a few differ in each record after it."""
 
@@ -66,9 +66,9 @@ def parting(first: NDArray[np.void], second: NDArray[np.void]) -> str | None:
     rows, columns = unequal.any(axis=1), unequal.any(axis=0)
     row = int(np.argmax(rows))
     here = [column for column, is_other in zip(COLUMNS, unequal[row], strict=True) if is_other]
-    named = [_named(first[row], second[row], column) for column in here[:MOST_NAMED]]
-    if len(here) > MOST_NAMED:
-        named.append(f"{len(here) - MOST_NAMED} other numbers")
+    named = [_named(first[row], second[row], column) for column in here[:MAX_NAMED]]
+    if len(here) > MAX_NAMED:
+        named.append(f"{len(here) - MAX_NAMED} other numbers")
     ticks = f"{first['tick'][row]} and {second['tick'][row]}"
     return (
         f"record {row} (ticks {ticks}) is the first that differs: {'; '.join(named)}. "

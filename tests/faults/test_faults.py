@@ -23,7 +23,7 @@ from hapticbridge.guard import USUAL_ENERGY, Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 
-LIMIT, MOST_ENERGY = 10.0, 0.05
+LIMIT, MAX_ENERGY = 10.0, 0.05
 """In N, of the rig, and in J, beyond what the hand put in."""
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Nan, Inf or huge value")
@@ -42,7 +42,7 @@ def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path:
     outcome = fault.run(tmp_path)
     assert outcome.is_finite
     assert outcome.largest_force <= LIMIT * (1 + 1e-12)
-    assert outcome.energy <= MOST_ENERGY
+    assert outcome.energy <= MAX_ENERGY
     assert outcome.last_is_zero
     assert outcome.rows + outcome.dropped == outcome.ticks
     if fault is RING_FULL:  # what happened in the gap nobody can tell, and the audit says so
@@ -76,7 +76,7 @@ def test_without_its_guard_the_fault_does_harm(fault: Fault, tmp_path: Path) -> 
         torques = outcome.torques
         assert torques[CAUSE : CAUSE + 5].max() > 0.3
     else:
-        assert outcome.energy > MOST_ENERGY
+        assert outcome.energy > MAX_ENERGY
 
 
 @pytest.mark.parametrize("energy", [USUAL_ENERGY, 0.046])

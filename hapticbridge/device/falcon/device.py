@@ -295,7 +295,7 @@ class FalconDevice:
             self._link.close()
 
 
-# Discovery of a Falcon.
+# Discovery of a Falcon
 
 
 def open_falcon(options: Mapping[str, object], tell: Notify, backend: Any = None) -> FalconDevice:

@@ -204,7 +204,7 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
     return False
 
 
-# Statics of the Falcon's legs.
+# Statics of the Falcon's legs
 
 
 @compiled
@@ -265,7 +265,7 @@ def thigh_torques(
     return True
 
 
-# Poses and forces of a Falcon from its packets.
+# Poses and forces of a Falcon from its packets
 
 MOTION_DTYPE = np.dtype([("position", "<f8", 3), ("angles", "<f8", 3), ("motors", "<i8", 3)])
 """State carried from tick to tick: position of the grip in the maker's frame in m, its thigh angles
@@ -290,7 +290,7 @@ SPEED_LIMIT = 3.0
 """Largest plausible speed in m/s. No figure is published; a hand at this speed crosses the
 workspace of 0.1 m in 33 ms."""
 
-MOST_COUNTS = 3000
+MAX_COUNTS = 3000
 """Largest encoder count of a thigh on either side of zero: -74° to 144°. The workspace takes -66°
 to 114°. One more turn would lead to the same position again."""
 
@@ -320,7 +320,7 @@ def believe(
     motion, reply, sample = motions[0], replies[0], samples[0]
     angles, position = np.empty(3), motion.position.copy()
     for i in range(3):
-        if abs(reply.encoders[i]) > MOST_COUNTS:
+        if abs(reply.encoders[i]) > MAX_COUNTS:
             return OUT_OF_REACH
         angles[i] = ZERO_ANGLE + reply.encoders[i] * RADIANS_PER_COUNT
     if not forward(angles, position):

@@ -166,7 +166,7 @@ class ReplyStream:
         self._count = 0
 
 
-# Boot protocol of a Falcon: serial bridge and loader.
+# Boot protocol of a Falcon: serial bridge and loader
 
 READ_FROM, WRITE_TO = 0x81, 0x02
 """Addresses of its bulk endpoints."""
@@ -364,7 +364,7 @@ def _difference(sent: bytes, echo: bytes, start: int) -> str:
     return f"{len(echo)} bytes for the {len(sent)} from byte {start} on"
 
 
-# Start of a Falcon: firmware and homing.
+# Start of a Falcon: firmware and homing
 
 LONGEST_PERIOD = 0.02
 """Longest period of the loop in s. The device is polled once per tick; at a longer period two lost

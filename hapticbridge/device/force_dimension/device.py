@@ -40,8 +40,8 @@ from hapticbridge.device.family import (
     select_device,
 )
 from hapticbridge.device.force_dimension.dhd import (
+    MAX_WATCHDOG,
     MODELS,
-    MOST_WATCHDOG,
     SATURATED,
     TIMEGUARD,
     WATCHDOG_STEP,
@@ -160,13 +160,13 @@ class ForceDimensionDevice:
                 pose.
             DeviceLost: The device is gone.
         """
-        longest = MOST_WATCHDOG * WATCHDOG_STEP
+        longest = MAX_WATCHDOG * WATCHDOG_STEP
         if checked_period(period) > 0.5 * longest:
             raise DeviceError(
                 f"{self._name}: its watchdog ends {1e3 * longest:.3g} ms after a force, so the "
                 f"rate must be at least {2.0 / longest:.0f} Hz, not {1 / period:g} Hz"
             )
-        steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MOST_WATCHDOG)
+        steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MAX_WATCHDOG)
         if not self._dhd.has_watchdog(self._id, steps):
             self._tell(
                 f"{self._name} has no watchdog ({self._dhd.last_error()}): its last force would "
@@ -253,7 +253,7 @@ class ForceDimensionDevice:
             self._sample["quaternion"] = quaternion_of(self._frame[:], self._name)
 
 
-# Discovery of Force Dimension's devices.
+# Discovery of Force Dimension's devices
 
 _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 

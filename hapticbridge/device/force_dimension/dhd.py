@@ -130,10 +130,10 @@ def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
 VARIABLE = "HAPTICBRIDGE_DHD"
 """Environment variable with the library's file, used without the option ``library``."""
 
-FRESH, TIMEGUARD, SATURATED = 0, 1, 2
-"""Return codes: success; no newer sample; a motor is saturated."""
+TIMEGUARD, SATURATED = 1, 2
+"""Return codes: no newer sample; a motor is saturated. Success is 0."""
 
-MOST_WATCHDOG = 255
+MAX_WATCHDOG = 255
 """Largest watchdog in steps of ``WATCHDOG_STEP``: the argument is a byte."""
 
 WATCHDOG_STEP = 125e-6
@@ -230,7 +230,7 @@ class Dhd:
         return code
 
     def has_watchdog(self, device: int, steps: int) -> bool:
-        """Sets the watchdog, 1 to ``MOST_WATCHDOG`` steps; returns False if the device has none."""
+        """Sets the watchdog, 1 to ``MAX_WATCHDOG`` steps; returns False if the device has none."""
         self["dhdEnableExpertMode"]()
         code = int(self["dhdSetWatchdog"](steps, device))
         self["dhdDisableExpertMode"]()

@@ -3,7 +3,7 @@
 The service answers each message with the device's state when the message arrived. So each tick
 sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
 force and requests the state. The force that responds to a sample acts as many whole ticks later as
-an answer takes. At most ``MOST_UNDER_WAY`` messages wait for answers. If the service is slower than
+an answer takes. At most ``MAX_UNDER_WAY`` messages wait for answers. If the service is slower than
 the loop, only the newest force waits and older ones are dropped, so nothing queues up.
 
 The service filters forces. Its force gate and its damping are set when the device is opened, the
@@ -117,7 +117,7 @@ LONGEST_PERIOD = 0.02
 """Longest period of the loop in s. A force lasts only for its message; at a longer period the
 device would idle between two ticks."""
 
-MOST_UNDER_WAY = 2
+MAX_UNDER_WAY = 2
 """Largest number of messages without an answer. With one, the service would idle while its answer
 travels."""
 
@@ -280,7 +280,7 @@ class HaplyDevice:
         return answer
 
     def _send_pending(self) -> None:
-        if self._pending is None or self._under_way >= MOST_UNDER_WAY:
+        if self._pending is None or self._under_way >= MAX_UNDER_WAY:
             return
         self._link.send(messages.force_message(self._listed, self._pending))
         self._under_way += 1
@@ -303,7 +303,7 @@ class HaplyDevice:
         self._sample["buttons"] = state.buttons
 
 
-# Discovery of Haply's devices in the maker's service.
+# Discovery of Haply's devices in the maker's service
 
 PLACE = ("localhost", 10001)
 """Default host and port of the service."""

@@ -161,7 +161,7 @@ class Effects:
     def _require_room(self, count: int) -> None:
         pool = self._reports.pool
         answer = self._link.requests.feature(*pool) if pool is not None else b""
-        most = self._reports.most_effects(answer) if answer else None
+        most = self._reports.max_effects(answer) if answer else None
         if most is not None and most < count:
             raise DeviceError(
                 f"{self._name} plays {most} effect at a time; two are needed, one per axis"
@@ -188,7 +188,7 @@ class Effects:
         raise DeviceError(f"{self._name} does not create the constant force that it offers")
 
 
-# Scale and data sheet of a force-feedback stick.
+# Scale and data sheet of a force-feedback stick
 
 ASSUMED_NEWTONS = 10.0
 """Assumed force at full scale in N: more than that of an ordinary stick, so that forces come out
@@ -335,13 +335,13 @@ def data_sheet(
     )
 
 
-# Axes and buttons of a force-feedback stick, found by usage.
+# Axes and buttons of a force-feedback stick, found by usage
 
 X, Y = 0x00010030, 0x00010031
 """Usages of the axes on the page of generic desktop controls: to the right, and towards the
 user."""
 
-MOST_BUTTONS = 63
+MAX_BUTTONS = 63
 """Largest number of buttons: the bits of a sample."""
 
 _CONTROLLERS = {page << 16 | usage for page, usage in CONTROLLERS}
@@ -421,7 +421,7 @@ def _buttons(fields: list[Field]) -> list[tuple[int, Place]]:
     for field in fields:
         for index, usage in enumerate(field.usages[: field.count]):
             number = usage & 0xFFFF
-            if usage >> 16 == _BUTTON_PAGE and field.is_variable and 0 < number <= MOST_BUTTONS:
+            if usage >> 16 == _BUTTON_PAGE and field.is_variable and 0 < number <= MAX_BUTTONS:
                 found.append((number - 1, element(field, index)))
     return found
 

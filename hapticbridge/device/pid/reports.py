@@ -39,11 +39,11 @@ SET_EFFECT, EFFECT_TYPE, CONSTANT = _P | 0x21, _P | 0x25, _P | 0x26
 BLOCK_INDEX, DURATION, GAIN, AXES_ENABLE = _P | 0x22, _P | 0x50, _P | 0x52, _P | 0x55
 DIRECTION_ENABLE, DIRECTION = _P | 0x56, _P | 0x57
 SET_CONSTANT_FORCE, MAGNITUDE = _P | 0x73, _P | 0x70
-EFFECT_OPERATION, OPERATION, START, STOP = _P | 0x77, _P | 0x78, _P | 0x79, _P | 0x7B
+EFFECT_OPERATION, START, STOP = _P | 0x77, _P | 0x79, _P | 0x7B
 LOOP_COUNT, DEVICE_GAIN_REPORT, DEVICE_GAIN = _P | 0x7C, _P | 0x7D, _P | 0x7E
-POOL, MOST_EFFECTS, BLOCK_FREE, CREATE = _P | 0x7F, _P | 0x83, _P | 0x90, _P | 0xAB
+POOL, MAX_EFFECTS, BLOCK_FREE, CREATE = _P | 0x7F, _P | 0x83, _P | 0x90, _P | 0xAB
 BLOCK_LOAD, LOAD_STATUS, LOADED, FULL = _P | 0x89, _P | 0x8B, _P | 0x8C, _P | 0x8D
-DEVICE_CONTROL, CONTROL = _P | 0x95, _P | 0x96
+DEVICE_CONTROL = _P | 0x95
 ENABLE, DISABLE, STOP_ALL, RESET = _P | 0x97, _P | 0x98, _P | 0x99, _P | 0x9A
 
 _MILLI = -3
@@ -140,16 +140,16 @@ class PidReports:
     @property
     def pool(self) -> tuple[int, int] | None:
         """Number and length in bytes of the feature report with the number of possible effects."""
-        return self._feature_request(self._pool) if place_of(self._pool, MOST_EFFECTS) else None
+        return self._feature_request(self._pool) if place_of(self._pool, MAX_EFFECTS) else None
 
     def loaded(self, answer: bytes) -> tuple[int | None, int]:
         """Returns the result of a creation (``LOADED``, ``FULL``, other) and the effect's index."""
         report = as_number(self._layout, answer)
         return chosen_usage(self._status, report), self._loaded_index.read(report)
 
-    def most_effects(self, answer: bytes) -> int | None:
+    def max_effects(self, answer: bytes) -> int | None:
         """Returns the number of effects that can play at once; None if unknown."""
-        place = place_of(self._pool, MOST_EFFECTS)
+        place = place_of(self._pool, MAX_EFFECTS)
         return None if place is None else place.read(as_number(self._layout, answer)) or None
 
     def longest(self) -> float:

@@ -142,7 +142,7 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
 
-# State frames of a raw HID device.
+# State frames of a raw HID device
 
 _HALF_A_TURN = 0x80000000
 """Half the range of the device's clock in µs; a larger step forwards counts as a step backwards."""
@@ -355,7 +355,7 @@ class RawHidDevice:
         self._link.write(b"\0" + frame)  # hidapi requires a leading 0 for reports without a number
 
 
-# Discovery of home-made devices.
+# Discovery of home-made devices
 
 
 def open_rawhid(

@@ -35,9 +35,9 @@ LEVELS = 41
 at 1 kHz."""
 _COARSEST_LEVEL = 6
 """Finest first part with friction, T/2^6. A faster axis would need more phases than
-``_MOST_PHASES``."""
+``_MAX_PHASES``."""
 
-_MOST_PHASES = 64
+_MAX_PHASES = 64
 """Largest number of slipping and sticking phases within a period, which bounds the loop."""
 
 AXIS_DTYPE = np.dtype(
@@ -229,7 +229,7 @@ def moved_with_friction(
     units_left = 1 << (LEVELS - 1)
     if not math.isfinite(force + stretch + velocity + drift):
         return math.nan, math.nan
-    for _ in range(_MOST_PHASES):
+    for _ in range(_MAX_PHASES):
         if units_left == 0:
             return travel, velocity
         direction = math.copysign(1.0, velocity)

@@ -176,7 +176,7 @@ def polling(path: str) -> tuple[float | None, float | None]:
     return found.get("in"), found.get("out")
 
 
-# Requests to a HID device outside the loop.
+# Requests to a HID device outside the loop
 
 
 def is_taken(send: Callable[[bytes], int], report: bytes, log: HexLog) -> bool:

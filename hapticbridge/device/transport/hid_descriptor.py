@@ -25,7 +25,7 @@ LONGEST_DESCRIPTOR = 4096
 LONGEST_REPORT_BITS = 8 * 16384
 """Largest report in bits, as in Linux (HID_MAX_BUFFER_SIZE)."""
 
-MOST_USAGES = 1024
+MAX_USAGES = 1024
 """Largest number of usages kept per field. A keyboard has 256; a range of 65536 means 'any' and is
 of no use."""
 
@@ -176,11 +176,11 @@ def _set_local(state: _State, tag: int, number: Number) -> None:
         state.least = number
     elif tag == _USAGE_MOST and state.least is not None:
         least, size = state.least
-        room = MOST_USAGES - len(state.usages)
+        room = MAX_USAGES - len(state.usages)
         last = min(number[0], least + room - 1)
         state.usages += [(usage, max(size, number[1])) for usage in range(least, last + 1)]
         state.least = None
-    del state.usages[MOST_USAGES:]
+    del state.usages[MAX_USAGES:]
 
 
 def _fields(state: _State, kind: int, flags: int) -> list[Field]:
@@ -222,7 +222,7 @@ def _fields(state: _State, kind: int, flags: int) -> list[Field]:
     ]
 
 
-# Layout of a HID device's reports by usage.
+# Layout of a HID device's reports by usage
 
 WIDEST = 32
 """Bits of the widest value that is read or written: the standard's own limit."""

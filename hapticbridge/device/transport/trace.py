@@ -15,7 +15,7 @@ from hapticbridge.errors import DeviceError
 VARIABLE = "HAPTICBRIDGE_LOG_USB"
 """Environment variable with the log's file, used without the device's option ``log``."""
 
-MOST_LINES = 200_000
+MAX_LINES = 200_000
 """Largest number of transfers kept: the last 100 s at 1 kHz in both directions, in some 40 MB."""
 
 
@@ -36,7 +36,7 @@ class HexLog:
     def __init__(self, path: str | Path | None = None) -> None:
         named = path or os.environ.get(VARIABLE, "")
         self._path = Path(named) if named else None
-        self._lines: deque[tuple[int, str, bytes]] = deque(maxlen=MOST_LINES)
+        self._lines: deque[tuple[int, str, bytes]] = deque(maxlen=MAX_LINES)
         self._count = 0
         self._origin = time.monotonic_ns()
         if self._path is not None:

@@ -119,7 +119,7 @@ def _text_or_nothing(path: Path) -> str:
         return ""
 
 
-# libusb context with a safe order of release.
+# libusb context with a safe order of release
 
 
 class _Users:
@@ -201,7 +201,7 @@ class UsbContext(pyusb._LibUSB):  # type: ignore[misc] # pyusb has no types
         self._users.release()
 
 
-# Connected USB devices, from libusb and the kernel.
+# Connected USB devices, from libusb and the kernel
 
 
 def libusb() -> Any:
@@ -282,7 +282,7 @@ def _described(family: Driver, device: Any) -> FoundDevice:
 PACKET = 64
 """Bytes per bulk packet on full speed. Each read requests one packet, so that it ends with it."""
 
-MOST_PACKETS = 1024
+MAX_PACKETS = 1024
 """Largest number of packets kept for ``take``. An FTDI bridge sends one per millisecond without a
 request, and between runs they are not taken. Without a bound they would fill 0.4 GB per hour."""
 
@@ -324,7 +324,7 @@ class UsbLink:
         self._device, self._name = device, name
         self._read_from, self._write_to = read_from, write_to
         self._log = log or HexLog("")
-        self._packets: deque[bytes] = deque(maxlen=MOST_PACKETS)
+        self._packets: deque[bytes] = deque(maxlen=MAX_PACKETS)
         self._arrived = threading.Event()
         self._lost = ""
         self._is_open = True

@@ -48,7 +48,7 @@ def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
 REPEATS = 7
 """Largest number of rounds. Three disturbed rounds do not move the median of seven."""
 
-LEAST_REPEATS = 3
+MIN_REPEATS = 3
 """Smallest number of rounds, however long they take: a median needs them."""
 
 PATIENCE = 45.0
@@ -127,7 +127,7 @@ def interleaved_costs(
     rounds: list[NDArray[np.float64]] = []
     start, done = clock(), 0
     while len(rounds) < repeats:
-        if len(rounds) >= min(LEAST_REPEATS, repeats) and clock() - start > patience:
+        if len(rounds) >= min(MIN_REPEATS, repeats) and clock() - start > patience:
             break
         costs = np.zeros(len(runs))
         for index in generator.permutation(len(runs)):

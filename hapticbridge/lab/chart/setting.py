@@ -38,7 +38,7 @@ CONTACTS: dict[str, tuple[float, float] | None] = {
     PYRAMIDAL: None,
 }
 """Contact settings by name; a pair is (timeconst in time steps, dampratio). ``2 steps`` is what the
-shipped scenes have at 1 kHz, ``damped`` the setting that ``scene.contact_rule`` calls strict."""
+shipped scenes have at 1 kHz, ``damped`` the setting that ``scene.contacts`` calls strict."""
 
 SOFT_SOLREF = (0.02, 1.0)
 """MuJoCo's default: timeconst in s and dampratio."""
@@ -185,7 +185,7 @@ VARIED = ("implicit", "lossless")
 """Methods whose contacts and solver are varied: the two that are meant for a device. The others
 respond to a contact as 'implicit' does, with an equal solver."""
 
-LEAST_MS, MOST_MS = 0.02, 20.0
+MIN_MS, MAX_MS = 0.02, 20.0
 """Range of T in ms: 50 kHz to 50 Hz. No haptic loop runs beyond it."""
 
 
@@ -220,10 +220,8 @@ def chosen_periods(steps_ms: Sequence[float] | None, *, is_quick: bool = False) 
     if not steps:
         raise StudyError("steps is empty; name one or more time steps in ms")
     for step in steps:
-        if not LEAST_MS <= step <= MOST_MS:
-            raise StudyError(
-                f"a step is {step!r} ms; it must be between {LEAST_MS:g} and {MOST_MS:g}"
-            )
+        if not MIN_MS <= step <= MAX_MS:
+            raise StudyError(f"a step is {step!r} ms; it must be between {MIN_MS:g} and {MAX_MS:g}")
         if abs(steps[0] / step - round(steps[0] / step)) > 1e-9:
             raise StudyError(
                 f"step {step:g} ms does not divide {steps[0]:g} ms; all steps must divide the "

@@ -85,7 +85,7 @@ NORM_TOLERANCE = 1e-9
 """Largest deviation of a quaternion's norm from 1. It admits rounding and refuses a wrong
 scaling."""
 
-MOST_STEPS = 10**8
+MAX_STEPS = 10**8
 """Largest number of steps in a run: a day at 1 kHz."""
 
 _ARGUMENTS = Arguments(StudyError)
@@ -272,7 +272,7 @@ class Task:
             StudyError: The timestep is not finite and positive, or N < 1.
         """
         check_timestep(timestep)
-        _ARGUMENTS.whole("steps", steps, least=1, most=MOST_STEPS)
+        _ARGUMENTS.whole("steps", steps, least=1, most=MAX_STEPS)
         if self.handle is None:
             return [composed(self.start, self.grip)] * (steps + 1)
         found, cursor = [], 0

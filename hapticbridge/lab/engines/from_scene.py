@@ -53,7 +53,7 @@ def task_from_scene(
 
     Args:
         scene: Scene to describe; it is reset to its start.
-        motion: Motion of the handle relative to its first pose, as ``check.motion_for`` returns it.
+        motion: Motion of the handle relative to its first pose, as ``check.case`` returns it.
             It begins at the grip's pose at the start. None: the handle rests there.
         coupling: Coupling between handle and grip; None leaves the tool alone.
 

@@ -40,7 +40,7 @@ MISSING = (
     "(Debian and Ubuntu: apt install libode8)"
 )
 
-MOST_CONTACTS = 8
+MAX_CONTACTS = 8
 """Largest number of contacts of one pair of geoms: as many as two boxes can have in ODE."""
 
 APPROXIMATE_FRICTION = 0x7000
@@ -197,7 +197,7 @@ def step(
     Args:
         ids: World, body and group of joints.
         pairs: Geoms that may touch, the tool's first, shape (n, 2).
-        contacts: Address of an array of ``MOST_CONTACTS`` contacts with their surfaces filled in,
+        contacts: Address of an array of ``MAX_CONTACTS`` contacts with their surfaces filled in,
             size of one, offset of the geometry in it, and offset of the depth in that, in bytes.
         timestep: Timestep in s.
         force: Force at the centre of mass in N.
@@ -213,7 +213,7 @@ def step(
     _torque(body, torque[0], torque[1], torque[2])
     total = 0
     for i in range(pairs.shape[0]):
-        count = _collide(pairs[i, 0], pairs[i, 1], MOST_CONTACTS, address + geometry, size)
+        count = _collide(pairs[i, 0], pairs[i, 1], MAX_CONTACTS, address + geometry, size)
         for j in range(count):
             contact = address + j * size
             depths[total] = floats(contact + geometry + depth, 1)[0]
@@ -283,11 +283,11 @@ class OdeSimulation(HeldSimulation):
         self._geoms = [*tools, *fixed]
         self._group = ode.dJointGroupCreate(0)
         pairs = np.array([(a, b) for a in tools for b in fixed], dtype=np.intp).reshape(-1, 2)
-        self._buffer = (Contact * MOST_CONTACTS)()
+        self._buffer = (Contact * MAX_CONTACTS)()
         for contact in self._buffer:
             contact.surface.mode = APPROXIMATE_FRICTION
             contact.surface.mu = task.body.friction
-        self._depths = np.empty(MOST_CONTACTS * len(pairs))
+        self._depths = np.empty(MAX_CONTACTS * len(pairs))
         self._touching = 0
         self._fixed_arguments = (
             (world, self._body, self._group),

@@ -37,7 +37,7 @@ from hapticbridge.theory.bounds import maximum_stiffness
 
 Point = dict[str, float | int | str | bool]
 
-LEAST_POINTS, MOST_POINTS = 4, 1_000_000
+MIN_POINTS, MAX_POINTS = 4, 1_000_000
 """Smallest and largest number of points of a map. Fewer form no grid. A million take hours to days
 and a gigabyte."""
 
@@ -162,9 +162,9 @@ def run_map(
     Raises:
         StudyError: The folder, the workers or the number cannot be used, or every point failed.
     """
-    if points is not None and not LEAST_POINTS <= points <= MOST_POINTS:
+    if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise StudyError(
-            f"points is {points}; a map needs {LEAST_POINTS} or more, and {MOST_POINTS} at most"
+            f"points is {points}; a map needs {MIN_POINTS} or more, and {MAX_POINTS} at most"
         )
     name = stability_map.name
     check_format(form)

@@ -303,7 +303,7 @@ def _cells_below(name: str, cells: Table) -> dict[str, Any]:
         "runs_below_6": len(selected),
         "environment_faults_below_6": int((ports == "environment").sum()),
         "device_faults_below_6": int((ports == "device").sum()),
-        "most_slack_used_below_6": float(selected.numbers("slack_share").max(initial=0.0)),
+        "max_slack_used_below_6": float(selected.numbers("slack_share").max(initial=0.0)),
         "largest_tapping_force_below_6": float(selected.numbers("peak_force").max(initial=0.0)),
     }
 
@@ -335,7 +335,7 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "'{name}' is stable and passive at {passive_share_below_6:.0%} of the {runs_below_6} "
             "points below (6); the hand that taps finds the environment at fault at "
             "{environment_faults_below_6}, the device at {device_faults_below_6}, and at most "
-            "{most_slack_used_below_6:.0%} of the slack used",
+            "{max_slack_used_below_6:.0%} of the slack used",
             selected | {"name": name},
         )
     yield (

@@ -32,7 +32,7 @@ ANGLES = np.union1d(np.linspace(0.01, np.pi, 2000), np.geomspace(0.01, np.pi, 10
 of a heavy tool, which are B/m wide."""
 
 
-def least_mass(method: str, stiffness: float, damping: float, period: float) -> float:
+def min_mass(method: str, stiffness: float, damping: float, period: float) -> float:
     """Returns the mass that a free tool must exceed to be stable behind a handle held still.
 
         implicit        0
@@ -118,7 +118,7 @@ def worst_angle(
     """Returns θ in rad at which a free tool needs most device damping, and that b in N s/m.
 
     The damping covers every passive hand if the tool is stable behind a handle held still
-    (``least_mass``); else it is inf.
+    (``min_mass``); else it is inf.
 
     Raises:
         StudyError: The method is none of ``NAMES``.
@@ -129,7 +129,7 @@ def worst_angle(
     response = felt(method, stiffness, damping, mass, period, ANGLES)
     needed = needed_for_fixed_environment(response, period, ANGLES)
     place = int(np.flatnonzero(needed >= needed.max() - 1e-12 * abs(needed.max()))[-1])
-    is_stable = mass > least_mass(method, stiffness, damping, period)
+    is_stable = mass > min_mass(method, stiffness, damping, period)
     return float(ANGLES[place]), float(needed[place]) if is_stable else float("inf")
 
 
@@ -385,9 +385,7 @@ def _needed(name: str) -> tuple[Array, Array, Array]:
 
 def _draw_theory(axes: Axes, name: str) -> None:
     mass, stiffness, needed = _needed(name)
-    least = np.array(
-        [least_mass(THEORIES[name], k, law_damping(name, k), PERIOD) for k in stiffness]
-    )
+    least = np.array([min_mass(THEORIES[name], k, law_damping(name, k), PERIOD) for k in stiffness])
     is_shown = np.isfinite(least) & (least > 0)
     axes.plot(least[is_shown], stiffness[is_shown], color=base.THEORY_COLOUR, ls=":", lw=2.2)
     axes.contour(
@@ -435,7 +433,7 @@ def _counts(name: str, cells: Table) -> dict[str, Any]:
         "unstable_held_still": int((cells.numbers("stable_held_still") != 1).sum()),
         "points_below_6": int(is_below.sum()),
         "unstable_below_6": int((is_below & ~stable).sum()),
-        "most_created": float(cells.numbers("created")[stable].max(initial=0.0)),
+        "max_created": float(cells.numbers("created")[stable].max(initial=0.0)),
     }
 
 
@@ -464,7 +462,7 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         yield (
             "'{name}': held still, a tool is unstable at {unstable_held_still} of {points} points "
             "of the grid; below (6), held still or in its worst hand, at {unstable_below_6} of "
-            "{points_below_6}; where stable, it creates at most {most_created:.2g} J",
+            "{points_below_6}; where stable, it creates at most {max_created:.2g} J",
             selected | {"name": name},
         )
         for what in SEARCHES:

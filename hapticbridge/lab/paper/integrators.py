@@ -455,7 +455,7 @@ def draw_least_mass(axes: Axes, stiffness: float, period: float) -> None:
     axes.legend(fontsize="x-small", loc="upper right")
 
 
-def least_stable_mass(coupling: Coupling, period: float, integrator: Integrator) -> float:
+def min_stable_mass(coupling: Coupling, period: float, integrator: Integrator) -> float:
     """Finds the mass in kg above which the loop decays while the handle is held still."""
     samples = 20_000
 
@@ -603,11 +603,11 @@ def virtual_mass_section() -> Section:
             label=MASS_NAMES[integrator],
             ls="--" if integrator == "explicit" else "-",
         )
-        least_mass = 1e3 * float(minimum_mass(MASS_COUPLING, PERIOD, integrator))
-        if least_mass > 0:
+        min_mass = 1e3 * float(minimum_mass(MASS_COUPLING, PERIOD, integrator))
+        if min_mass > 0:
             delay = SCHEMES.index(integrator)
-            name = f"least stable mass, j = {delay}: {least_mass:g} g"
-            axes.axvline(least_mass, color=colour, ls=(":", (0, (1, 3)))[delay - 1], label=name)
+            name = f"least stable mass, j = {delay}: {min_mass:g} g"
+            axes.axvline(min_mass, color=colour, ls=(":", (0, (1, 3)))[delay - 1], label=name)
     axes.axhline(K * PERIOD / 2 + B, color="k", lw=0.8, ls="-.", label="KT/2 + B, (6)")
     axes.set(xlabel="virtual mass (g)", ylabel="device damping needed (N s/m)", ylim=(0, 8))
     axes.legend(fontsize="x-small", loc="upper right")
@@ -625,7 +625,7 @@ def virtual_mass_section() -> Section:
                 quantity=f"least stable mass, {MASS_NAMES[integrator]}",
                 route="time-domain loop, handle held still, bisection",
                 expected=expected,
-                got=least_stable_mass(MASS_COUPLING, PERIOD, integrator),
+                got=min_stable_mass(MASS_COUPLING, PERIOD, integrator),
                 unit="kg",
                 tolerance=1e-3,
             )
