@@ -178,7 +178,7 @@ class TickKernel:
         method = setup.method
         self.bound, self.step, self.substeps = bound, method.step, range(setup.substeps)
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
-        self.is_ahead = setup.is_pipelined and can_split(setup.scene.model, method.scheme)
+        self.is_ahead = False
         self.external_flags = bound.external_flags
         self.wrench = bound.wrench_on_device
 
@@ -330,6 +330,9 @@ class Session:
             self.kernel.bound.resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self._signal = ""
+        # a callback that forbids the split may have been set since the bridge was opened
+        model, method = self.setup.scene.model, self.setup.method
+        self.kernel.is_ahead = self.setup.is_pipelined and can_split(model, method.scheme)
 
     def note_grants(self, grants: tuple[Grant, ...]) -> None:
         """Records the answers of the system to the real-time requests; warns once of refusals."""

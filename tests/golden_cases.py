@@ -14,7 +14,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import redirect_stderr, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,7 @@ from audit_cases import rewritten
 from numpy.typing import NDArray
 
 import hapticbridge as hb
-from hapticbridge.cli import main
+from hapticbridge.cli import main, terminal
 from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
@@ -734,13 +734,32 @@ def session_file(name: str) -> Path:
     return GOLDEN / "sessions" / f"{name}.txt"
 
 
+@contextmanager
+def consoles_of(width: int) -> Iterator[None]:
+    """Gives the consoles a width; they are made once, with the width of that moment."""
+    consoles = (terminal.out, terminal.err)
+    before = [console.width for console in consoles]
+    try:
+        for console in consoles:
+            console.width = width
+        yield
+    finally:
+        for console, old in zip(consoles, before, strict=True):
+            console.width = old
+
+
 def session_text(name: str, folder: Path) -> str:
     """Returns a session as a terminal of 100 columns shows it, with exit codes, paths masked."""
     shown, plain = [], {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     models = str(Path(hb.__file__).parents[1])
     for command in SESSIONS[name]:
         out, err = io.StringIO(), io.StringIO()
-        with patch.dict(os.environ, plain), redirect_stdout(out), redirect_stderr(err):
+        with (
+            consoles_of(100),
+            patch.dict(os.environ, plain),
+            redirect_stdout(out),
+            redirect_stderr(err),
+        ):
             code = main(command.replace("FOLDER", str(folder)).split())
         words = err.getvalue() + out.getvalue()
         words = words.replace(str(folder), "FOLDER").replace(models, "HOME")
