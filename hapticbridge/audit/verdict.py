@@ -35,6 +35,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method
 from hapticbridge.summary import coupling_sentences, was_never_lossless
+from hapticbridge.units import format_energy
 
 # End of a run.
 
@@ -166,11 +167,11 @@ def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool
         }
     if unstrict is None:
         # rounding may leave it above zero; + 0.0 removes the sign of zero
-        lost = max(-energies.energies["environment_energy"], 0.0) + 0.0
+        lost = format_energy(max(-energies.energies["environment_energy"], 0.0))
         return {
             "verdict": "passive",
             "environment": "strict",
-            "reason": f"the environment never gave out more than it got ({lost:.3g} J dissipated)",
+            "reason": f"the environment never gave out more than it got ({lost} dissipated)",
         }
     if active is None and not strict:
         return {

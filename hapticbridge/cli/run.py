@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions
+from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
 from hapticbridge.cli.terminal import err, out, tell
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -93,13 +93,16 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
 
 def announce_measured(bridge: Bridge) -> None:
     """Prints the device conditions of a method without a coupling law, known once it is open."""
-    if bridge.setup.method.has_law:
+    setup, parameters = bridge.setup, bridge.session.parameters
+    if setup.method.has_law:
         return
-    effective = bridge.session.parameters.felt
-    if effective is not None:
-        err.print(_true_weld(effective, bridge.setup.coupling))
+    if parameters.felt is not None:
+        err.print(_true_weld(parameters.felt, setup.coupling))
+    conditions = run_conditions(setup.info, parameters, setup.method)
+    met = {condition.sentence() for condition in conditions if condition.holds}
     for sentence in bridge.conditions():
-        err.print(f"[yellow]warning:[/yellow] {escape(sentence)}")
+        head = "  " if sentence in met else "[yellow]warning:[/yellow] "
+        err.print(head + escape(sentence))
 
 
 def _true_weld(effective: Coupling, requested: Coupling) -> str:

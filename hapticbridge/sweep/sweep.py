@@ -23,6 +23,7 @@ from concurrent.futures import (
     wait,
 )
 from multiprocessing import connection
+from multiprocessing.synchronize import Barrier
 from typing import Any
 
 from hapticbridge.errors import StudyError
@@ -195,7 +196,10 @@ def _submitted(
                     yield chunk, future.result()
                 del running[future]
     except KeyboardInterrupt:
-        for future in running:
+        # Ctrl-C ends the processes of a pool too. If a future is cancelled while its pool breaks,
+        # Python 3.11 never completes the others, and waiting for them would not end.
+        can_cancel = not isinstance(executor, ProcessPoolExecutor)
+        for future in running if can_cancel else ():
             future.cancel()
         with holding_interrupts():
             for future in wait(running).done:
@@ -330,7 +334,8 @@ class _Processes(ProcessPoolExecutor):
     """
 
     def __init__(self, count: int) -> None:
-        super().__init__(count, multiprocessing.get_context("spawn"), _start_process)
+        context = multiprocessing.get_context("spawn")
+        super().__init__(count, context, _start_process, (context.Barrier(count),))
 
     def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
         """Hands a task over; a process that starts for it holds Ctrl-C back while it imports."""
@@ -354,7 +359,12 @@ def _processes(function: Callable[[Any], Any], count: int) -> Iterator[Executor]
     pool = _Processes(count)
     try:
         try:
-            pool.submit(callable, function).result()
+            # All processes start before the first point. Python 3.11 may wait without end for one
+            # that starts while another dies.
+            with holding_interrupts():
+                probes = [pool.submit(callable, function) for _ in range(count)]
+            for probe in probes:
+                probe.result()
         except BrokenExecutor:
             raise StudyError(
                 "worker processes end as soon as they start: each imports the module of the swept "
@@ -366,12 +376,13 @@ def _processes(function: Callable[[Any], Any], count: int) -> Iterator[Executor]
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _start_process() -> None:
+def _start_process(barrier: Barrier) -> None:
     """Prepares a worker process, which ends silently on Ctrl-C and with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_leave_with_parent, daemon=True).start()
+    barrier.wait()  # until all processes of the pool have started
 
 
 def _leave_with_parent() -> None:
