@@ -28,12 +28,19 @@ energy that the device received beyond the hand's.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
-from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
-from hapticbridge.kernel.ledger import add_tuning_work
+from hapticbridge.kernel.handle import (
+    handle_of_step,
+    note_tool,
+    slip_handle,
+    tool_after_step,
+)
+from hapticbridge.kernel.ledger import moment_dot
 from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
@@ -41,7 +48,6 @@ from hapticbridge.pose import (
     Vector,
     add,
     conjugate,
-    dot,
     norm,
     product,
     quaternion_exp,
@@ -196,21 +202,96 @@ def set_gains(s: State, share: float) -> None:
     mj = s.mj
     for axis in range(6):
         first = 0 if axis < 3 else 3
+        part = share * s.level.share[0 if axis < 3 else 1]
         actuator = mj.coupling_actuator_id + axis
-        floats(mj.gainprm + 8 * _GAINS * actuator, 1)[0] = share * s.coupling.gains[first]
+        floats(mj.gainprm + 8 * _GAINS * actuator, 1)[0] = part * s.coupling.gains[first]
         bias = floats(mj.biasprm + 8 * _GAINS * actuator, 3)
-        bias[1] = -share * s.coupling.gains[first + 1]
-        bias[2] = -share * s.coupling.gains[first + 2]
+        bias[1] = -part * s.coupling.gains[first + 1]
+        bias[2] = -part * s.coupling.gains[first + 2]
 
 
 @compiled
-def retune(s: State) -> None:
-    """Moves the gains one tick nearer to their goal, and books the work on the spring.
+def applied_wrench(s: State, share: float) -> tuple[Vector, Vector]:
+    """Returns the mean wrench that the coupling's actuators applied to the tool in the step.
 
-    Needs the handle's new pose and the tool's old one. With n evaluations of the law per tick the
-    handle has made the first of its n steps by then.
+    In the handle's axes. ``actuator_force`` is their force at the step's start; two terms of
+    MuJoCo's effective metric take it to the end (``ledger._actuator_work``).
+
+    Args:
+        s: The bound state after a step of the integrator ``discrete``.
+        share: Share of the gains, as given to ``set_gains``.
+    """
+    mj = s.mj
+    h = s.run.timestep
+    first = mj.coupling_output_adr
+    forces = floats(mj.actuator_force, first + 6)
+    f = np.empty(6)
+    for axis in range(6):
+        row = 0 if axis < 3 else 3
+        part = share * s.level.share[0 if axis < 3 else 1]
+        stiffness, damping = s.coupling.gains[row + 1], s.coupling.gains[row + 2]
+        end = moment_dot(s, first + axis, mj.qvel)
+        change = moment_dot(s, first + axis, mj.qacc)
+        in_position, in_velocity = part * h * stiffness, part * h * (h * stiffness + damping)
+        f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
+    return vector_of(f), vector_of(f[3:6])
+
+
+@compiled
+def _spring_length(stiffness: float, energy: float, limit: float) -> float:
+    """Returns the length at which a spring of limited force holds an energy."""
+    elastic = 0.5 * limit * limit / stiffness if stiffness > 0.0 else 0.0
+    if energy <= elastic:
+        return math.sqrt(2.0 * energy / stiffness) if stiffness > 0.0 else 0.0
+    return limit / stiffness + (energy - elastic) / limit if stiffness > 0.0 else 0.0
+
+
+@compiled
+def pulled(s: State) -> tuple[Vector, Vector]:
+    """Returns stretch in m and twist in rad between the handle's new and the tool's old pose.
+
+    With n evaluations of the law per tick, after the first of the handle's n steps.
+    """
+    pose = s.pose
+    ahead = 1.0 - 1.0 / s.run.law_evaluations
+    stretch = subtract(vector_of(pose.handle_position), scaled(ahead, vector_of(pose.handle_step)))
+    stretch = subtract(stretch, vector_of(pose.tool_position))
+    back = quaternion_exp(scaled(-ahead, vector_of(pose.handle_turn)))
+    orientation = product(back, quaternion_of(pose.handle_quaternion))
+    return stretch, rotation_between(quaternion_of(pose.tool_quaternion), orientation)
+
+
+@compiled
+def shorten(s: State, length: float, angle: float) -> bool:
+    """Slips the handle toward the tool, to a largest stretch in m and twist in rad.
+
+    Returns:
+        True if it slipped.
+    """
+    stretch, twist = pulled(s)
+    size, size_r = norm(stretch), norm(twist)
+    if size <= length and size_r <= angle:
+        return False
+    shift, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    if size > length:
+        shift = scaled(length / size - 1.0, stretch)
+    if size_r > angle:
+        turn = scaled(angle / size_r - 1.0, twist)
+    slip_handle(s.pose, shift, turn)
+    return True
+
+
+@compiled
+def retune(s: State) -> bool:
+    """Moves the gains one tick nearer to their goal; the spring's energy does not rise.
+
+    Returns:
+        True if the handle slipped.
     """
     k, goal, left = s.coupling, s.coupling.tuning_goal, s.coupling.tuning_ticks
+    stretch, twist = pulled(s)
+    energy = _spring_energy(k.stiffness, norm(stretch), s.level.level[0])
+    energy_r = _spring_energy(k.rotational_stiffness, norm(twist), s.level.level[1])
     stiffness, rotational = k.stiffness, k.rotational_stiffness
     share = 1.0 / left
     k.stiffness += share * (goal[0] - k.stiffness)
@@ -230,12 +311,9 @@ def retune(s: State) -> None:
     k.tuning_ticks = left - 1
     set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)
 
-    pose = s.pose
-    ahead = 1.0 - 1.0 / s.run.law_evaluations
-    stretch = subtract(vector_of(pose.handle_position), scaled(ahead, vector_of(pose.handle_step)))
-    stretch = subtract(stretch, vector_of(pose.tool_position))
-    back = quaternion_exp(scaled(-ahead, vector_of(pose.handle_turn)))
-    orientation = product(back, quaternion_of(pose.handle_quaternion))
-    twist = rotation_between(quaternion_of(pose.tool_quaternion), orientation)
-    add_tuning_work(s.energy, 0.5 * (k.stiffness - stiffness) * dot(stretch, stretch))
-    add_tuning_work(s.energy, 0.5 * (k.rotational_stiffness - rotational) * dot(twist, twist))
+    length = angle = np.inf
+    if k.stiffness > stiffness:
+        length = _spring_length(k.stiffness, energy, s.level.level[0])
+    if k.rotational_stiffness > rotational:
+        angle = _spring_length(k.rotational_stiffness, energy_r, s.level.level[1])
+    return shorten(s, length, angle)

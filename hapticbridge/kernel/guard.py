@@ -20,6 +20,8 @@ energy limit alone protects.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hapticbridge.jit import compiled
@@ -27,29 +29,26 @@ from hapticbridge.kernel.codes import (
     BACKWARDS,
     CLUTCH,
     CLUTCHED,
-    FORCE_LIMITED,
     FORCE_OFF,
     GAVE_ENERGY,
     JUMPED,
     RAMPING,
     RESEATED,
-    SLEW_LIMITED,
     STALE_SAMPLE,
     STRETCHED,
     TWISTED,
     Part,
     State,
 )
-from hapticbridge.kernel.coupling import releasable_energy
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
     Vector,
     add,
+    dot,
     norm,
     quaternion_of,
     rotation_between,
     scaled,
-    store_vector,
     subtract,
     vector_of,
 )
@@ -59,53 +58,34 @@ _FROM_PARAMETERS = (
     "fade_ticks",
     "clutch",
     "dead_man",
-    "reseats",
-    "force_rise",
-    "torque_rise",
     "longest_stall",
     "reach",
-    "ramp_energy",
 )
 _THRESHOLDS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
 GUARD_DTYPE = np.dtype(
     [
-        *((name, "<i8") for name in _FROM_PARAMETERS[:5]),
-        *((name, "<f8") for name in _FROM_PARAMETERS[5:]),
+        *((name, "<i8") for name in _FROM_PARAMETERS[:4]),
+        *((name, "<f8") for name in _FROM_PARAMETERS[4:]),
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),
-        ("is_released", "<i8"),
-        ("is_anchor_requested", "<i8"),
         ("consecutive_stale", "<i8"),
-        ("fade_ticks_elapsed", "<i8"),
         ("time_since_sample", "<f8"),
-        ("ramp_start", "<i8"),
-        ("ramp_length", "<i8"),
-        ("ramp_progress", "<f8"),
-        ("transmitted_share", "<f8"),
-        ("ramp_share", "<f8"),
-        ("limited_wrench", "<f8", 6),
+        ("start_tick", "<i8"),
+        ("rise_ticks", "<i8"),
+        ("share", "<f8"),
     ]
 )
 """Sub-record ``guard``, written by this module alone.
 
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
-``time_since_sample`` in s; the ramp's start, length and progress in ticks;
-``transmitted_share`` of the requested force, ``ramp_share`` of ramp and fade alone;
-``limited_wrench`` in N and N m, before ramp and fade."""
+``time_since_sample`` in s; ``share`` is r, the ratio of the lever between device and handle;
+``rise_ticks`` its time from 0 to 1."""
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that belong to the device; bits above them are commands."""
-
-STILL = 1e-4
-"""Largest motion in m of a device between its start and the first tick without a re-anchoring. A
-hand at rest moves less. At 2400 N/m it leaves a force of 0.24 N."""
-
-STILL_TURN = 0.02
-"""Largest rotation in rad of a device between its start and the first tick without a re-anchoring.
-At 2.4 N m/rad it leaves a torque of 0.05 N m."""
 
 
 def bind_guard(guard: Part, parameters: RunParameters) -> None:
@@ -115,20 +95,19 @@ def bind_guard(guard: Part, parameters: RunParameters) -> None:
         guard[name] = getattr(limits, name)
     for name in _THRESHOLDS:
         guard[f"max_{name}"] = getattr(limits, name)
-    guard["ramp_length"] = parameters.ramp_ticks
-    # before the first tick, a device with a dead-man button counts as released
-    guard["is_released"] = limits.dead_man != 0
+    guard["rise_ticks"] = parameters.ramp_ticks
+    guard["share"] = 1.0 if parameters.ramp_ticks == 0 else 0.0
 
 
 def restart_ramp(guard: Part, tick: int, length: int) -> None:
-    """Lets the wrench rise from zero again, from a tick on and within so many ticks."""
-    guard["ramp_start"], guard["ramp_length"], guard["ramp_progress"] = tick, length, 0.0
-    guard["limited_wrench"] = 0.0
+    """Lets the share rise from zero again, from a tick on and within so many ticks."""
+    guard["start_tick"], guard["rise_ticks"] = tick, length
+    guard["share"] = 1.0 if length == 0 else 0.0
 
 
-def request_anchor(guard: Part) -> None:
-    """Re-anchors the handle at the next tick in which it follows the device."""
-    guard["is_anchor_requested"] = 1
+def let_go(guard: Part) -> None:
+    """Lets the handle go: it does not follow the device's next motion."""
+    guard["share"], guard["rise_ticks"] = 0.0, guard["fade_ticks"]
 
 
 def set_commanded(guard: Part, bits: int) -> None:
@@ -147,7 +126,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
         elapsed: Time between the two readings in s.
     """
     guard, pose = s.guard, s.pose
-    is_first = s.loop.tick == guard.ramp_start
+    is_first = s.loop.tick == guard.start_tick
     if elapsed < 0.0 and not is_first:
         return BACKWARDS
     # the device moves on while its samples are old, and between a start and the first tick
@@ -165,138 +144,72 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
 
 
 @compiled
-def follow(
-    s: State, position: Vector, moved: Vector, turned: Vector, buttons: int, elapsed: float
-) -> bool:
-    """Decides if the handle follows the device, is re-anchored, and if the wrench fades.
+def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> None:
+    """Advances r by one tick: it falls to 0 while the hand is let go, else it rises to 1.
 
-    The handle stays while a clutch is held (by a button or by command), while a dead-man button is
-    not held, and while the device is beyond ``reach``, at the edge of its workspace. The wrench
-    then fades. It also fades after ``stale_ticks`` ticks without a new sample, and while the force
-    is off by command. Afterwards, and after a stall, the handle is re-anchored (flag ``RESEATED``):
-    it is placed at the tool, the device's pose belongs to it from then on, and the wrench rises
-    within ``fade_ticks``. A coupling that stayed stretched would release energy that no hand
-    supplied.
+    The hand is let go while a clutch is held (by a button or by command), while a dead-man button
+    is not held, while the device is beyond ``reach``, at the edge of its workspace, after
+    ``stale_ticks`` ticks without a new sample, and while the force is off by command.
 
     Args:
         s: The bound state.
         position: New position of the device in m.
-        moved: Its motion since the last sample in m.
-        turned: Its rotation vector since the last sample in rad.
         buttons: Bits of buttons and commands.
         elapsed: Time since the last sample in s.
-
-    Returns:
-        True if the handle follows the device.
     """
     guard, flags = s.guard, s.loop.external_flags
     guard.flags = 0
     is_stale = (flags & STALE_SAMPLE) != 0
-    was_silent = guard.fade_ticks_elapsed > 0
     guard.consecutive_stale = guard.consecutive_stale + 1 if is_stale else 0
     waited = guard.time_since_sample + max(elapsed, s.run.period)
     guard.time_since_sample = waited if is_stale else 0.0
-    was_released = guard.is_released != 0
     is_released = (buttons & (guard.clutch | CLUTCHED)) != 0
     is_released = is_released or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
     is_released = is_released or norm(position) > guard.reach
-    guard.is_released = is_released
-    is_silent = is_released or (buttons & FORCE_OFF) != 0
-    is_silent = is_silent or (guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks)
-    guard.fade_ticks_elapsed = guard.fade_ticks_elapsed + 1 if is_silent else 0
     if is_released:
-        guard.flags = CLUTCH
-        return False
-    is_first = s.loop.tick == guard.ramp_start
-    has_stalled = elapsed > guard.longest_stall and not is_first
-    has_moved = norm(moved) > STILL or norm(turned) > STILL_TURN
-    has_strayed = is_first and guard.reseats and has_moved
-    # after a reset, or in the re-simulation of a recorded run
-    is_requested = guard.is_anchor_requested != 0 or (flags & RESEATED) != 0
-    guard.is_anchor_requested = 0
-    is_heard_again = was_silent and not is_silent
-    if was_released or is_heard_again or has_stalled or has_strayed or is_requested:
-        guard.flags |= RESEATED
-        if not is_first:
-            guard.ramp_length = guard.fade_ticks
-        guard.ramp_start, guard.ramp_progress = s.loop.tick, 0.0
-        for i in range(6):
-            guard.limited_wrench[i] = 0.0
-    return True
+        guard.flags |= CLUTCH
+    is_off = is_released or (buttons & FORCE_OFF) != 0
+    is_off = is_off or (guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks)
+    if is_off:
+        guard.share = max(guard.share - 1.0 / guard.fade_ticks, 0.0)
+        if guard.share == 0.0:
+            guard.rise_ticks = guard.fade_ticks
+    elif guard.share < 1.0:
+        guard.share = min(guard.share + 1.0 / (guard.rise_ticks + 1.0), 1.0)
+    if guard.share < 1.0:
+        guard.flags |= RAMPING
 
 
 @compiled
-def advance_ramp(s: State) -> float:
-    """Advances the ramp by one tick, and returns the share of the wrench that is let through.
-
-    ``ramp_progress`` counts ticks; a tick counts in part if the coupling holds more than
-    ``ramp_energy``.
-    """
-    guard = s.guard
-    full = guard.ramp_length + 1.0
-    if guard.ramp_progress >= full:
-        return 1.0
-    pace = 1.0
-    if s.run.has_law and guard.ramp_energy < np.inf:
-        stored = releasable_energy(s)
-        if stored > guard.ramp_energy:
-            pace = guard.ramp_energy / stored
-    guard.ramp_progress += pace
-    if guard.ramp_progress >= full:
-        return 1.0
-    guard.flags |= RAMPING
-    return float(guard.ramp_progress / full)
+def note_anchored(guard: Part) -> None:
+    """Notes that the handle was anchored anew in this tick."""
+    guard.flags |= RESEATED
 
 
 @compiled
-def _limited(v: Vector, limit: float) -> tuple[Vector, bool]:
-    length = norm(v)
-    if length > limit:
-        return scaled(limit / length, v), True
-    return v, False
-
-
-@compiled
-def _slew_limited(v: Vector, before: Vector, rise: float) -> tuple[Vector, bool]:
-    change = subtract(v, before)
-    length = norm(change)
-    if length > rise:
-        return add(before, scaled(rise / length, change)), True
-    return v, False
-
-
-@compiled
-def limit_wrench(
-    s: State, force: Vector, torque: Vector, requested: float
+def send_within(
+    s: State, wrench: tuple[Vector, Vector], damped: tuple[Vector, Vector]
 ) -> tuple[Vector, Vector]:
-    """Limits a wrench on the device by norm and by change, then applies ramp and fade.
+    """Returns the wrench on the device: the coupling's, and of the added damping what fits.
 
-    Args:
-        s: The bound state.
-        force: In N, in the device's frame.
-        torque: In N m, in the device's frame.
-        requested: Norm in N of the force before the passivity controller.
-
-    Returns:
-        The wrench to send.
+    The coupling's wrench is at the force level already and passes whole.
     """
-    guard, run = s.guard, s.run
-    force, is_limited = _limited(force, run.force_limit)
-    torque, is_torque_limited = _limited(torque, run.torque_limit)
-    if is_limited or is_torque_limited:
-        guard.flags |= FORCE_LIMITED
-    last, last_torque = vector_of(guard.limited_wrench), vector_of(guard.limited_wrench[3:6])
-    force, is_slewed = _slew_limited(force, last, guard.force_rise)
-    torque, is_torque_slewed = _slew_limited(torque, last_torque, guard.torque_rise)
-    if is_slewed or is_torque_slewed:
-        guard.flags |= SLEW_LIMITED
-    store_vector(guard.limited_wrench[0:3], force)
-    store_vector(guard.limited_wrench[3:6], torque)
-    share = advance_ramp(s)
-    if guard.fade_ticks_elapsed > 0:
-        share *= max(0.0, 1.0 - guard.fade_ticks_elapsed / guard.fade_ticks)
-    guard.ramp_share = share
-    if share != 1.0:
-        force, torque = scaled(share, force), scaled(share, torque)
-    guard.transmitted_share = min(norm(force) / requested, 1.0) if requested > 0.0 else share
-    return force, torque
+    run = s.run
+    return (
+        _within(wrench[0], damped[0], run.force_limit),
+        _within(wrench[1], damped[1], run.torque_limit),
+    )
+
+
+@compiled
+def _within(base: Vector, whole: Vector, limit: float) -> Vector:
+    """Returns base + β (whole − base) with the largest β <= 1 that keeps the norm."""
+    if dot(whole, whole) <= limit * limit:
+        return whole
+    more = subtract(whole, base)
+    a, b, c = dot(more, more), dot(base, more), dot(base, base) - limit * limit
+    if a == 0.0:
+        return base
+    root = max(b * b - a * min(c, 0.0), 0.0)
+    share = max((math.sqrt(root) - b) / a, 0.0)
+    return add(base, scaled(min(share, 1.0), more))

@@ -119,12 +119,39 @@ def move_handle(pose: Part, position: Vector, quaternion: Quaternion) -> None:
 
 
 @compiled
-def anchor_handle(pose: Part, position: Vector, quaternion: Quaternion) -> None:
-    """Re-anchors the handle: a device pose belongs to the tool's present pose from now on."""
-    store_vector(pose.device_origin[0:3], position)
-    store_quaternion(pose.device_origin[3:7], quaternion)
-    store_vector(pose.handle_origin[0:3], vector_of(pose.tool_position))
-    store_quaternion(pose.handle_origin[3:7], quaternion_of(pose.tool_quaternion))
+def follow_in_part(
+    run: Part, pose: Part, share: float, moved: Vector, turned: Vector
+) -> tuple[Vector, Quaternion]:
+    """Returns the handle's pose after a share of the device's motion.
+
+        h_k = h_{k−1} + r · scale · A δp,    R_h,k = exp(r · A δφ) R_h,k−1
+
+    With the force r f on the device, the handle moved by r times its motion takes up the work that
+    the device does: a lever of ratio r.
+    """
+    step = scaled(share * run.scale, scene_from_device(run.axes, moved))
+    turn = quaternion_exp(scaled(share, scene_from_device(run.axes, turned)))
+    position = add(vector_of(pose.handle_position), step)
+    return position, canonical(product(turn, quaternion_of(pose.handle_quaternion)))
+
+
+@compiled
+def slip_handle(pose: Part, shift: Vector, turn: Vector) -> None:
+    """Moves the handle without the device; the handle's step of the tick does not contain it."""
+    store_vector(pose.handle_position, add(vector_of(pose.handle_position), shift))
+    orientation = product(quaternion_exp(turn), quaternion_of(pose.handle_quaternion))
+    store_quaternion(pose.handle_quaternion, canonical(orientation))
+
+
+@compiled
+def anchor_handle(pose: Part) -> None:
+    """Re-anchors the handle: its pose belongs to the device's present pose from now on."""
+    for i in range(3):
+        pose.device_origin[i] = pose.device_position[i]
+        pose.handle_origin[i] = pose.handle_position[i]
+    for i in range(4):
+        pose.device_origin[3 + i] = pose.device_quaternion[i]
+        pose.handle_origin[3 + i] = pose.handle_quaternion[i]
 
 
 def move_handle_to_tool(pose: Part) -> None:

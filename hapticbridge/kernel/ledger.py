@@ -418,7 +418,7 @@ def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
     """
     w, energy = s.loop.wrench_on_device, s.energy
     energy.device_energy += dot(vector_of(w), moved) + dot(vector_of(w[3:6]), turned)
-    if s.loop.tick > s.guard.ramp_start:
+    if s.loop.tick > s.guard.start_tick:
         energy.device_dissipation += s.run.device_damping / interval * dot(moved, moved)
         energy.device_dissipation += (
             s.run.device_rotational_damping / interval * dot(turned, turned)

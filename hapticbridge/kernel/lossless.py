@@ -43,9 +43,11 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
-from hapticbridge.kernel.coupling import law_wrench, set_gains
+from hapticbridge.kernel.coupling import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.force_level import limited_wrench
+from hapticbridge.kernel.force_level import wrench_after_step as implicit_wrench
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
-from hapticbridge.kernel.ledger import add_body_wrenches, moment_dot, set_kinetic_energy
+from hapticbridge.kernel.ledger import add_body_wrenches, set_kinetic_energy
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -289,30 +291,6 @@ def _take_back(s: State, kinetic: float, own: float) -> float:
 
 
 @compiled
-def implicit_half(s: State) -> tuple[Vector, Vector]:
-    """Returns the mean wrench that the coupling's actuators applied to the tool in the step.
-
-    ``actuator_force`` is their force at the step's start; two terms of MuJoCo's effective metric
-    take it to the end (``ledger._actuator_work``). Must run before the kinematics are refreshed.
-    """
-    mj = s.mj
-    h = s.run.timestep
-    first = mj.coupling_output_adr
-    forces = floats(mj.actuator_force, first + 6)
-    f = np.empty(6)
-    for axis in range(6):
-        stiffness, damping = s.coupling.stiffness, s.coupling.damping
-        if axis >= 3:
-            stiffness, damping = s.coupling.rotational_stiffness, s.coupling.rotational_damping
-        end = moment_dot(s, first + axis, mj.qvel)
-        change = moment_dot(s, first + axis, mj.qacc)
-        in_position, in_velocity = 0.5 * h * stiffness, 0.5 * h * (h * stiffness + damping)
-        f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
-    handle = quaternion_of(s.pose.handle_quaternion)
-    return rotated(handle, vector_of(f)), rotated(handle, vector_of(f[3:6]))
-
-
-@compiled
 def midpoint_torque(s: State, tool: Quaternion, turned: Vector) -> Vector:
     """Returns the coupling's torque on the tool, in the world frame, by the midpoint rule.
 
@@ -360,22 +338,30 @@ def wrench_after_step(s: State) -> tuple[Vector, Vector, Vector, Vector]:
         Force, torque, and the tool's motion and rotation vector in the step.
     """
     lossless = s.lossless
-    half = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     lossless.is_near = is_near(s)
     lossless.was_midpoint = lossless.is_midpoint
     lossless.ticks += lossless.was_midpoint
-    if lossless.is_midpoint:
-        half = implicit_half(s)
+    if not lossless.is_midpoint:
+        force, torque, moved, turned = implicit_wrench(s, True)
+        if s.level.share[0] < 1.0 or s.level.share[1] < 1.0 or s.level.flags:
+            lossless.is_near = True
+        return force, torque, moved, turned
+    handle_frame = quaternion_of(s.pose.handle_quaternion)
+    half = applied_wrench(s, 0.5)
+    half_force, half_torque = rotated(handle_frame, half[0]), rotated(handle_frame, half[1])
     position, orientation, moved, turned = tool_after_step(s)
     tool = position, orientation
     force, torque = law_wrench(s, handle_of_step(s, True), tool, moved, turned)
-    if lossless.is_midpoint:
-        torque = midpoint_torque(s, orientation, turned)
-        # the torque is carried in the tool's frame, so that it turns with the tool
-        to_before = conjugate(quaternion_of(s.pose.tool_quaternion))
-        store_vector(lossless.applied_half[0:3], half[0])
-        store_vector(lossless.applied_half[3:6], rotated(orientation, rotated(to_before, half[1])))
+    torque = midpoint_torque(s, orientation, turned)
+    # the torque is carried in the tool's frame, so that it turns with the tool
+    to_before = conjugate(quaternion_of(s.pose.tool_quaternion))
+    store_vector(lossless.applied_half[0:3], half_force)
+    store_vector(lossless.applied_half[3:6], rotated(orientation, rotated(to_before, half_torque)))
     note_tool(s.pose, position, orientation)
+    # above the level the rest that is carried over is smaller than the half, which dissipates
+    force, torque = limited_wrench(s, force, torque)
+    if s.level.flags:
+        lossless.is_near = True
     return force, torque, moved, turned
 
 

@@ -40,6 +40,7 @@ llvmlite.binding.load_library_permanently(str(_library()))
 _ADDRESS = types.intp
 _ON_DATA = types.void(_ADDRESS, _ADDRESS)
 mj_step: Any = types.ExternalFunction("mj_step", _ON_DATA)
+mj_step2: Any = types.ExternalFunction("mj_step2", _ON_DATA)
 mj_kinematics: Any = types.ExternalFunction("mj_kinematics", _ON_DATA)
 mj_fwd_kinematics: Any = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
 mj_fwd_position: Any = types.ExternalFunction("mj_fwdPosition", _ON_DATA)
@@ -223,6 +224,8 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
 _DATA_ARRAYS = (
     "qpos",
     "qvel",
+    "act",
+    "history",
     "qacc",
     "ctrl",
     "mocap_pos",
@@ -244,6 +247,7 @@ _DATA_ARRAYS = (
     "solver_niter",
 )
 _DATA_FIELDS = (
+    "time",
     "ncon",
     "nisland",
     "nefmA",
@@ -272,7 +276,7 @@ _OWNED = (
     "outnum",
 )
 _MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
-_SIZES = ("nq", "nv", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
+_SIZES = ("nq", "nv", "na", "nhistory", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
 _CONTACT = ("size", "distance", "point", "frame", "geoms", "dim", "row")
 _IDS = (
     "handle_mocap_id",

@@ -167,13 +167,13 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.previous_generated = over
     net = stored - energy.actuator_work - energy.external_work
     change = net - observer.previous_net_storage
-    gained = (s.run.force_scale / s.run.scale) * s.guard.transmitted_share * change
+    gained = (s.run.force_scale / s.run.scale) * s.guard.share * change
     taken = change if s.guard.commanded & FORCE_OFF else 0.0
     unfelt = max(observer.stored_while_force_off + taken, 0.0)
     observer.stored_while_force_off = min(unfelt, max(stored, 0.0))
     observer.previous_net_storage = net
     # before the first tick and in a pause, the time that the device took to move is unknown
-    rate = 1.0 / interval if s.loop.tick > s.guard.ramp_start else 0.0
+    rate = 1.0 / interval if s.loop.tick > s.guard.start_tick else 0.0
     delivered = 0.0
     w, a = s.loop.wrench_on_device, observer.axis_energy
     b, b_r = observer.assumed_damping, observer.assumed_rotational_damping
@@ -216,7 +216,7 @@ def _damped(s: State, i: int, f: float, max_damping: float, debt: float) -> tupl
     if not _swings(s.observer, i):
         return f, damping
     # the force may follow the motion from tick to tick only as far as the device's damper bears
-    change, last = BOUND * max_damping * abs(u), s.guard.limited_wrench[i]
+    change, last = BOUND * max_damping * abs(u), s.loop.wrench_on_device[i]
     return min(max(f, last - change), last + change), damping
 
 

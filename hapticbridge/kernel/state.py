@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: nine sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: ten sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -9,6 +9,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | mj          | addresses, sizes and ids of model and data        | state, once                   |
 | run         | period, scheme, scales, limits, axes              | state, once                   |
 | coupling    | K, B', gains of the actuators, goal of a change   | coupling                      |
+| level       | force level, share of the gains                   | force_level                   |
 | pose        | poses of device, handle and tool, and their steps | handle                        |
 | loop        | results that a stage of a tick hands to the next  | tick                          |
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
@@ -28,10 +29,11 @@ from numpy.typing import NDArray
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
+from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.guard import (
     GUARD_DTYPE,
     bind_guard,
-    request_anchor,
+    let_go,
     restart_ramp,
     set_commanded,
 )
@@ -99,6 +101,7 @@ STATE_DTYPE = np.dtype(
         ("mj", MJ_DTYPE),
         ("run", RUN_DTYPE),
         ("coupling", COUPLING_DTYPE),
+        ("level", LEVEL_DTYPE),
         ("pose", POSE_DTYPE),
         ("loop", LOOP_DTYPE),
         ("energy", ENERGY_DTYPE),
@@ -193,7 +196,7 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
-        request_anchor(s["guard"])
+        let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
             restart_lossless(s)
 
@@ -244,6 +247,16 @@ class BoundKernel:
         mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
         run["axes_quaternion"] = quaternion
         bind_coupling(s["coupling"], parameters, _whole_gains(self._model, parameters))
+        self._owned |= bind_level(
+            s["level"],
+            self._model,
+            (
+                parameters.force_limit / parameters.force_scale,
+                parameters.torque_limit * parameters.scale / parameters.force_scale,
+            ),
+            is_solved=parameters.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT)
+            and self._model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE,
+        )
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
 

@@ -21,7 +21,6 @@ from hapticbridge.kernel.codes import (
     HALF_DONE,
     LARGEST_CONTROL,
     OK,
-    RESEATED,
     RING_FULL,
     TRIP,
     Part,
@@ -29,11 +28,19 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.coupling import command_handle_velocity, retune, wrench_after_step
-from hapticbridge.kernel.guard import DEVICE_BUTTONS, follow, limit_wrench, refusal
+from hapticbridge.kernel.coupling import command_handle_velocity, retune
+from hapticbridge.kernel.force_level import keep_state, limited_wrench, wrench_after_step
+from hapticbridge.kernel.guard import (
+    DEVICE_BUTTONS,
+    advance_share,
+    note_anchored,
+    refusal,
+    send_within,
+)
 from hapticbridge.kernel.handle import (
     anchor_handle,
     device_from_scene,
+    follow_in_part,
     handle_pose,
     move_device,
     move_handle,
@@ -141,18 +148,25 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     meter_device(s, moved, turned, interval)
     move_device(pose, position, quaternion)
 
-    handle, orientation = vector_of(pose.handle_position), quaternion_of(pose.handle_quaternion)
     buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
-    if follow(s, position, moved, turned, buttons, elapsed):
-        if s.guard.flags & RESEATED:
-            anchor_handle(pose, position, quaternion)
+    share = s.guard.share  # of the wrench that was held until now
+    if share == 1.0:
         handle, orientation = handle_pose(s.run, pose, position, quaternion)
+    else:
+        handle, orientation = follow_in_part(s.run, pose, share, moved, turned)
     move_handle(pose, handle, orientation)
+    advance_share(s, position, buttons, elapsed)
+    has_slipped = share < 1.0
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
-        retune(s)
+        has_slipped = retune(s) or has_slipped
         s.loop.has_positions = 0  # it was computed with the old gains
+    if has_slipped:
+        anchor_handle(pose)
+        note_anchored(s.guard)
+    handle = vector_of(pose.handle_position)
+    orientation = quaternion_of(pose.handle_quaternion)
 
     r.tick = s.loop.tick
     r.buttons = buttons
@@ -199,6 +213,8 @@ def before_step(
         command_handle_velocity(s, orientation)
     else:
         drive_compared(s, orientation)
+    if s.level.is_solved:
+        keep_state(s)
     if s.loop.has_positions:
         s.loop.has_positions = 0
         if not s.energy.mocap_has_moved:
@@ -307,6 +323,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         force, torque, moved, turned = lossless_wrench(s)
     else:
         force, torque, moved, turned = compared_wrench(s, is_last)
+        force, torque = limited_wrench(s, force, torque)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
@@ -335,7 +352,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
-    loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags
+    loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     if loop.active_contacts > 0:
         loop.flags |= CONTACT
     row[0].solver_iterations = _solver_iterations(s)
@@ -351,9 +368,10 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
     run = s.run
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
-    requested = norm(force)
-    force, torque = control(s, force, torque)
-    force, torque = limit_wrench(s, force, torque, requested)
+    share = s.guard.share
+    if share != 1.0:
+        force, torque = scaled(share, force), scaled(share, torque)
+    force, torque = send_within(s, (force, torque), control(s, force, torque))
     store_vector(s.loop.wrench_on_device[0:3], force)
     store_vector(s.loop.wrench_on_device[3:6], torque)
 
@@ -424,7 +442,7 @@ def _record(s: State, row: NDArray[np.void]) -> None:
     r.environment_energy, r.device_energy = energy.environment_energy, energy.device_energy
     r.injected_damping = s.observer.injected_damping
     r.injected_rotational_damping = s.observer.injected_rotational_damping
-    r.share = s.guard.ramp_share
+    r.share = s.guard.share
 
 
 @compiled

@@ -1,0 +1,229 @@
+"""Force level of the coupling: one limit of the wrench, on the tool and on the device alike.
+
+With P_F(u) = u min(1, F/‖u‖), the force on the tool is
+
+    f = P_F(u),    u = K e + (B'/T) δe
+
+and the torque has a level of its own. F in N is the device's force limit divided by ``force_scale``.
+f is the gradient of a convex potential, quadratic up to F/K and linear beyond, and a monotone
+damper. Its slopes are at most K and B', so the device condition b >= K T/2 + B' stays as it is. A
+limit on the device alone breaks the guarantee: a hand that stretches the coupling far beyond the
+limit and then yields receives energy that it never supplied.
+
+MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c belongs to the end of
+the step, c = F/‖u‖, so a step is repeated with other gains until it does: positions, contacts and
+velocities at the start of the step stay valid, only the forces are solved again. Within a step u
+answers to the force nearly as ‖u‖ = A/(1 + c σ); σ is learnt from the last two solutions, and c
+for the next tick is extrapolated, so most saturated ticks need one repetition. The share is 1 and
+nothing is repeated while the coupling is below its level.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
+from hapticbridge.kernel.coupling import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
+from hapticbridge.pose import Vector, norm, scaled
+
+TOLERANCE = 1e-6
+"""Largest error of the wrench within a saturated step, as a share of the level; no unit. The error
+is energy of the environment's port and metered there. A smaller value repeats more steps."""
+
+REPETITIONS = 12
+"""Largest number of repetitions of a step. Two are usual where a contact opens or closes."""
+
+LEVEL_DTYPE = np.dtype(
+    [
+        ("level", "<f8", 2),
+        ("share", "<f8", 2),
+        ("previous", "<f8", 2),
+        ("compliance", "<f8", 2),
+        ("is_solved", "<i8"),
+        ("repetitions", "<i8"),
+        ("state_before", "<i8"),
+        ("flags", "<i8"),
+    ]
+)
+"""Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on the
+tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
+``compliance`` σ; ``is_solved`` is 1 if steps are repeated; ``repetitions`` counts them since the
+start; ``state_before`` is the address of MuJoCo's state before the step."""
+
+
+def bind_level(
+    level: Part, model: mujoco.MjModel, levels: tuple[float, float], *, is_solved: bool
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in the levels; returns the arrays that must outlive the state.
+
+    Args:
+        level: The sub-record.
+        model: The prepared scene.
+        levels: F in N and F_r in N m on the tool.
+        is_solved: True if the wrench is solved inside MuJoCo's step.
+    """
+    level["level"] = levels
+    level["share"] = level["previous"] = 1.0
+    level["is_solved"] = is_solved
+    before = np.zeros(model.nq + model.nv + model.na + model.nhistory + 1)
+    level["state_before"] = before.ctypes.data
+    return {"state_before": before}
+
+
+@compiled
+def keep_state(s: State) -> None:
+    """Keeps MuJoCo's state before a step."""
+    mj = s.mj
+    kept = floats(s.level.state_before, mj.nq + mj.nv + mj.na + mj.nhistory + 1)
+    end = 0
+    for source, count in (
+        (mj.qpos, mj.nq),
+        (mj.qvel, mj.nv),
+        (mj.act, mj.na),
+        (mj.history, mj.nhistory),
+        (mj.time, 1),
+    ):
+        values = floats(source, count)
+        for i in range(count):
+            kept[end + i] = values[i]
+        end += count
+
+
+@compiled
+def _restore_state(s: State) -> None:
+    mj = s.mj
+    kept = floats(s.level.state_before, mj.nq + mj.nv + mj.na + mj.nhistory + 1)
+    end = 0
+    for target, count in (
+        (mj.qpos, mj.nq),
+        (mj.qvel, mj.nv),
+        (mj.act, mj.na),
+        (mj.history, mj.nhistory),
+        (mj.time, 1),
+    ):
+        values = floats(target, count)
+        for i in range(count):
+            values[i] = kept[end + i]
+        end += count
+
+
+@compiled
+def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Returns P_F of a force and a torque on the tool, and notes if one was limited."""
+    level = s.level
+    level.flags = 0
+    size, size_r = norm(force), norm(torque)
+    if size > level.level[0]:
+        force = scaled(level.level[0] / size, force)
+        level.flags = FORCE_LIMITED
+    if size_r > level.level[1]:
+        torque = scaled(level.level[1] / size_r, torque)
+        level.flags = FORCE_LIMITED
+    return force, torque
+
+
+@compiled
+def _share_at_level(level: float, size: float, share: float, compliance: float) -> float:
+    """Returns c with c ‖u‖ = F for ‖u‖ = A/(1 + c σ), given one solution; at most 1."""
+    u = size / share
+    a = u * (1.0 + share * compliance)
+    if a <= level * (1.0 + compliance):
+        return 1.0
+    return level / (a - level * compliance)
+
+
+@compiled
+def solve_level(s: State) -> bool:
+    """Repeats the step that just ended until its wrench is at the level or below.
+
+    Returns:
+        True if the step was repeated; kinematics must then be refreshed again.
+    """
+    level = s.level
+    last = (0.0, 0.0)
+    shares = (level.share[0], level.share[1])
+    count = 0
+    for _ in range(REPETITIONS):
+        force, torque = applied_wrench(s, 1.0)
+        sizes = (norm(force), norm(torque))
+        is_done = True
+        wanted = shares
+        for ch in range(2):
+            c, size = level.share[ch], sizes[ch]
+            u = size / c
+            if count > 0 and c != shares[ch]:
+                u_last = last[ch]
+                change = shares[ch] * u_last - size
+                if abs(change) > 1e-12 * level.level[ch]:
+                    level.compliance[ch] = max((u - u_last) / change, 0.0)
+            new = _share_at_level(level.level[ch], size, c, level.compliance[ch])
+            if count > REPETITIONS // 2:
+                new = 0.5 * (c + new)
+            if abs(new - c) * u > TOLERANCE * level.level[ch]:
+                is_done = False
+            wanted = (new, wanted[1]) if ch == 0 else (wanted[0], new)
+        if is_done or not math.isfinite(wanted[0] + wanted[1]):
+            break
+        last = (sizes[0] / level.share[0], sizes[1] / level.share[1])
+        shares = (level.share[0], level.share[1])
+        level.share[0], level.share[1] = wanted[0], wanted[1]
+        set_gains(s, 1.0)
+        _restore_state(s)
+        if count == 0:
+            mj_kinematics(s.mj.model, s.mj.data)  # forces on bodies act at the start's positions
+        mj_step2(s.mj.model, s.mj.data)
+        count += 1
+    level.repetitions += count
+    return count > 0
+
+
+@compiled
+def _foresee_shares(s: State) -> None:
+    """Sets the gains of the next tick: 1/c goes on as in the last two ticks."""
+    level = s.level
+    is_changed = False
+    for ch in range(2):
+        c = level.share[ch]
+        reach = 2.0 / c - 1.0 / level.previous[ch]
+        level.previous[ch] = c
+        new = 1.0 / reach if c < 1.0 and reach > 1.0 else 1.0
+        is_changed = is_changed or new != c
+        level.share[ch] = new
+    if is_changed:
+        set_gains(s, 1.0)
+
+
+@compiled
+def wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Evaluates the limited law after a step of MuJoCo, and notes the tool's new pose.
+
+    Args:
+        s: The bound state.
+        is_last: True for the last substep of the tick.
+
+    Returns:
+        Force, torque, and the tool's motion and rotation vector since the previous evaluation.
+    """
+    level = s.level
+    position, orientation, moved, turned = tool_after_step(s)
+    handle = handle_of_step(s, is_last)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
+    if is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1]:
+        if level.is_solved:
+            if solve_level(s):
+                position, orientation, moved, turned = tool_after_step(s)
+                force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+            _foresee_shares(s)
+        force, torque = limited_wrench(s, force, torque)
+    else:
+        level.flags = 0
+    note_tool(s.pose, position, orientation)
+    return force, torque, moved, turned
