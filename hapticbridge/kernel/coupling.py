@@ -35,14 +35,16 @@ import numpy as np
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.handle import (
+    device_from_scene,
     handle_of_step,
     note_tool,
+    scene_from_device,
     slip_handle,
     tool_after_step,
 )
 from hapticbridge.kernel.ledger import moment_dot
 from hapticbridge.kernel.mujoco_c import floats
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -80,6 +82,10 @@ COUPLING_DTYPE = np.dtype(
         ("gains", "<f8", 6),  # of the actuators: three for forces, three for torques
         ("tuning_goal", "<f8", 12),  # TUNED, then gains
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
+        ("has_passive", "<i8"),
+        ("is_passive", "<f8", 6),  # 1 for an axis of the device without motor
+        ("hold", "<f8", 2),
+        ("idle", "<f8", 2),
     ]
 )
 """Sub-record ``coupling``, written by this module alone."""
@@ -99,6 +105,11 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
     for name, value in zip(TUNED, tuned_values(parameters), strict=True):
         coupling[name] = value
     coupling["gains"] = gains
+    guarding = parameters.guarding
+    coupling["is_passive"] = [1.0 - (guarding.motors >> i & 1) for i in range(6)]
+    coupling["has_passive"] = guarding.motors != ALL_MOTORS
+    coupling["hold"] = guarding.hold_force, guarding.hold_torque
+    coupling["idle"] = guarding.idle_force, guarding.idle_torque
 
 
 def set_tuning_goal(
@@ -262,31 +273,61 @@ def pulled(s: State) -> tuple[Vector, Vector]:
 
 
 @compiled
-def shorten(s: State, length: float, angle: float) -> bool:
-    """Slips the handle toward the tool, to a largest stretch in m and twist in rad.
+def _within(v: Vector, length: float) -> Vector:
+    """Returns a vector, shortened to a largest length."""
+    size = norm(v)
+    return scaled(length / size, v) if size > length else v
+
+
+@compiled
+def _held(s: State, v: Vector, first: int, length: float) -> Vector:
+    """Returns a vector whose part along the axes without motor is shortened to a length."""
+    axes = s.run.axes
+    x, y, z = device_from_scene(axes, v)
+    k = s.coupling.is_passive
+    part = scene_from_device(axes, (x * k[first], y * k[first + 1], z * k[first + 2]))
+    return add(v, subtract(_within(part, length), part))
+
+
+@compiled
+def slip(s: State, max_stretch: float, max_twist: float) -> bool:
+    """Slips the handle toward the tool, where the spring holds more than it may.
+
+    Three things make it slip. A raised gain must not raise the spring's energy. Along an axis
+    without motor the coupling holds up to ``hold`` and then slips. While the hand is let go it
+    relaxes to ``idle``. Each only shortens the spring, so energy is lost and none is gained.
+
+    Args:
+        s: The bound state, with the handle's new and the tool's old pose.
+        max_stretch: Largest stretch in m.
+        max_twist: Largest twist in rad.
 
     Returns:
         True if it slipped.
     """
+    k = s.coupling
     stretch, twist = pulled(s)
-    size, size_r = norm(stretch), norm(twist)
-    if size <= length and size_r <= angle:
+    new, new_twist = _within(stretch, max_stretch), _within(twist, max_twist)
+    if k.has_passive:
+        new = _held(s, new, 0, k.hold[0] / k.stiffness)
+        if k.rotational_stiffness > 0.0:
+            new_twist = _held(s, new_twist, 3, k.hold[1] / k.rotational_stiffness)
+    if s.guard.share == 0.0:
+        new = _within(new, k.idle[0] / k.stiffness)
+        if k.rotational_stiffness > 0.0:
+            new_twist = _within(new_twist, k.idle[1] / k.rotational_stiffness)
+    if new == stretch and new_twist == twist:
         return False
-    shift, turn = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if size > length:
-        shift = scaled(length / size - 1.0, stretch)
-    if size_r > angle:
-        turn = scaled(angle / size_r - 1.0, twist)
-    slip_handle(s.pose, shift, turn)
+    slip_handle(s.pose, subtract(new, stretch), subtract(new_twist, twist))
     return True
 
 
 @compiled
-def retune(s: State) -> bool:
-    """Moves the gains one tick nearer to their goal; the spring's energy does not rise.
+def retune(s: State) -> tuple[float, float]:
+    """Moves the gains one tick nearer to their goal.
 
     Returns:
-        True if the handle slipped.
+        Largest stretch in m and twist in rad with which the spring's energy does not rise.
     """
     k, goal, left = s.coupling, s.coupling.tuning_goal, s.coupling.tuning_ticks
     stretch, twist = pulled(s)
@@ -316,4 +357,4 @@ def retune(s: State) -> bool:
         length = _spring_length(k.stiffness, energy, s.level.level[0])
     if k.rotational_stiffness > rotational:
         angle = _spring_length(k.rotational_stiffness, energy_r, s.level.level[1])
-    return shorten(s, length, angle)
+    return length, angle

@@ -26,8 +26,13 @@ _TANK_ALONE = 2
 MAX_BUTTONS = 32
 """Largest count of buttons in a mask. No handle has more."""
 
-LATER = frozenset({"reach", "ramp_energy"})
-"""Fields missing in the first recordings with a guard; they default to infinity."""
+ALL_MOTORS = 63
+"""Mask of six axes with a motor."""
+
+LATER = frozenset(
+    {"reach", "ramp_energy", "motors", "hold_force", "hold_torque", "idle_force", "idle_torque"}
+)
+"""Fields missing in the first recordings with a guard."""
 
 _POSITIVE = ("force_rise", "torque_rise", "longest_stall")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
@@ -96,6 +101,11 @@ class GuardParameters:
     energy: float = math.inf
     reach: float = math.inf
     ramp_energy: float = math.inf
+    motors: int = ALL_MOTORS
+    hold_force: float = math.inf
+    hold_torque: float = math.inf
+    idle_force: float = math.inf
+    idle_torque: float = math.inf
 
     def __post_init__(self) -> None:
         if self.controller == _TANK_ALONE:
@@ -109,7 +119,7 @@ class GuardParameters:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
-        for name in (*_POSITIVE, *_TRIPS, *LATER):
+        for name in (*_POSITIVE, *_TRIPS, *(LATER - {"motors"})):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")

@@ -128,6 +128,18 @@ def excess_energy_to_device(s: State) -> float:
 
 
 @compiled
+def foreseen_excess(s: State) -> float:
+    """Returns ``excess_energy_to_device`` after the next tick, at the speed of the last one."""
+    observer, w = s.observer, s.loop.wrench_on_device
+    work = 0.0
+    for i in range(6):
+        u = observer.device_velocity[i]
+        b = observer.assumed_damping if i < 3 else observer.assumed_rotational_damping
+        work += (w[i] - b * u) * u
+    return float(observer.excess_energy_to_device + s.run.period * work)
+
+
+@compiled
 def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Updates the passivity observer with the previous tick's energy flow.
 

@@ -18,6 +18,7 @@ from hapticbridge.kernel.codes import (
     BAD_RESULT,
     BAD_SAMPLE,
     CONTACT,
+    GAVE_ENERGY,
     HALF_DONE,
     LARGEST_CONTROL,
     OK,
@@ -28,7 +29,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.coupling import command_handle_velocity, retune
+from hapticbridge.kernel.coupling import command_handle_velocity, retune, slip
 from hapticbridge.kernel.force_level import keep_state, limited_wrench, wrench_after_step
 from hapticbridge.kernel.guard import (
     DEVICE_BUTTONS,
@@ -71,7 +72,7 @@ from hapticbridge.kernel.mujoco_c import (
     pointer_at,
     release_fence,
 )
-from hapticbridge.kernel.passivity_controller import control, observe_energy
+from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -156,13 +157,13 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
         handle, orientation = follow_in_part(s.run, pose, share, moved, turned)
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
-    has_slipped = share < 1.0
+    max_stretch = max_twist = np.inf
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
-        has_slipped = retune(s) or has_slipped
+        max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
-    if has_slipped:
+    if slip(s, max_stretch, max_twist) or share < 1.0:
         anchor_handle(pose)
         note_anchored(s.guard)
     handle = vector_of(pose.handle_position)
@@ -349,6 +350,9 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     ):
         return _refuse(s)
     _render(s, force, torque)
+    if foreseen_excess(s) > s.guard.max_energy:
+        _refuse(s)
+        return GAVE_ENERGY
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
