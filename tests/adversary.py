@@ -136,7 +136,9 @@ def _attack(
                 d[:], t[:] = 0.0, 0.0
         elif kind == 3:  # shakes at one frequency
             angle = 2.0 * np.pi * h.tick / (push + hold)
-            d[:] = 1e-3 * speed * np.array([np.sin(angle), np.cos(1.3 * angle), np.sin(0.7 * angle)])
+            d[:] = (
+                1e-3 * speed * np.array([np.sin(angle), np.cos(1.3 * angle), np.sin(0.7 * angle)])
+            )
             t[:] = 2e-3 * np.array([np.cos(angle), np.sin(1.1 * angle), np.cos(0.9 * angle)])
         else:  # trembles without memory
             for i in range(3):
@@ -232,7 +234,7 @@ class Attack:
             grip=scene.grip,
             period=period,
             substeps=1,
-            coupling=method.used(strongest, period),
+            coupling=method.law_coupling(strongest, period),
             scale=self.scale,
             force_scale=self.force_scale,
             force_limit=1e9 if self.is_limited_alone else limits[0],
@@ -249,9 +251,7 @@ class Attack:
         hand["quaternion"][0, 0] = 1.0
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
         habits = 10 ** rng.uniform(-1.0, 0.4), rng.uniform(0.05, 0.6)
-        options = np.array(
-            [self.axes, self.kind, b, b_r, *limits, 0.0, *habits, *np.ceil(times)]
-        )
+        options = np.array([self.axes, self.kind, b, b_r, *limits, 0.0, *habits, *np.ceil(times)])
         seed_hand(self.seed)
         code = OK
         for _ in range(ticks // CHUNK):
@@ -261,7 +261,7 @@ class Attack:
                 kernel.command(int(rng.choice([0, FORCE_OFF, CLUTCHED])))
             if self.tunes and rng.random() < 0.2:
                 wanted = self._coupling(rng, b / gain, b_r / gain_r, rng.uniform(0.1, 1.0))
-                law = method.used(wanted, period)
+                law = method.law_coupling(wanted, period)
                 goal = RunParameters(**{**_fields(parameters), "coupling": law})
                 kernel.tune(goal, method.gains(law, period), max(round(0.02 / period), 1))
             code = _attack(kernel.state, sample, kernel.row, hand, options)
@@ -269,9 +269,7 @@ class Attack:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code
 
-    def _coupling(
-        self, rng: np.random.Generator, b: float, b_r: float, share: float
-    ) -> Coupling:
+    def _coupling(self, rng: np.random.Generator, b: float, b_r: float, share: float) -> Coupling:
         """Returns a coupling that needs at most a share of the damping b."""
         damping, damping_r = share * b * rng.uniform(0.0, 0.5), share * b_r * rng.uniform(0.0, 0.5)
         return Coupling(

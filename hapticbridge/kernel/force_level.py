@@ -4,16 +4,16 @@ With P_F(u) = u min(1, F/‖u‖), the force on the tool is
 
     f = P_F(u),    u = K e + (B'/T) δe
 
-and the torque has a level of its own. F in N is the device's force limit divided by ``force_scale``.
-f is the gradient of a convex potential, quadratic up to F/K and linear beyond, and a monotone
-damper. Its slopes are at most K and B', so the device condition b >= K T/2 + B' stays as it is. A
-limit on the device alone breaks the guarantee: a hand that stretches the coupling far beyond the
-limit and then yields receives energy that it never supplied.
+and the torque has a level of its own. F in N is the device's force limit divided by
+``force_scale``. f is the gradient of a convex potential, quadratic up to F/K and linear beyond, and
+a monotone damper. Its slopes are at most K and B', so the device condition b >= K T/2 + B' stays as
+it is. A limit on the device alone breaks the guarantee: a hand that stretches the coupling far
+beyond the limit and then yields receives energy that it never supplied.
 
-MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c belongs to the end of
-the step, c = F/‖u‖, so a step is repeated with other gains until it does: positions, contacts and
-velocities at the start of the step stay valid, only the forces are solved again. Within a step u
-answers to the force nearly as ‖u‖ = A/(1 + c σ); σ is learnt from the last two solutions, and c
+MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c belongs to the end
+of the step, c = F/‖u‖, so a step is repeated with other gains until it does: positions, contacts
+and velocities at the start of the step stay valid, only the forces are solved again. Within a step
+u answers to the force nearly as ‖u‖ = A/(1 + c σ); σ is learnt from the last two solutions, and c
 for the next tick is extrapolated, so most saturated ticks need one repetition. The share is 1 and
 nothing is repeated while the coupling is below its level.
 """
@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
-from hapticbridge.kernel.coupling import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.pose import Vector, norm, scaled
 
@@ -52,8 +52,8 @@ LEVEL_DTYPE = np.dtype(
         ("flags", "<i8"),
     ]
 )
-"""Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on the
-tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
+"""Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
+the tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
 ``compliance`` σ; ``is_solved`` is 1 if steps are repeated; ``repetitions`` counts them since the
 start; ``state_before`` is the address of MuJoCo's state before the step."""
 

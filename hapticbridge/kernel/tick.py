@@ -29,15 +29,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.coupling import command_handle_velocity, retune, slip
 from hapticbridge.kernel.force_level import keep_state, limited_wrench, wrench_after_step
-from hapticbridge.kernel.guard import (
-    DEVICE_BUTTONS,
-    advance_share,
-    note_anchored,
-    refusal,
-    send_within,
-)
 from hapticbridge.kernel.handle import (
     anchor_handle,
     device_from_scene,
@@ -47,6 +39,7 @@ from hapticbridge.kernel.handle import (
     move_handle,
     place_handle,
 )
+from hapticbridge.kernel.law import command_handle_velocity, retune, slip
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
     judge_environment,
@@ -55,8 +48,12 @@ from hapticbridge.kernel.ledger import (
     note_moved_mocap_bodies,
     refresh_energies,
 )
-from hapticbridge.kernel.lossless import apply_carried, finish_lossless, lossless_flag
-from hapticbridge.kernel.lossless import wrench_after_step as lossless_wrench
+from hapticbridge.kernel.lossless import (
+    apply_carried,
+    finish_lossless,
+    lossless_flag,
+    lossless_wrench,
+)
 from hapticbridge.kernel.mujoco_c import (
     floats,
     has_warned,
@@ -73,6 +70,13 @@ from hapticbridge.kernel.mujoco_c import (
     release_fence,
 )
 from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
+from hapticbridge.kernel.tick_guard import (
+    DEVICE_BUTTONS,
+    advance_share,
+    note_anchored,
+    refusal,
+    send_within,
+)
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -105,7 +109,7 @@ LOOP_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
-next. ``external_flags`` are ``STALE_SAMPLE`` and ``RESEATED`` as the live loop or a recording has
+next. ``external_flags`` are ``STALE_SAMPLE`` and ``REANCHORED`` as the live loop or a recording has
 them, set before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
 ``motion`` is the tool's, in m and rad; wrenches in N and N m, peaks since the start."""
 
@@ -642,7 +646,7 @@ def simulate_recorded(
     Args:
         state: The bound state.
         samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` and ``RESEATED`` as recorded, one per tick.
+        external_flags: ``STALE_SAMPLE`` and ``REANCHORED`` as recorded, one per tick.
         elapsed: Time between two samples in s, one per tick.
         row: The bound record.
         rows: Receives the records; as long as ``samples``.

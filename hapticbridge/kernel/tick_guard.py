@@ -33,7 +33,7 @@ from hapticbridge.kernel.codes import (
     GAVE_ENERGY,
     JUMPED,
     RAMPING,
-    RESEATED,
+    REANCHORED,
     STALE_SAMPLE,
     STRETCHED,
     TWISTED,
@@ -140,7 +140,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
     if norm(rotation_between(tool, handle)) > guard.max_angle:
         return TWISTED
-    return GAVE_ENERGY if s.observer.excess_energy_to_device > guard.max_energy else 0
+    return GAVE_ENERGY if s.observer.excess_device_energy > guard.max_energy else 0
 
 
 @compiled
@@ -163,12 +163,12 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     guard.consecutive_stale = guard.consecutive_stale + 1 if is_stale else 0
     waited = guard.time_since_sample + max(elapsed, s.run.period)
     guard.time_since_sample = waited if is_stale else 0.0
-    is_released = (buttons & (guard.clutch | CLUTCHED)) != 0
-    is_released = is_released or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
-    is_released = is_released or norm(position) > guard.reach
-    if is_released:
+    is_clutched = (buttons & (guard.clutch | CLUTCHED)) != 0
+    is_clutched = is_clutched or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
+    is_clutched = is_clutched or norm(position) > guard.reach
+    if is_clutched:
         guard.flags |= CLUTCH
-    is_off = is_released or (buttons & FORCE_OFF) != 0
+    is_off = is_clutched or (buttons & FORCE_OFF) != 0
     is_off = is_off or (guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks)
     if is_off:
         guard.share = max(guard.share - 1.0 / guard.fade_ticks, 0.0)
@@ -183,7 +183,7 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
 @compiled
 def note_anchored(guard: Part) -> None:
     """Notes that the handle was anchored anew in this tick."""
-    guard.flags |= RESEATED
+    guard.flags |= REANCHORED
 
 
 @compiled
