@@ -25,11 +25,6 @@ from hapticbridge.record import SAMPLE_DTYPE
 LONGEST_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""
 
-USUAL_SLEW_TIME = 2e-3
-"""Shortest time in s from zero wrench to its limit. A coupling of 2400 N/m produces 10 N in 2 ms at
-2 m/s, faster than a hand taps. A longer time delays true contacts, and delay creates energy; a
-shorter one passes a jump of the scene as a blow."""
-
 USUAL_STRETCH = 0.2
 """Stretch limit in m of the device's motion; no hand at a desk goes that far from its tool. A
 smaller limit stops users who pull on a stuck tool; a larger one misses a lost tool."""
@@ -51,7 +46,6 @@ class Limits:
     Attributes:
         force: Largest norm of the force in N, > 0; a larger force keeps its direction.
         torque: Largest norm of the torque in N m, > 0.
-        slew_time: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
         ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
             stores much energy meanwhile (``kernel.tick_guard``).
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
@@ -68,7 +62,6 @@ class Limits:
 
     force: float
     torque: float
-    slew_time: float = USUAL_SLEW_TIME
     ramp: float = 0.5
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
@@ -82,10 +75,6 @@ class Limits:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
         if not 0 <= self.ramp <= LONGEST_RAMP:
             raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
-        if not 0 <= self.slew_time <= LONGEST_RAMP:
-            raise DeviceError(
-                f"slew time is {self.slew_time!r} s; it must be 0 to {LONGEST_RAMP:g}"
-            )
         for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -104,17 +93,10 @@ class Limits:
         """Returns the length of the ramp in ticks of ``period`` seconds."""
         return round(self.ramp / period)
 
-    def slew_limits(self, period: float) -> tuple[float, float]:
-        """Returns the largest change of force (N) and torque (N m) per tick."""
-        if self.slew_time == 0:
-            return math.inf, math.inf
-        return self.force * period / self.slew_time, self.torque * period / self.slew_time
-
 
 UNLIMITED = Limits(
     force=1e30,
     torque=1e30,
-    slew_time=0.0,
     ramp=0.0,
     stretch=math.inf,
     angle=math.inf,
@@ -317,11 +299,6 @@ LONGEST_STALL, STALL_PERIODS = 0.05, 5
 """Longest stall of the loop: 50 ms, or five periods if these are longer. Afterwards the hand's
 position is unknown: at 0.4 m/s it has moved 20 mm."""
 
-RAMP_ENERGY = 0.01
-"""Energy in J that the coupling may store while the wrench rises at full pace: 7 N at 2400 N/m. A
-start may give as much to the hand during its ramp. It is a quarter of the energy limit, so that a
-start alone never ends a run. A smaller value slows the rise with a heavy tool."""
-
 JUMP_MARGIN = 2.0
 """Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
 shows up to two periods of motion in one."""
@@ -373,10 +350,7 @@ def guard_parameters_for(
             no controller. A spring turned far beyond the torque limit returns more than the credit
             covers, and an account of both ports would then blame a passive run.
     """
-    force_slew, torque_slew = limits.slew_limits(period)
     common = GuardParameters(
-        force_slew=force_slew,
-        torque_slew=torque_slew,
         fade_ticks=max(round(FADE / period), 1),
         stretch=limits.stretch * scale,
         angle=limits.angle,
@@ -404,9 +378,7 @@ def guard_parameters_for(
         energy_credit_limit=ENERGY_CREDIT,
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         longest_stall=max(LONGEST_STALL, STALL_PERIODS * period),
-        reanchors_at_start=True,
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,
-        ramp_energy=RAMP_ENERGY,
     )

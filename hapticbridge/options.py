@@ -311,7 +311,6 @@ class RunSetup:
             guard,
             clutch=button_mask(options.clutch, "clutch"),
             dead_man=button_mask(options.dead_man, "dead-man"),
-            reanchors_at_start=guard.reanchors_at_start and not options.workspace.absolute,
         )
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
         is_real_clock = clock.name == RealClock.name
@@ -387,7 +386,8 @@ class RunSetup:
             axes=self.workspace.rotation,
             force_limit=self.limits.force,
             torque_limit=self.limits.torque,
-            ramp_ticks=self.limits.ramp_ticks(self.period),
+            # a prescribed motion has no hand that a ramp would protect
+            ramp_ticks=0 if self.info.is_prescribed else self.limits.ramp_ticks(self.period),
             device_origin=IDENTITY_POSE if is_absolute else pose,
             handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,

@@ -118,7 +118,6 @@ class Ledger:
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
-        tuning_work: Work on the coupling's spring by commands (``kernel.law``).
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.
@@ -134,7 +133,6 @@ class Ledger:
     coupling_work: float
     actuator_work: float
     external_work: float
-    tuning_work: float
     environment_energy: float
     device_energy: float
     slack: float
@@ -177,7 +175,6 @@ _ENERGIES = (
     "coupling_work",
     "actuator_work",
     "external_work",
-    "tuning_work",
     "environment_energy",
     "device_energy",
     "slack",

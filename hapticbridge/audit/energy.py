@@ -10,13 +10,12 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.motion import Array, turn_between
+from hapticbridge.audit.motion import Array, Motion, turn_between
 from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
@@ -54,102 +53,27 @@ def dissipated_by_damping(
     return np.asarray(np.where(is_running, energy / time, 0.0))
 
 
-def transmitted_shares(ticks: NDArray[np.void], parameters: RunParameters) -> tuple[Array, Array]:
-    """Returns the shares of force and torque that passed limits, ramp and fade, (n,) each."""
-    scales = (parameters.force_scale, parameters.force_scale / parameters.scale)
-    shares = []
-    for part, scale in zip((slice(0, 3), slice(3, 6)), scales, strict=True):
-        full = scale * np.linalg.norm(ticks["wrench_on_tool"][:, part], axis=1)
-        sent = np.linalg.norm(ticks["wrench_on_device"][:, part], axis=1)
-        share = np.divide(sent, full, out=np.ones_like(full), where=full > 0)
-        shares.append(np.minimum(share, 1.0))  # injected damping may add to the wrench
-    return shares[0], shares[1]
+def released_by_coupling(parameters: RunParameters, gains: Array, motion: Motion) -> Array:
+    """Returns V(e) + V(φ), the energy that the coupling's springs hold, (n,) in J of the scene.
 
+    With the work w_k on the tool and the energy E_d given to the device beyond its dissipation,
 
-class SpringPath(NamedTuple):
-    """Motion of the coupling for one kind of axis, in m or as rotation vectors in rad.
+        E_d + (s/scale) [Σ w_k + V(e_k)] <= 0
 
-    Attributes:
-        pulled: p = h_k − x_{k−1}, (n, 3).
-        stretch: e = h − x, (n, 3).
-        stretched: δe, the change of e in each tick, (n, 3).
-        work: Work w of the coupling on the tool in each tick, (n,) in J.
-        transmitted: c, the share of force or torque that reached the device, (n,).
-    """
-
-    pulled: Array
-    stretch: Array
-    stretched: Array
-    work: Array
-    transmitted: Array
-
-
-def stored_in_coupling(
-    parameters: RunParameters,
-    gains: Array,
-    paths: tuple[SpringPath, SpringPath],
-    is_start: NDArray[np.bool_],
-    share: Array,
-    share_before: Array,
-) -> tuple[Array, Array]:
-    """Returns the energy stored in coupling and tool from the handle, in J of the scene.
-
-        Σ c_k w_k + r_k V(e_k) − Σ (r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
-
-    V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. Let E be
-    the energy given to the device minus its dissipation plus this result. With b >= K T/2 + B and
-    no active limit, E is never above zero, for any hand and tool. This is the identity behind (6),
-    with V(e) at the end on the left. An excess above zero comes from the wrench held between
-    samples and is the fault of the port ``device``.
-
-    The second sum is the energy already stretched into the spring when the force is switched on, in
-    a ramp or after a jump of the device before its first tick; r_{k−1} is 0 at a start. W_k is
-    ``work_of_commands``, which the caller subtracts.
-
-    Args:
-        parameters: Run parameters of a method with a coupling law and one law per tick.
-        gains: K, B', K_r and B'_r in each tick, (n, 4).
-        paths: Translation and rotation of the coupling.
-        is_start: True where the force begins to rise, (n,).
-        share: r, the share of the wrench that ramp and fade transmitted, (n,).
-        share_before: r of the previous tick, (n,).
-
-    Returns:
-        The summand of each tick without W_k, and r V(e); (n,) each.
+    for every hand and tool if b >= K T/2 + B: the identity behind (6), with V(e) at the end on the
+    left. V is the energy of a spring whose force stops growing at the force level. It holds at any
+    share r, because the handle moves by r times the device's motion where the device gets r times
+    the force. An excess above zero is the fault of the port ``device``.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
-    rise = np.where(is_start, share, share - share_before)
-    parts, stored = np.zeros(len(share)), np.zeros(len(share))
-    for column, limit, path in zip((0, 2), limits_on_tool(parameters), paths, strict=True):
-        k, b = gains[:, column], gains[:, column + 1]
-        spring = spring_energy(k, np.linalg.norm(path.stretch, axis=1), limit)
-        present = spring + 0.5 * b / parameters.period * np.sum(path.stretched**2, axis=1)
-        parts += np.where(is_start, 0.0, path.transmitted * path.work) - rise * present
-        stored += share * spring
-    return parts, stored
-
-
-def work_of_commands(
-    parameters: RunParameters,
-    gains_before: Array,
-    gains: Array,
-    paths: tuple[SpringPath, SpringPath],
-    share_before: Array,
-) -> Array:
-    """Returns W_k = r_{k−1} (V_k(p_k) − V_{k−1}(p_k)), the work of commands that change K, in J.
-
-    Neither scene nor coupling released this energy. ``gains_before`` holds the gains of each
-    previous tick, (n, 4); the other arguments are those of ``stored_in_coupling``.
-    """
-    work = np.zeros(len(share_before))
-    for column, limit, path in zip((0, 2), limits_on_tool(parameters), paths, strict=True):
-        k_before, k = gains_before[:, column], gains[:, column]
-        if np.any(k != k_before):
-            length = np.linalg.norm(path.pulled, axis=1)
-            work += spring_energy(k, length, limit) - spring_energy(k_before, length, limit)
-    return share_before * work
+    stored = np.zeros(len(gains))
+    for column, limit, e in zip(
+        (0, 2), limits_on_tool(parameters), (motion.stretch, motion.twist), strict=True
+    ):
+        stored += spring_energy(gains[:, column], np.linalg.norm(e, axis=1), limit)
+    return stored
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +94,6 @@ class EnergyBalance:
             released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
             per tick. With a coupling law, energy created by the environment is not included; it
             belongs to the other port.
-        commanded: Energy that commands added to the effective coupling, (n,) in J.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
     """
 
@@ -181,7 +104,6 @@ class EnergyBalance:
     environment_energy: Array
     slack: Array
     excess_device_energy: Array
-    commanded: Array
     sums: dict[str, float]
 
     @classmethod
@@ -190,11 +112,8 @@ class EnergyBalance:
         ticks, motion, parameters = block.ticks, block.motion, events.parameters
         before, gains = block.state.sums, events.gains(ticks["tick"])
         wrench = ticks["wrench_on_tool"]
-        works = (
-            np.sum(wrench[:, :3] * motion.tool_step, axis=1),
-            np.sum(wrench[:, 3:] * motion.tool_turn, axis=1),
-        )
-        work = works[0] + works[1]
+        work = np.sum(wrench[:, :3] * motion.tool_step, axis=1)
+        work += np.sum(wrench[:, 3:] * motion.tool_turn, axis=1)
         totals = {"throughput": _summed(np.abs(work), before["throughput"])}
         # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = ticks["coupling_work"]
@@ -207,29 +126,13 @@ class EnergyBalance:
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
         totals |= _device_energies(block, events, delay)
-        released, commanded = coupling_work, np.zeros(len(ticks))
-        totals["stored_in_coupling"] = np.zeros(len(ticks))
-        lost = created  # without a law, all energy stored in the scene counts
+        released, lost = coupling_work, created  # without a law all energy in the scene counts
         if parameters.has_law:
-            shares = transmitted_shares(ticks, parameters)
-            stretched = motion.stretched
-            paths = (
-                SpringPath(motion.pulled, motion.stretch, stretched[0], works[0], shares[0]),
-                SpringPath(motion.turned, motion.twist, stretched[1], works[1], shares[1]),
-            )
-            gains_before = events.gains(ticks["tick"] - 1)
-            commanded = work_of_commands(parameters, gains_before, gains, paths, block.share_before)
-            parts, held = stored_in_coupling(
-                parameters, gains, paths, block.is_start, block.share, block.share_before
-            )
-            kept = _summed(parts - commanded, before["stored_in_coupling"])
-            totals["stored_in_coupling"] = kept
             # with a delay the device is elsewhere, and only the energy given so far counts
-            released = kept if delay else kept + held
-            # The slack covers energy created by the environment, but a ramp or a limit passes only
-            # a share of the slack. Counted here, it would blame a device that bears its coupling.
+            if not delay:
+                released = coupling_work + released_by_coupling(parameters, gains, motion)
+            # energy that the environment created belongs to the other port
             lost = np.minimum(created, 0.0)
-        totals["commanded"] = _summed(commanded, before["commanded"])
         excess = np.zeros(len(ticks))
         if parameters.device_damping is not None and (
             not parameters.has_law or parameters.law_evaluations == 1
@@ -244,7 +147,6 @@ class EnergyBalance:
             environment_energy=created,
             slack=totals["slack"],
             excess_device_energy=excess,
-            commanded=totals["commanded"],
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
 

@@ -108,21 +108,18 @@ class RunEvents:
         """Returns True for each tick that began with a reset."""
         return np.isin(numbers, self.resets)
 
-    def sentences(self, added: float | None = None) -> tuple[str, ...]:
-        """Describes changes of the coupling; empty without any.
-
-        ``added`` is the energy that they added to the effective coupling, in J; None if unknown.
-        """
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Sentences about changes of the coupling; empty without any."""
         first, last = self.couplings[0], self.couplings[-1]
         if last is first:
             return ()
         turning = ""
         if last.rotational_stiffness != first.rotational_stiffness:
             turning = f", K_r = {last.rotational_stiffness:g} N m/rad"
-        energy = "" if added is None else f", which gave the coupling {added:.3g} J"
         return (
             f"so it began; commands changed the coupling {len(self.couplings) - 1} times, last to "
-            f"K = {last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used{energy}",
+            f"K = {last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used",
         )
 
 

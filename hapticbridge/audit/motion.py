@@ -24,6 +24,12 @@ def quaternion_product(a: Array, b: Array) -> Array:
     return np.concatenate([scalar, vector], axis=-1)
 
 
+def quaternion_of(turn: Array) -> Array:
+    """Returns the quaternions (n, 4) of rotation vectors (n, 3)."""
+    half = 0.5 * np.linalg.norm(turn, axis=1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * turn], axis=1)
+
+
 def conjugate(q: Array) -> Array:
     """Returns the inverse of unit quaternions (…, 4)."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
@@ -58,15 +64,13 @@ class Motion:
     Arrays are (n, 3) unless stated. The jump of a reset is no motion.
 
     Attributes:
-        handle_step: h_k − h_{k−1}.
-        handle_turn: Rotation of the handle.
+        handle_step: d, the handle's motion with the device: r_{k−1} scale A δp; without slip.
+        handle_turn: Its rotation with the device, r_{k−1} A δφ.
         tool_step: x_k − x_{k−1}.
         tool_turn: Rotation of the tool.
         stretch: e = h − x.
         twist: Rotation from the tool to the handle.
         twist_before: Rotation from the tool to the handle in the previous tick.
-        pulled: h_k − x_{k−1}, the stretch after the handle's step and before the tool's.
-        turned: Rotation from the previous tick's tool to the handle.
         carried: Rotation of the tool in each tick as quaternions, (n, 4).
         handle_before: Handle pose in the previous tick, (n, 7).
         tool_before: Tool pose in the previous tick, (n, 7).
@@ -79,31 +83,34 @@ class Motion:
     stretch: Array
     twist: Array
     twist_before: Array
-    pulled: Array
-    turned: Array
     carried: Array
     handle_before: Array
     tool_before: Array
 
     @classmethod
-    def of(cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents) -> Motion:
-        """Computes the motion of consecutive records."""
+    def of(
+        cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents, share: Array
+    ) -> Motion:
+        """Computes the motion of consecutive records; ``share`` is r_{k−1}, (n,)."""
         rows = np.concatenate([state.row, ticks])
         is_reset = events.is_reset(ticks["tick"])[:, None]
         handle, tool = pose_of(rows, "handle"), pose_of(rows, "tool")
         handle_before = np.where(is_reset, events.home, handle[:-1])
         tool_before = np.where(is_reset, events.home, tool[:-1])
         handle, tool = handle[1:], tool[1:]
+        parameters, device = events.parameters, pose_of(rows, "device")
+        axes = np.array(parameters.axes).reshape(3, 3)
+        moved = parameters.scale * np.diff(device[:, :3], axis=0) @ axes.T
+        # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
+        turned = turn_between(device[:-1, 3:], device[1:, 3:]) @ axes.T
         return cls(
-            handle_step=handle[:, :3] - handle_before[:, :3],
-            handle_turn=turn_between(handle_before[:, 3:], handle[:, 3:]),
+            handle_step=share[:, None] * moved,
+            handle_turn=share[:, None] * turned,
             tool_step=tool[:, :3] - tool_before[:, :3],
             tool_turn=turn_between(tool_before[:, 3:], tool[:, 3:]),
             stretch=handle[:, :3] - tool[:, :3],
             twist=turn_between(tool[:, 3:], handle[:, 3:]),
             twist_before=turn_between(tool_before[:, 3:], handle_before[:, 3:]),
-            pulled=handle[:, :3] - tool_before[:, :3],
-            turned=turn_between(tool_before[:, 3:], handle[:, 3:]),
             carried=quaternion_product(tool[:, 3:], conjugate(tool_before[:, 3:])),
             handle_before=handle_before,
             tool_before=tool_before,

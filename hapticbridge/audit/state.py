@@ -21,8 +21,6 @@ SUMS = (
     "slack",
     "delayed_device_energy",
     "device_dissipation",
-    "stored_in_coupling",
-    "commanded",
 )
 """Names of the cumulative energies."""
 
@@ -35,18 +33,14 @@ class AuditState:
         row: Record of the previous tick, (1,). Before the first tick it holds the poses at the
             start and zeros.
         since_sample: Time in s that the device has been without a new sample.
-        share: Share of the wrench that ramp and fade transmitted.
-        ramp_ticks: Length of the newest ramp in ticks.
-        anchors: Device pose and handle pose (7,) at the last anchoring.
+        rise_ticks: Ticks in which the share of the wrench rises from 0 to 1.
         start_energy: Kinetic plus potential energy before the first tick, in J.
         sums: Cumulative energies in J, by the names of ``SUMS``.
     """
 
     row: NDArray[np.void]
     since_sample: float
-    share: float
-    ramp_ticks: float
-    anchors: tuple[Array, Array]
+    rise_ticks: float
     start_energy: float
     sums: dict[str, float]
 
@@ -69,9 +63,7 @@ class AuditState:
         return cls(
             row=row,
             since_sample=0.0,
-            share=0.0,
-            ramp_ticks=float(parameters.ramp_ticks),
-            anchors=(np.array(parameters.device_origin), np.array(parameters.handle_origin)),
+            rise_ticks=float(parameters.ramp_ticks),
             start_energy=float(starts["start_kinetic"][0] + starts["start_potential"][0]),
             sums=dict.fromkeys(SUMS, 0.0),
         )

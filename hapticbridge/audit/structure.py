@@ -204,28 +204,25 @@ def _wrong_deadline(
     )
 
 
-def has_share(record: np.dtype[np.void]) -> bool:
-    """Returns True if records hold the transmitted share; those of earlier versions do not."""
-    return "share" in (record.names or ())
+def is_clutched(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
+    """Returns True for each record in which the hand has let the handle go."""
+    guarding, buttons = parameters.guarding, ticks["buttons"]
+    is_released = (buttons & (guarding.clutch | CLUTCHED)) != 0
+    if guarding.dead_man:
+        is_released |= (buttons & guarding.dead_man) == 0
+    is_out = np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
+    return np.asarray(is_released | is_out)
+
+
+def is_let_go(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
+    """Returns True for each record whose share falls by a button, a command or the reach."""
+    return np.asarray(is_clutched(ticks, parameters) | ((ticks["buttons"] & FORCE_OFF) != 0))
 
 
 def may_fade(ticks: NDArray[np.void]) -> Flags:
-    """Returns True for each record whose wrench may be fading.
-
-    It fades during a clutch, while the force is off, and after several old samples.
-    """
+    """Returns True for each record whose share may fall, also after several old samples."""
     is_off = (ticks["buttons"] & FORCE_OFF) != 0
     return np.asarray(is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE))
-
-
-def _is_clutched(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
-    """Returns True for each record in which the handle does not follow the device."""
-    guarding, buttons = parameters.guarding, ticks["buttons"]
-    is_clutched = (buttons & (guarding.clutch | CLUTCHED)) != 0
-    if guarding.dead_man:
-        is_clutched |= (buttons & guarding.dead_man) == 0
-    is_out = np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
-    return np.asarray(is_clutched | is_out)
 
 
 def _flag_faults(
@@ -235,25 +232,16 @@ def _flag_faults(
     parameters = events.parameters
     guarding = parameters.guarding
     none, every = np.zeros(len(ticks), bool), np.ones(len(ticks), bool)
-    is_clutched = _is_clutched(ticks, parameters)
-    was_clutched = _is_clutched(before, parameters) if before.size else [guarding.dead_man != 0]
-    was_clutched = np.concatenate([was_clutched, is_clutched[:-1]])
-    is_touching = ticks["contacts"] > 0
-    is_anchored = ~is_clutched & (was_clutched | events.is_reset(ticks["tick"]))
-    may_anchor, ramps, may_ramp = ~is_clutched, none, every
-    if has_share(ticks.dtype):
-        may_ramp = ticks["share"] < 1
-        ramps = may_ramp & ~may_fade(ticks)
-        first_share = (1 + TOLERANCE) / (guarding.fade_ticks + 1)
-        may_anchor &= events.is_first(ticks) | (ticks["share"] <= first_share)
+    is_released, is_touching = is_clutched(ticks, parameters), ticks["contacts"] > 0
+    is_partial = ticks["share"] < 1
     controls = guarding.controller == DAMPER
     controls |= guarding.controller == ENVIRONMENT and parameters.has_law
     for flag, is_due, is_possible in (
         (TickFlag.DROPPED_BEFORE, none, none),  # the ticks are contiguous
         (TickFlag.CONTACT, is_touching, is_touching),
-        (TickFlag.CLUTCH, is_clutched, is_clutched),
-        (TickFlag.REANCHORED, is_anchored, may_anchor),
-        (TickFlag.RAMPING, ramps, may_ramp),
+        (TickFlag.CLUTCH, is_released, is_released),
+        (TickFlag.RAMPING, is_partial, is_partial),
+        (TickFlag.SLEW_LIMITED, none, none),
         (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
     ):
         has = has_flag(ticks, flag)

@@ -21,7 +21,6 @@ from hapticbridge.audit.structure import (
     Fault,
     file_fault,
     first_row,
-    has_share,
     structure_fault,
 )
 from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
@@ -84,7 +83,6 @@ class PassivityTally:
             condition behind a coupling law is proven safe without it.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
-        commanded: Energy that commands have added to the coupling, in J.
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
         excess: First tick in which the device received unpaid energy, and that energy.
@@ -93,7 +91,6 @@ class PassivityTally:
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
-    commanded: float = 0.0
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
@@ -111,7 +108,6 @@ class PassivityTally:
         if self.is_watched:
             excess = balance.excess_device_energy
             self.excess = self.excess or _first(excess > rounding, excess, start)
-        self.commanded = float(balance.commanded[-1])
         last = ticks[-1]
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
@@ -219,7 +215,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         run = AuditedRun.of(recording)
         facts |= _device_facts(run, recording)
         sentences = facts["coupling_sentences"]
-        facts["coupling_sentences"] = sentences + run.events.sentences()
+        facts["coupling_sentences"] = sentences + run.events.sentences
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
@@ -227,7 +223,6 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             energies = PassivityTally(is_watched=facts["certified"] is not True)
             fault, facts["duration"] = _check_records(recording, run, energies)
             facts["energies"] = energies.energies
-            facts["coupling_sentences"] = sentences + run.events.sentences(energies.commanded)
         if fault is None:
             outcome = compare_resimulation(recording, run.parameters)
             facts["resimulation"] = outcome.agreement
@@ -239,7 +234,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         found = decide(Fault(outcome.agreement), None, strict=strict)
     if fault is None:
         if not outcome.has_run:
-            facts["unchecked"] = facts["unchecked"] or _unchecked_without_replay(recording)
+            facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
         notes = (found["reason"], unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
@@ -324,13 +319,7 @@ def _unchecked(run: AuditedRun) -> str:
     return ""
 
 
-def _unchecked_without_replay(recording: RecordingFile) -> str:
-    """Returns the changes that pass where versions differ and nothing is simulated again."""
-    if not has_share(recording.record):
-        return (
-            "recorded without 'share' by an earlier version and not re-simulated: of "
-            "wrench_on_device only the limit was checked"
-        )
-    return (
-        "not re-simulated: a change of wrench_on_device and share that fits both would go unnoticed"
-    )
+_UNCHECKED_WITHOUT_REPLAY = (
+    "not re-simulated: a change of wrench_on_device and share that fits both would go unnoticed"
+)
+"""Changes that pass where versions differ and nothing is simulated again."""

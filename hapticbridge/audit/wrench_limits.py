@@ -1,13 +1,14 @@
-"""Second computation of the guard: anchoring of the handle, ramp and limits of the wrench.
+"""Second computation of the handle, the share and the limited wrench of each tick.
 
-Each tick follows from its record and the previous one, because the record holds the share r of the
-wrench that ramp and fade transmitted:
+Each tick follows from its record and the previous one:
 
-    w_k = r_k F_k,   F_k = slew(limit(−s Aᵀ f_k), F_{k−1}),   F_{k−1} = w_{k−1} / r_{k−1}
+    h_k = h_{k−1} + r_{k−1} scale A δp_k,    w_k = −r_k s Aᵀ f_k,    f_k = P_F(u_k)
 
-f is the wrench on the tool, w the wrench on the device, A the device's axes, s ``force_scale``
-(divided by ``scale`` for torque). While the passivity controller acts, only the bounds of norm and
-change are checked; the re-simulation checks the rest.
+r is the recorded share, δp the device's motion, A the device's axes, f the wrench on the tool, u the
+coupling's law at the recorded poses, F the force level, w the wrench on the device and s
+``force_scale`` (divided by ``scale`` for torque). Where the record says so, the handle slipped
+toward the tool, and its spring must not have gained. While the passivity controller acts, only the
+norm is checked; the re-simulation checks the rest.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import (
     Array,
     Motion,
-    pose_of,
+    quaternion_of,
     quaternion_product,
     turn_between,
     wrench_by_law,
 )
 from hapticbridge.audit.state import AuditState
-from hapticbridge.audit.structure import TOLERANCE, Deviation, has_share, may_fade
+from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import UNITS, TickFlag, has_flag
 
@@ -62,13 +63,9 @@ class AuditedBlock:
         state: State before the records.
         motion: Motion of handle and tool.
         is_first: True for the first tick after a start or a pause without force, (n,).
-        is_start: True where the wrench begins to rise from zero, (n,).
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
-        ramp_ticks: Length of the ramp in ticks: long after a start, short after an anchoring, (n,).
-        anchors: Poses of device and handle at the last anchoring, (n, 7) each.
-        limited: Wrench requested of the device, limited in norm, (n, 6).
-        share: r, the share of the wrench that ramp and fade transmitted, (n,).
-        share_before: r of the previous tick, (n,).
+        share_before: r_{k−1}, the share of the device's motion that the handle made, (n,).
+        rise_ticks: Ticks in which r rises from 0 to 1, (n,).
     """
 
     ticks: NDArray[np.void]
@@ -76,13 +73,9 @@ class AuditedBlock:
     state: AuditState
     motion: Motion
     is_first: Flags
-    is_start: Flags
     interval: Array
-    ramp_ticks: Array
-    anchors: tuple[Array, Array]
-    limited: Array
-    share: Array
     share_before: Array
+    rise_ticks: Array
 
     @classmethod
     def of(
@@ -93,34 +86,25 @@ class AuditedBlock:
         events: RunEvents,
     ) -> AuditedBlock:
         """Evaluates consecutive records, at least one."""
-        parameters, motion = events.parameters, Motion.of(ticks, state, events)
-        is_first, is_anchored = events.is_first(ticks), has_flag(ticks, TickFlag.REANCHORED)
-        lengths = np.where(is_first, parameters.ramp_ticks, parameters.guarding.fade_ticks)
-        start, anchoring = _newest(is_first | is_anchored), _newest(is_anchored)
-        axes = np.array(parameters.axes).reshape(3, 3)
-        wrench = -parameters.force_scale * ticks["wrench_on_tool"]
-        force = _shortened(wrench[:, _FORCE] @ axes, parameters.force_limit)
-        torque = wrench[:, _TORQUE] / parameters.scale @ axes
-        limited = np.concatenate([force, _shortened(torque, parameters.torque_limit)], axis=1)
-        share = _recorded_share(ticks, limited, state.share, parameters)
-        poses = pose_of(ticks, "device"), motion.tool_before
-        device, handle = (
-            np.where(anchoring[:, None] >= 0, pose[anchoring], before)
-            for pose, before in zip(poses, state.anchors, strict=True)
-        )
+        parameters = events.parameters
+        is_first, is_reset = events.is_first(ticks), events.is_reset(ticks["tick"])
+        before = np.concatenate([state.row["share"], ticks["share"][:-1]])
+        before[is_first] = first_share(parameters)
+        before[is_reset] = 0.0
+        # a start rises slowly; after a reset, or once r has been 0, it rises within the fade
+        is_short = is_reset | ((ticks["share"] == 0.0) & may_fade(ticks))
+        start, fade = _newest(is_first), _newest(is_short)
+        rise = np.where(fade >= start, parameters.guarding.fade_ticks, parameters.ramp_ticks)
+        rise = np.where((start < 0) & (fade < 0), state.rise_ticks, rise)
         return cls(
             ticks=ticks,
             following=following,
             state=state,
-            motion=motion,
+            motion=Motion.of(ticks, state, events, before),
             is_first=is_first,
-            is_start=is_first | is_anchored,
             interval=_sample_intervals(ticks, state, parameters.period),
-            ramp_ticks=np.where(start >= 0, lengths[start], state.ramp_ticks),
-            anchors=(device, handle),
-            limited=limited,
-            share=share,
-            share_before=np.concatenate([[state.share], share[:-1]]),
+            share_before=before,
+            rise_ticks=rise,
         )
 
     def state_after(self, sums: dict[str, float]) -> AuditState:
@@ -130,11 +114,14 @@ class AuditedBlock:
             self.state,
             row=row.copy(),
             since_sample=float(self.interval[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
-            share=float(self.share[-1]),
-            ramp_ticks=float(self.ramp_ticks[-1]),
-            anchors=(self.anchors[0][-1], self.anchors[1][-1]),
+            rise_ticks=float(self.rise_ticks[-1]),
             sums=sums,
         )
+
+
+def first_share(parameters: RunParameters) -> float:
+    """Returns r before the first tick and after a pause."""
+    return 1.0 if parameters.ramp_ticks == 0 else 0.0
 
 
 def _newest(is_on: Flags) -> NDArray[np.int64]:
@@ -160,41 +147,23 @@ def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float)
     return np.asarray(interval)
 
 
-def _recorded_share(
-    ticks: NDArray[np.void], limited: Array, before: float, parameters: RunParameters
-) -> Array:
-    """Returns the share as recorded.
-
-    A recording of an earlier version lacks it. Then it is estimated as the ratio of sent and
-    limited wrench, and kept while there is no wrench.
-    """
-    if has_share(ticks.dtype):
-        return np.asarray(ticks["share"])
-    weights = np.repeat([1 / parameters.force_limit, 1 / parameters.torque_limit], 3)
-    full, sent = weights * limited, weights * ticks["wrench_on_device"]
-    square = np.sum(full**2, axis=1)
-    ratio = np.divide(
-        np.sum(full * sent, axis=1), square, out=np.ones_like(square), where=square > 0
-    )
-    last = _newest(square > 0)
-    return np.where(last >= 0, np.clip(ratio, 0.0, 1.0)[last], before)
-
-
 def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviation]:
     """Yields the deviations of handle, wrench on the tool, share, wrench and injected damping."""
     ticks, parameters = block.ticks, events.parameters
-    yield from _handle_deviations(block, parameters)
+    yield from _handle_deviations(block, events)
     if parameters.has_law and parameters.law_evaluations == 1:
         law = wrench_by_law(ticks, events.gains(ticks["tick"]), parameters.period, block.motion)
+        for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
+            law[:, part] = _shortened(law[:, part], limit)
         yield Deviation.between(
             "wrench_on_tool", ticks["wrench_on_tool"], law, "N or N m", "coupling law and poses"
         )
-    if has_share(ticks.dtype):
-        expected, share = _ramp_share(block, events), block.share
-        off = np.where(
-            may_fade(ticks), np.maximum(share - expected, -share), np.abs(share - expected)
-        )
-        yield Deviation("share", off, TOLERANCE, "", "ramp and flags")
+    share, before, fade = ticks["share"], block.share_before, parameters.guarding.fade_ticks
+    risen = np.abs(share - np.minimum(before + 1 / (block.rise_ticks + 1), 1.0))
+    fallen = np.abs(share - np.maximum(before - 1 / fade, 0.0))
+    off = np.where(is_let_go(ticks, parameters), fallen, risen)
+    off = np.where(has_flag(ticks, TickFlag.STALE_SAMPLE), np.minimum(fallen, risen), off)
+    yield Deviation("share", off, TOLERANCE, "", "buttons, events and flags")
     yield _wrench_deviation(block, parameters)
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
     guarding = parameters.guarding
@@ -208,74 +177,55 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
         yield Deviation(name, beyond, TOLERANCE * (1 + most), unit, "the controller's limits")
 
 
-def _handle_deviations(block: AuditedBlock, parameters: RunParameters) -> Iterator[Deviation]:
-    """Compares the handle with the device's pose: h = h_0 + scale · A (p − p_0).
-
-    p_0 and h_0 are the poses of device and handle at the last anchoring. During a clutch the handle
-    keeps its pose.
-    """
-    ticks, (origin, target) = block.ticks, block.anchors
-    device = pose_of(ticks, "device")
-    axes = np.array(parameters.axes).reshape(3, 3)
-    moved = (device[:, :3] - origin[:, :3]) @ axes.T
-    # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
-    vector = turn_between(origin[:, 3:], device[:, 3:]) @ axes.T
-    angle = np.linalg.norm(vector, axis=1, keepdims=True)
-    turn = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector], axis=1)
-    pose = np.concatenate(
-        [target[:, :3] + parameters.scale * moved, quaternion_product(turn, target[:, 3:])], axis=1
-    )
-    pose = np.where(has_flag(ticks, TickFlag.CLUTCH)[:, None], block.motion.handle_before, pose)
-    yield Deviation.between(
-        "handle_position", ticks["handle_position"], pose[:, :3], "m", "device pose and scale"
-    )
-    angle = np.linalg.norm(turn_between(pose[:, 3:], ticks["handle_quaternion"]), axis=1)
-    yield Deviation("handle_quaternion", angle, TOLERANCE, "rad", "device pose")
-
-
-def _ramp_share(block: AuditedBlock, events: RunEvents) -> Array:
-    """Returns the share after a rise of min(1, V_0/V)/(n + 1) from the previous tick's.
-
-    V is the energy stored in the coupling at the recorded poses, V_0 ``ramp_energy``, n the ramp's
-    length in ticks.
-    """
-    parameters, motion = events.parameters, block.motion
-    pace, most = np.ones(len(block.ticks)), parameters.guarding.ramp_energy
-    if parameters.has_law and np.isfinite(most):
-        gains, held = events.gains(block.ticks["tick"]), np.zeros(len(pace))
-        for column, limit, e in zip(
-            (0, 2), limits_on_tool(parameters), (motion.stretch, motion.twist), strict=True
-        ):
-            held += spring_energy(gains[:, column], np.linalg.norm(e, axis=1), limit)
-        held *= parameters.force_scale / parameters.scale
-        np.divide(most, held, out=pace, where=held > most)
-    before = np.where(block.is_start, 0.0, block.share_before)
-    return np.minimum(before + pace / (block.ramp_ticks + 1.0), 1.0)
+def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviation]:
+    """Compares the handle with the device's motion; where it slipped, the energy of its spring."""
+    ticks, motion, parameters = block.ticks, block.motion, events.parameters
+    moved, turned = motion.handle_step, motion.handle_turn
+    position = motion.handle_before[:, :3] + moved
+    orientation = quaternion_product(quaternion_of(turned), motion.handle_before[:, 3:])
+    has_slipped = has_flag(ticks, TickFlag.REANCHORED)
+    off = np.linalg.norm(ticks["handle_position"] - position, axis=1)
+    angle = np.linalg.norm(turn_between(orientation, ticks["handle_quaternion"]), axis=1)
+    gains, before = events.gains(ticks["tick"]), events.gains(ticks["tick"] - 1)
+    tool = motion.tool_before
+    # with n laws per tick the spring is compared after the first of the handle's n steps
+    share = 1.0 / parameters.law_evaluations
+    pulled = position - (1.0 - share) * moved - tool[:, :3]
+    slipped = pulled + ticks["handle_position"] - position
+    back = quaternion_of(-(1.0 - share) * turned)
+    pulled_turn = turn_between(tool[:, 3:], quaternion_product(back, orientation))
+    slipped_turn = turn_between(tool[:, 3:], quaternion_product(back, ticks["handle_quaternion"]))
+    for column, limit, name, amount, lengths, unit in (
+        (0, 0, "handle_position", off, (pulled, slipped), "m"),
+        (2, 1, "handle_quaternion", angle, (pulled_turn, slipped_turn), "rad"),
+    ):
+        level = limits_on_tool(parameters)[limit]
+        stored, kept = (
+            spring_energy(k[:, column], np.linalg.norm(e, axis=1), level)
+            for k, e in zip((before, gains), lengths, strict=True)
+        )
+        gained = np.where(has_slipped & (amount > TOLERANCE), kept - stored, amount)
+        yield Deviation(name, gained, TOLERANCE * (1 + stored), unit, "device pose and share")
 
 
 def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviation:
-    """Compares the wrench on the device with the transmitted share of the limited wrench."""
-    sent, has_exact_share = block.ticks["wrench_on_device"], has_share(block.ticks.dtype)
-    share, share_before = block.share[:, None], block.share_before[:, None]
-    before = np.concatenate([block.state.row["wrench_on_device"], sent[:-1]])
-    is_rising = ~block.is_start[:, None] & (share_before > 0)
-    before = np.divide(before, share_before, out=np.zeros_like(before), where=is_rising)
-    expected, beyond = np.zeros_like(sent), np.full(len(sent), -np.inf)
-    for part, limit, most in (
-        (_FORCE, parameters.force_limit, parameters.guarding.force_slew),
-        (_TORQUE, parameters.torque_limit, parameters.guarding.torque_slew),
-    ):
-        rise = min(most, 2 * limit)  # finite also without a slew limit
-        change = _shortened(block.limited[:, part] - before[:, part], rise)
-        expected[:, part] = share * (before[:, part] + change)
-        norm_limit = block.share * limit if has_exact_share else limit
-        excess = np.linalg.norm(sent[:, part], axis=1) - norm_limit
-        if has_exact_share:
-            change = np.linalg.norm(sent[:, part] - share * before[:, part], axis=1)
-            excess = np.maximum(excess, change - block.share * rise)
-        beyond = np.maximum(beyond, excess)
-    deviation = Deviation.between(
-        "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and limits"
+    """Compares the wrench on the device with the share of the wrench on the tool."""
+    ticks = block.ticks
+    axes = np.array(parameters.axes).reshape(3, 3)
+    wrench = -parameters.force_scale * ticks["share"][:, None] * ticks["wrench_on_tool"]
+    expected = np.concatenate(
+        [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )
-    is_bounded_only = has_flag(block.ticks, TickFlag.CONTROLLER_ACTIVE) | (not has_exact_share)
-    return deviation._replace(amount=np.where(is_bounded_only, beyond, deviation.amount))
+    sent = ticks["wrench_on_device"]
+    deviation = Deviation.between(
+        "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and share"
+    )
+    limits = parameters.force_limit, parameters.torque_limit
+    beyond = [
+        np.linalg.norm(sent[:, part], axis=1) - limit * (1 + TOLERANCE)
+        for part, limit in zip((_FORCE, _TORQUE), limits, strict=True)
+    ]
+    is_bounded_only = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
+    return deviation._replace(
+        amount=np.where(is_bounded_only, np.maximum(*beyond), deviation.amount)
+    )

@@ -201,7 +201,7 @@ def _foresee_shares(s: State) -> None:
 
 
 @compiled
-def wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+def limited_wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
     """Evaluates the limited law after a step of MuJoCo, and notes the tool's new pose.
 
     Args:

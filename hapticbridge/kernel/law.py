@@ -8,22 +8,13 @@ K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; h and x are the positi
 tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
 inside MuJoCo's step; the functions here evaluate it afterwards, at the poses that resulted.
 
-A change of the gains during a run does work. With gains that change from tick to tick, the identity
-behind BC97 (6) becomes
-
-    Σ f_k·d_{k+1} + Σ ‖d_k‖²_{b/T} = Σ f_k·δx_k + Σ (terms >= 0) + ½‖p_{N+1}‖²_{K_N}
-                                     − ½‖p_1‖²_{K_1} − Σ W_k,
-    W_k = ½‖p_k‖²_{K_k − K_{k−1}},    p_k = h_k − x_{k−1} = e_{k−1} + d_k
-
-with d the steps of the handle. It holds if b ⪰ K_k T/2 + B_k in every tick. W_k is the energy by
-which the spring grows between the steps of handle and tool. The command gives it to the device;
-softening the coupling takes it away. A change of B does no work, and the environment's balance (14)
-does not contain the gains. W is booked as ``energy.tuning_work``.
-
-Two facts bound W. The gains move in a straight line over ``tuning_ticks`` ticks, so W_k is at most
-½ (K_goal − K)/n ‖p‖² per tick; the damping that a device needs is convex in K and B, so no coupling
-on the line needs more than the larger end. The guard's energy limit counts W, because it counts all
-energy that the device received beyond the hand's.
+A change of the gains during a run, and an axis without motor, move the handle's end of the spring
+without the device: it slips. With gains that change from tick to tick, the identity behind Brown &
+Colgate's (6) has the term −Σ W_k with W_k = V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the
+energy of the spring. A raised gain would hand W_k to the device, so the handle slips toward the
+tool until V_k(p'_k) = V_{k−1}(p_k); a lowered gain loses energy. The gains move in a straight line
+over ``tuning_ticks`` ticks; the damping that a device needs is convex in K and B, so no coupling on
+the line needs more than the larger end.
 """
 
 from __future__ import annotations

@@ -47,7 +47,6 @@ ENERGY_DTYPE = np.dtype(
         ("coupling_work", "<f8"),
         ("actuator_work", "<f8"),
         ("external_work", "<f8"),
-        ("tuning_work", "<f8"),
         ("environment_energy", "<f8"),
         ("device_energy", "<f8"),
         ("device_dissipation", "<f8"),
@@ -389,12 +388,6 @@ def add_coupling_work(energy: Part, work: float) -> None:
     """Adds the work f·δx + τ·δφ on the tool, in J."""
     energy.coupling_work += work
     energy.throughput += abs(work)
-
-
-@compiled
-def add_tuning_work(energy: Part, work: float) -> None:
-    """Adds the work of a command that changes the coupling's spring, in J."""
-    energy.tuning_work += work
 
 
 def add_reset_work(energy: Part, work: float) -> None:

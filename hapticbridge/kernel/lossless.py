@@ -43,8 +43,7 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
-from hapticbridge.kernel.force_level import limited_wrench
-from hapticbridge.kernel.force_level import lossless_wrench as implicit_wrench
+from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.ledger import add_body_wrenches, set_kinetic_energy
@@ -342,7 +341,7 @@ def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     lossless.was_midpoint = lossless.is_midpoint
     lossless.ticks += lossless.was_midpoint
     if not lossless.is_midpoint:
-        force, torque, moved, turned = implicit_wrench(s, True)
+        force, torque, moved, turned = limited_wrench_after_step(s, True)
         if s.level.share[0] < 1.0 or s.level.share[1] < 1.0 or s.level.flags:
             lossless.is_near = True
         return force, torque, moved, turned

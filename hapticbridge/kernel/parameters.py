@@ -18,10 +18,8 @@ from hapticbridge.kernel.codes import Scheme, has_law, law_evaluations
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
-behind it, for the energy debt of both ports; damping for the debt of the environment's port alone.
-Recordings of earlier versions have 2 for a tank by itself."""
-
-_TANK_ALONE = 2
+behind it, for the energy debt of both ports; damping for the debt of the environment's port
+alone."""
 
 MAX_BUTTONS = 32
 """Largest count of buttons in a mask. No handle has more."""
@@ -29,12 +27,7 @@ MAX_BUTTONS = 32
 ALL_MOTORS = 63
 """Mask of six axes with a motor."""
 
-LATER = frozenset(
-    {"reach", "ramp_energy", "motors", "hold_force", "hold_torque", "idle_force", "idle_torque"}
-)
-"""Fields missing in the first recordings with a guard."""
-
-_POSITIVE = ("force_slew", "torque_slew", "longest_stall")
+_POSITIVE = ("longest_stall", "reach", "hold_force", "hold_torque", "idle_force", "idle_torque")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
     "assumed_damping",
@@ -45,24 +38,11 @@ _NOT_NEGATIVE = (
 )
 
 
-_FILE_KEYS = {
-    "assumed_damping": "credit",
-    "assumed_rotational_damping": "rotational_credit",
-    "max_damping": "most_damping",
-    "max_rotational_damping": "most_rotational_damping",
-    "energy_credit_limit": "surplus",
-    "force_slew": "force_rise",
-    "torque_slew": "torque_rise",
-    "reanchors_at_start": "reseats",
-}
-"""Keys of the metadata ``guard`` that differ from the names of ``GuardParameters``."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
 
-    A recording holds them as its metadata ``guard``, some under older names (``_FILE_KEYS``).
+    The names are those of the metadata ``guard`` of a recording.
 
     Attributes:
         controller: ``OFF``, ``DAMPER`` or ``ENVIRONMENT``.
@@ -71,14 +51,11 @@ class GuardParameters:
         max_damping: Largest damping in N s/m that the controller adds on an axis.
         max_rotational_damping: Largest damping in N m s/rad that it adds on an axis.
         energy_credit_limit: Largest energy in J that earlier dissipation may pay for.
-        force_slew: Largest change of the force per tick in N.
-        torque_slew: Largest change of the torque per tick in N m.
         stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
         fade_ticks: Ticks in which the wrench fades to zero.
         clutch: Mask of buttons; while one is held, the device moves without the handle.
         dead_man: Mask of buttons of which one must be held; 0 for none.
         longest_stall: Time in s between two samples after which the handle is re-anchored.
-        reanchors_at_start: True if a device that moved before the first tick is re-anchored.
         speed: Speed of the device in m/s above which the run is stopped.
         turn_speed: Angular speed of the device in rad/s above which the run is stopped.
         stretch: Length of the coupling in m above which the run is stopped.
@@ -86,8 +63,11 @@ class GuardParameters:
         energy: Energy in J given to the device beyond the hand's above which the run is stopped.
         reach: Distance in m from the origin of the device's frame beyond which the device moves
             without the handle and without force.
-        ramp_energy: Energy in J of the coupling up to which the ramp rises at full pace
-            (``kernel.tick_guard``).
+        motors: Mask of the device's axes with a motor, in the order x, y, z, rx, ry, rz.
+        hold_force: Largest force in N along axes without motor; beyond it the handle slips.
+        hold_torque: Largest torque in N m about axes without motor.
+        idle_force: Force in N to which the coupling relaxes while the hand is let go.
+        idle_torque: Torque in N m to which it relaxes then.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -99,21 +79,17 @@ class GuardParameters:
     max_damping: float = 0.0
     max_rotational_damping: float = 0.0
     energy_credit_limit: float = 0.0
-    force_slew: float = math.inf
-    torque_slew: float = math.inf
     stale_ticks: int = 0
     fade_ticks: int = 1
     clutch: int = 0
     dead_man: int = 0
     longest_stall: float = math.inf
-    reanchors_at_start: bool = False
     speed: float = math.inf
     turn_speed: float = math.inf
     stretch: float = math.inf
     angle: float = math.inf
     energy: float = math.inf
     reach: float = math.inf
-    ramp_energy: float = math.inf
     motors: int = ALL_MOTORS
     hold_force: float = math.inf
     hold_torque: float = math.inf
@@ -121,22 +97,17 @@ class GuardParameters:
     idle_torque: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.controller == _TANK_ALONE:
-            raise HapticBridgeError(
-                "the controller is a tank by itself, which only earlier versions of hapticbridge "
-                "ran and judge; 'hapticbridge export' still reads a recording of it"
-            )
         if self.controller not in (OFF, DAMPER, ENVIRONMENT):
             raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 3")
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
-        for name in (*_POSITIVE, *_TRIPS, *(LATER - {"motors"})):
+        for name in (*_POSITIVE, *_TRIPS):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
-        smallest = {"stale_ticks": 0, "fade_ticks": 1, "clutch": 0, "dead_man": 0}
+        smallest = {"stale_ticks": 0, "fade_ticks": 1, "clutch": 0, "dead_man": 0, "motors": 0}
         for name, minimum in smallest.items():
             value = getattr(self, name)
             if not isinstance(value, int) or not minimum <= value < 2**MAX_BUTTONS:
@@ -144,8 +115,8 @@ class GuardParameters:
 
     def to_json(self) -> str:
         """Returns the text for a recording's metadata; infinity becomes null."""
-        values = {_FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
-        return json.dumps({k: None if v == math.inf else v for k, v in values.items()})
+        values = asdict(self).items()
+        return json.dumps({k: None if v == math.inf else v for k, v in values})
 
     @classmethod
     def from_json(cls, text: str) -> GuardParameters:
@@ -158,12 +129,15 @@ class GuardParameters:
             values = dict(read_json(text))
         except (ValueError, TypeError):
             values = {}
-        names = {_FILE_KEYS.get(field.name, field.name): field.name for field in fields(cls)}
-        if not names.keys() - LATER <= values.keys() <= names.keys():
+        names = {field.name for field in fields(cls)}
+        if "controller" in values and "hold_force" not in values:
+            raise HapticBridgeError(
+                "recorded by an earlier version of hapticbridge, whose force limits acted on the "
+                "device alone; this version cannot judge it, but 'hapticbridge export' reads it"
+            )
+        if values.keys() != names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
-        numbers: dict[str, Any] = {
-            names[key]: math.inf if value is None else value for key, value in values.items()
-        }
+        numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
         return cls(**numbers)
 
 

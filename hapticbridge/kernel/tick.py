@@ -29,7 +29,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.force_level import keep_state, limited_wrench, wrench_after_step
+from hapticbridge.kernel.force_level import keep_state, limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import (
     anchor_handle,
     device_from_scene,
@@ -323,7 +323,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if count == 1 and not is_last:
         return OK
     if scheme == Scheme.IMPLICIT:
-        force, torque, moved, turned = wrench_after_step(s, is_last)
+        force, torque, moved, turned = limited_wrench_after_step(s, is_last)
     elif scheme == Scheme.MIDPOINT:
         force, torque, moved, turned = lossless_wrench(s)
     else:

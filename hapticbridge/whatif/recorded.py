@@ -138,23 +138,15 @@ class RecordedRun:
     def is_absolute(self) -> bool:
         """True if the device's poses were poses in the scene."""
         p = self.parameters
-        is_nowhere = p.device_origin == p.handle_origin == IDENTITY_POSE
-        return is_nowhere and not p.guarding.reanchors_at_start
+        return p.device_origin == p.handle_origin == IDENTITY_POSE
 
     @property
     def limits(self) -> Limits:
         """Limits of the run, times in s."""
         p, guarding = self.parameters, self.parameters.guarding
-        most = p.force_limit * p.period
-        slew_time = 0.0  # steps are allowed
-        if guarding.force_slew < math.inf:
-            slew_time = invert_exactly(
-                guarding.force_slew, lambda s: most / s, most / guarding.force_slew
-            )
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
-            slew_time=slew_time,
             ramp=p.ramp_ticks * p.period,
             stretch=invert_exactly(
                 guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
