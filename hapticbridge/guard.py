@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
-from hapticbridge.device import Device, DeviceInfo
+from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
@@ -24,6 +24,12 @@ from hapticbridge.record import SAMPLE_DTYPE
 
 LONGEST_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""
+
+USUAL_HOLD_FORCE, USUAL_HOLD_TORQUE = 1.0, 0.05
+"""Force in N and torque in N m with which the coupling holds the tool along axes that a device
+lacks. They keep a tool of 0.1 kg upright against light touches; on a wrench of 0.15 m the torque
+adds 0.3 N. A larger value resists motions that the hand cannot make; a smaller one lets the tool
+turn at a touch."""
 
 USUAL_STRETCH = 0.2
 """Stretch limit in m of the device's motion; no hand at a desk goes that far from its tool. A
@@ -41,13 +47,17 @@ Scenes whose motors push the hand need more."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of the wrench, applied in this order after scale and controller, and of the run.
+    """Limits of the wrench and of the run.
 
     Attributes:
-        force: Largest norm of the force in N, > 0; a larger force keeps its direction.
+        force: Largest norm of the force in N, > 0; a larger force keeps its direction. The tool
+            gets no more than it either (``kernel.force_level``).
         torque: Largest norm of the torque in N m, > 0.
-        ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
-            stores much energy meanwhile (``kernel.tick_guard``).
+        hold_force: Largest force in N with which the coupling holds the tool along axes that the
+            device lacks, > 0; beyond it the handle slips. The tool's own weight comes on top.
+        hold_torque: Largest torque in N m about axes that the device lacks, > 0.
+        ramp: Time in s of the linear rise at the start, 0 to 60. The handle follows the device by
+            the share of the force that is sent.
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
@@ -62,6 +72,8 @@ class Limits:
 
     force: float
     torque: float
+    hold_force: float = USUAL_HOLD_FORCE
+    hold_torque: float = USUAL_HOLD_TORQUE
     ramp: float = 0.5
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
@@ -75,10 +87,19 @@ class Limits:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
         if not 0 <= self.ramp <= LONGEST_RAMP:
             raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
-        for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
+        for name, unit in (
+            ("stretch", "m"),
+            ("energy", "J"),
+            ("reach", "m"),
+            ("hold_force", "N"),
+            ("hold_torque", "N m"),
+        ):
             value = getattr(self, name)
             if value is not None and not value > 0:
-                raise DeviceError(f"{name} limit is {value!r} {unit}; it must be > 0, inf for none")
+                words = name.replace("_", " ")
+                raise DeviceError(
+                    f"{words} limit is {value!r} {unit}; it must be > 0, inf for none"
+                )
         if not (0 < self.angle < math.pi or self.angle == math.inf):
             raise DeviceError(
                 f"angle limit is {self.angle!r} rad; it must be > 0 and < pi, inf for none"
@@ -182,6 +203,30 @@ def wait_until_still(
                 f"the device '{device.info.name}' has moved for {PATIENCE:g} s; hold it still, "
                 "then start again: force is enabled only at rest"
             )
+
+
+FARTHEST = 2.0
+"""Largest plausible distance in m of a device from the origin of its frame, where its data sheet
+names no reach. No desk is larger."""
+
+
+def refuse_implausible_pose(info: DeviceInfo, sample: NDArray[np.void]) -> None:
+    """Refuses a device whose first pose lies outside its workspace.
+
+    Raises:
+        DeviceError: The message names the position and the reach.
+    """
+    if info.is_prescribed:
+        return
+    position = sample["position"][0]
+    reach = FARTHEST if info.reach is None else info.reach
+    distance = float(np.linalg.norm(position))
+    if not distance <= reach:
+        raise DeviceError(
+            f"the device '{info.name}' reports {np.round(position, 4).tolist()} m, {distance:.3g} m "
+            f"from the middle of its workspace; it reaches {reach:.3g} m: home or calibrate it, and "
+            "check the unit of its poses"
+        )
 
 
 def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
@@ -299,6 +344,10 @@ LONGEST_STALL, STALL_PERIODS = 0.05, 5
 """Longest stall of the loop: 50 ms, or five periods if these are longer. Afterwards the hand's
 position is unknown: at 0.4 m/s it has moved 20 mm."""
 
+IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
+"""Force in N and torque in N m, beyond the tool's weight, to which the coupling relaxes while the
+hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
+
 JUMP_MARGIN = 2.0
 """Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
 shows up to two periods of motion in one."""
@@ -334,7 +383,7 @@ def guard_parameters_for(
 ) -> GuardParameters:
     """Returns the guard's parameters for a run without buttons and with relative poses.
 
-    A device with prescribed motion has no hand; it gets limits and slew only.
+    A device with prescribed motion has no hand; it gets limits only.
 
     Args:
         info: The device. Unknown damping is replaced by ``certificate.assumed_damping``; with
@@ -355,6 +404,11 @@ def guard_parameters_for(
         stretch=limits.stretch * scale,
         angle=limits.angle,
         reach=limits.reach_of(info),
+        motors=sum(1 << i for i, axis in enumerate(AXES) if axis in info.axes),
+        hold_force=limits.hold_force,
+        hold_torque=limits.hold_torque,
+        idle_force=IDLE_FORCE,
+        idle_torque=IDLE_TORQUE,
     )
     if info.is_prescribed:
         return common

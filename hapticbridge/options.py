@@ -44,9 +44,11 @@ from hapticbridge.realtime import wants_real_time
 from hapticbridge.rendering import (
     Method,
     default_method,
+    loaded_handle,
     method_named,
     require_hazard_consent,
     resolve_contact_stiffness,
+    static_load,
 )
 from hapticbridge.scene import Scene
 
@@ -375,7 +377,21 @@ class RunSetup:
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
-        is_absolute = self.workspace.absolute
+        is_absolute, handle_origin, guard = self.workspace.absolute, IDENTITY_POSE, self.guard
+        if self.method.has_law:
+            load = static_load(self.scene)
+            force, torque = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
+            guard = replace(
+                guard,
+                hold_force=guard.hold_force + force,
+                hold_torque=guard.hold_torque + torque,
+                idle_force=guard.idle_force + force,
+                idle_torque=guard.idle_torque + torque,
+            )
+        else:
+            load = np.zeros(6)
+        if not is_absolute:
+            handle_origin = loaded_handle(self.scene.grip_pose(), load, self.law)
         return RunParameters(
             grip=self.scene.grip,
             period=self.period,
@@ -389,12 +405,12 @@ class RunSetup:
             # a prescribed motion has no hand that a ramp would protect
             ramp_ticks=0 if self.info.is_prescribed else self.limits.ramp_ticks(self.period),
             device_origin=IDENTITY_POSE if is_absolute else pose,
-            handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
+            handle_origin=handle_origin,
             device_start=pose,
             scheme=self.method.scheme,
             effective=effective,
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,
             device_rotational_damping=rotational_damping,
-            guarding=self.guard,
+            guarding=guard,
         )

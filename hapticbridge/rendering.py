@@ -9,13 +9,21 @@ from importlib import import_module
 from typing import Any
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
-from hapticbridge.kernel.codes import WELD_NAME, Scheme, has_law, law_evaluations
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    WELD_NAME,
+    Scheme,
+    has_law,
+    law_evaluations,
+)
 from hapticbridge.kernel.law import Gains
-from hapticbridge.kernel.lossless import REACH
+from hapticbridge.kernel.lossless import REACH, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_massless_tool, check_metered
@@ -313,6 +321,80 @@ def prepare(
     effective = measured_weld(scene.model, scene.grip) if method.scheme == Scheme.WELD else None
     scene.reset()
     return effective
+
+
+AT_REST = 1e-6
+"""Largest acceleration in m/s² or rad/s² of a tool that rests without a hand. Rounding leaves less;
+a smaller value would start every scene by looking for a load of nothing."""
+
+SETTLING_STEPS = 3000
+"""Largest number of steps in which a tool settles on its coupling. A tool of 1 kg on 2400 N/m takes
+a tenth of it."""
+
+SETTLED = 1e-3
+"""Largest relative change of the coupling's wrench over the last steps of a tool that has
+settled; no unit."""
+
+
+def static_load(scene: Scene) -> NDArray[np.float64]:
+    """Returns the wrench that holds the tool of a prepared scene at rest, (6,) in N and N m.
+
+    World frame, about the grip. The tool settles on the coupling with the handle at its grip; its
+    motion is stopped whenever its kinetic energy has passed a peak (dynamic relaxation with kinetic
+    damping). The scene itself is not changed. Zero if the tool rests without a hand, or does not
+    settle because the scene moves it.
+    """
+    model, load = scene.model, np.zeros(6)
+    data = mujoco.MjData(model)
+    mujoco.mj_copyData(data, model, scene.data)
+    mujoco.mj_forward(model, data)
+    grip = model.site(scene.grip).id
+    dofs = tree_of_tool(model, int(model.site_bodyid[grip])).dofs
+    if np.abs(data.qacc[dofs]).max(initial=0.0) < AT_REST:
+        return load
+    first = model.actuator_outadr[model.actuator(COUPLING_ACTUATORS[0]).id]
+    momentum, last, earlier = np.zeros(model.nv), 0.0, load
+    for step in range(SETTLING_STEPS):
+        mujoco.mj_step(model, data)
+        velocity = np.where(dofs, data.qvel, 0.0)
+        mujoco.mj_mulM(model, data, momentum, velocity)
+        kinetic = 0.5 * float(velocity @ momentum)
+        if kinetic < last:
+            data.qvel[dofs], kinetic = 0.0, 0.0
+        last = kinetic
+        if step % 100 == 99:
+            earlier, load = load, data.actuator_force[first : first + 6].copy()
+            if np.linalg.norm(load - earlier) <= SETTLED * np.linalg.norm(load):
+                handle = scene.grip_pose()[3:]  # the actuators push along the handle's axes
+                force, torque = np.zeros(3), np.zeros(3)
+                mujoco.mju_rotVecQuat(force, load[:3], np.array(handle))
+                mujoco.mju_rotVecQuat(torque, load[3:], np.array(handle))
+                return np.concatenate([force, torque])
+    return np.zeros(6)
+
+
+def loaded_handle(
+    grip: tuple[float, ...], load: NDArray[np.float64], coupling: Coupling
+) -> tuple[float, ...]:
+    """Returns the handle pose (7,) at which the coupling carries a load on a tool at rest.
+
+        h = x + f/K,    R_h = exp(τ/K_r) R_x
+
+    ``grip`` is the tool's pose (7,), ``load`` the wrench (6,) in N and N m.
+    """
+    position = np.array(grip[:3]) + load[:3] / coupling.stiffness
+    orientation, turn = np.array(grip[3:]), np.zeros(4)
+    angle = float(np.linalg.norm(load[3:]))
+    if angle > 0.0 and coupling.rotational_stiffness > 0.0:
+        twist = min(angle / coupling.rotational_stiffness, MAX_START_TWIST)
+        mujoco.mju_axisAngle2Quat(turn, load[3:] / angle, twist)
+        mujoco.mju_mulQuat(orientation, turn, np.array(grip[3:]))
+    return (*position.tolist(), *orientation.tolist())
+
+
+MAX_START_TWIST = 1.0
+"""Largest angle in rad by which the handle is turned at the start to carry the tool's weight. A
+heavier tool sags; beyond a right angle the spring would lose its grip."""
 
 
 def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Method) -> None:

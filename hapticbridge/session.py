@@ -21,7 +21,7 @@ from hapticbridge.clock import Clock, RealClock, slept_ns
 from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.device import Device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import refuse_stretched_start, wait_until_still
+from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
 from hapticbridge.inputs import Write, apply_writes
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
@@ -262,6 +262,7 @@ class Session:
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
         sample[:] = self.device.start(setup.period)
+        refuse_implausible_pose(self.device.info, sample)
         self.parameters = setup.parameters(sample, effective)
         start = start_state(scene.model, scene.data).tobytes()
         bound = BoundKernel(scene.model, scene.data, self.parameters)

@@ -35,14 +35,16 @@ class RunEvents:
 
     Attributes:
         parameters: Run parameters at the start.
-        home: Pose (7,) of tool and handle after a reset.
+        tool_home: Pose (7,) of the tool after a reset.
+        handle_home: Pose (7,) of the handle after a reset.
         resumed: Ticks at which the run resumed after a pause without force.
         resets: Ticks before which the scene was reset.
         couplings: Couplings of the law (K and B') in order, the initial one first.
     """
 
     parameters: RunParameters
-    home: Array
+    tool_home: Array
+    handle_home: Array
     resumed: Array
     resets: Array
     couplings: tuple[Coupling, ...]
@@ -59,7 +61,6 @@ class RunEvents:
         by_name: dict[str, list[Mapping[str, Any]]] = {
             name: [] for name in ("resume", "reset", "coupling", "switch")
         }
-        home = np.array(meta_start(recording.meta, "tool_start"))
         for event in recording.events:
             if event.get("event") in by_name:
                 by_name[str(event["event"])].append(event)
@@ -69,7 +70,8 @@ class RunEvents:
         }
         return cls(
             parameters=parameters,
-            home=home,
+            tool_home=np.array(meta_start(recording.meta, "tool_start")),
+            handle_home=np.array(meta_start(recording.meta, "handle_start")),
             resumed=ticks["resume"],
             resets=ticks["reset"],
             couplings=(

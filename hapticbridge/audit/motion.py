@@ -95,8 +95,8 @@ class Motion:
         rows = np.concatenate([state.row, ticks])
         is_reset = events.is_reset(ticks["tick"])[:, None]
         handle, tool = pose_of(rows, "handle"), pose_of(rows, "tool")
-        handle_before = np.where(is_reset, events.home, handle[:-1])
-        tool_before = np.where(is_reset, events.home, tool[:-1])
+        handle_before = np.where(is_reset, events.handle_home, handle[:-1])
+        tool_before = np.where(is_reset, events.tool_home, tool[:-1])
         handle, tool = handle[1:], tool[1:]
         parameters, device = events.parameters, pose_of(rows, "device")
         axes = np.array(parameters.axes).reshape(3, 3)

@@ -30,6 +30,7 @@ POSE_DTYPE = np.dtype(
     [
         ("device_origin", "<f8", 7),
         ("handle_origin", "<f8", 7),
+        ("handle_home", "<f8", 7),
         ("device_position", "<f8", 3),
         ("device_quaternion", "<f8", 4),
         ("handle_position", "<f8", 3),
@@ -93,6 +94,7 @@ def bind_poses(run: Part, pose: Part, parameters: RunParameters) -> None:
     pose["device_position"], pose["device_quaternion"] = (x, y, z), (qw, qx, qy, qz)
     position, quaternion = handle_pose(run, pose, (x, y, z), (qw, qx, qy, qz))
     pose["handle_position"], pose["handle_quaternion"] = position, quaternion
+    pose["handle_home"] = (*position, *quaternion)
 
 
 def set_tool(pose: Part, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
@@ -154,10 +156,10 @@ def anchor_handle(pose: Part) -> None:
         pose.handle_origin[3 + i] = pose.handle_quaternion[i]
 
 
-def move_handle_to_tool(pose: Part) -> None:
-    """Puts the handle to the tool's pose, so that the coupling is not stretched."""
-    pose["handle_position"] = pose["tool_position"]
-    pose["handle_quaternion"] = pose["tool_quaternion"]
+def move_handle_home(pose: Part) -> None:
+    """Puts the handle to its pose before the first tick, where it carries the tool at its start."""
+    pose["handle_position"] = pose["handle_home"][:3]
+    pose["handle_quaternion"] = pose["handle_home"][3:]
 
 
 @compiled

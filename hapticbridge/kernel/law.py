@@ -41,6 +41,7 @@ from hapticbridge.pose import (
     Vector,
     add,
     conjugate,
+    dot,
     norm,
     product,
     quaternion_exp,
@@ -75,6 +76,7 @@ COUPLING_DTYPE = np.dtype(
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
         ("has_passive", "<i8"),
         ("is_passive", "<f8", 6),  # 1 for an axis of the device without motor
+        ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
     ]
@@ -281,10 +283,46 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
 
 
 @compiled
+def charge_lateness(s: State, interval: float) -> None:
+    """Charges the springs with the energy that a late sample may have put in.
+
+        D = (K/2 + B'/T − b/t) ‖d‖²,    b >= K T/2 + B'
+
+    d is the handle's step in m, t the time in s since the last sample, T the period. The hand has
+    felt a held force while the spring was stretched by d; the device burned b ‖d‖²/t. D is below
+    zero for a sample in time; a late one pays later, because the handle slips until the springs
+    hold less by D. b in N s/m is the device's damping seen at the handle, at least what the
+    condition needs.
+    """
+    k, run, pose = s.coupling, s.run, s.pose
+    ratio = run.force_scale * run.scale
+    d, turn = vector_of(pose.handle_step), vector_of(pose.handle_turn)
+    for kind in range(2):
+        stiffness, damping = k.stiffness, k.damping
+        b, square = run.device_damping / ratio, dot(d, d)
+        if kind == 1:
+            stiffness, damping = k.rotational_stiffness, k.rotational_damping
+            b = run.device_rotational_damping * run.scale / run.force_scale
+            square = dot(turn, turn)
+        b = max(b, 0.5 * stiffness * run.period + damping)
+        lacking = 0.5 * stiffness + damping / run.period - b / interval
+        k.owed[kind] = max(k.owed[kind] + lacking * square, 0.0)
+
+
+@compiled
+def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[float, float]:
+    """Returns the length at which a spring has paid what it owes, and the rest that it still owes."""
+    energy = _spring_energy(stiffness, length, limit)
+    if stiffness <= 0.0 or owed <= 0.0:
+        return np.inf, 0.0
+    return _spring_length(stiffness, max(energy - owed, 0.0), limit), max(owed - energy, 0.0)
+
+
+@compiled
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
-    Three things make it slip. A raised gain must not raise the spring's energy. Along an axis
+    Four things make it slip. A late sample is charged (``charge_lateness``). A raised gain must not raise the spring's energy. Along an axis
     without motor the coupling holds up to ``hold`` and then slips. While the hand is let go it
     relaxes to ``idle``. Each only shortens the spring, so energy is lost and none is gained.
 
@@ -298,6 +336,12 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """
     k = s.coupling
     stretch, twist = pulled(s)
+    if k.owed[0] > 0.0 or k.owed[1] > 0.0:
+        length, k.owed[0] = _paid(k.stiffness, norm(stretch), s.level.level[0], k.owed[0])
+        angle, k.owed[1] = _paid(
+            k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1]
+        )
+        max_stretch, max_twist = min(max_stretch, length), min(max_twist, angle)
     new, new_twist = _within(stretch, max_stretch), _within(twist, max_twist)
     if k.has_passive:
         new = _held(s, new, 0, k.hold[0] / k.stiffness)

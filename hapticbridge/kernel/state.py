@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
-from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_to_tool, set_tool
+from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_home, set_tool
 from hapticbridge.kernel.law import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
 from hapticbridge.kernel.ledger import (
     ENERGY_DTYPE,
@@ -183,14 +183,13 @@ class BoundKernel:
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
 
-        The handle is placed at the tool, and the device's pose belongs to it from the next tick on,
-        so the coupling is at rest. The change of the scene's storage is work of the external port.
+        The handle is placed at its start, and the device's pose belongs to it from the next tick on. The change of the scene's storage is work of the external port.
         Energy that the device received before is not forgotten.
         """
         s = self._record
         before = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         self._take_tool_pose()
-        move_handle_to_tool(s["pose"])
+        move_handle_home(s["pose"])
         discard_wrench(s["loop"])
         refresh_energies(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])

@@ -39,7 +39,12 @@ from hapticbridge.kernel.handle import (
     move_handle,
     place_handle,
 )
-from hapticbridge.kernel.law import command_handle_velocity, retune, slip
+from hapticbridge.kernel.law import (
+    charge_lateness,
+    command_handle_velocity,
+    retune,
+    slip,
+)
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
     judge_environment,
@@ -162,6 +167,8 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
+    if s.run.has_law and s.loop.tick > s.guard.start_tick:
+        charge_lateness(s, interval)
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
