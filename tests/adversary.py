@@ -9,7 +9,8 @@ ever had in hand beyond what b had burned and the scene had given up of its own 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,14 +61,14 @@ FASTEST, FASTEST_TURN = 3.0, 20.0
 
 
 @compiled
-def _shortened(v: NDArray[np.float64], most: float) -> None:
+def _shorten(v: NDArray[np.float64], most: float) -> None:
     size = np.sqrt(np.sum(v * v))
     if size > most:
         v *= most / size
 
 
 @compiled
-def _turned(q: NDArray[np.float64], turn: NDArray[np.float64]) -> None:
+def _turn(q: NDArray[np.float64], turn: NDArray[np.float64]) -> None:
     angle = np.sqrt(np.sum(turn * turn))
     if angle == 0.0:
         return
@@ -82,9 +83,42 @@ def _turned(q: NDArray[np.float64], turn: NDArray[np.float64]) -> None:
 
 
 @compiled
-def seed_hand(seed: int) -> None:
-    """Seeds the hand's own random numbers, which live in compiled code."""
-    np.random.seed(seed)
+def _move(
+    h: Any, w: NDArray[np.float64], habits: NDArray[np.float64], period: float, rng: Any
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the next step in m and rotation vector in rad; ``habits`` as in ``_attack``."""
+    axes, kind, b, b_r = int(habits[0]), int(habits[1]), habits[2], habits[3]
+    speed, pace = habits[7], habits[8]
+    push, hold, follow = int(habits[9]), int(habits[10]), int(habits[11])
+    d, t = np.zeros(3), np.zeros(3)
+    step = h.tick % (push + hold + follow)
+    if kind == 0:  # wanders
+        for i in range(6):
+            fresh = 0.05 * speed if i < 3 else 0.3
+            h.velocity[i] = 0.98 * h.velocity[i] + fresh * rng.standard_normal()
+        d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
+    elif kind == 3:  # shakes at one frequency
+        angle = 2.0 * np.pi * h.tick / (push + hold)
+        d[:] = 1e-3 * speed * np.array([np.sin(angle), np.cos(1.3 * angle), np.sin(0.7 * angle)])
+        t[:] = 2e-3 * np.array([np.cos(angle), np.sin(1.1 * angle), np.cos(0.9 * angle)])
+    elif kind == 4:  # trembles without memory
+        for i in range(3):
+            d[i], t[i] = 1e-3 * speed * rng.standard_normal(), 5e-3 * rng.standard_normal()
+    elif step < push:  # stretches, waits, then follows the force (1), or the tool alone (2)
+        if step == 0:
+            for i in range(6):
+                h.velocity[i] = rng.standard_normal()
+            h.velocity[min(axes, 3) : 3] = 0.0
+            h.velocity[:3] *= speed / np.sqrt(np.sum(h.velocity[:3] ** 2))
+        d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
+    elif step >= push + hold:
+        d[:], t[:] = w[:3] * (pace / b * period), w[3:] * (pace / b_r * period)
+        if kind == 2 and np.sum(d * h.velocity[:3]) < 0.0:
+            d[:] = 0.0
+    d[min(axes, 3) :] = 0.0
+    if axes < 6:
+        t[:] = 0.0
+    return d, t
 
 
 @compiled
@@ -93,81 +127,48 @@ def _attack(
     sample: NDArray[np.void],
     row: NDArray[np.void],
     hand: NDArray[np.void],
-    options: NDArray[np.float64],
+    habits: NDArray[np.float64],
+    rng: Any,
 ) -> int:
     """Runs a chunk; returns the code of the first tick that was refused, else ``OK``.
 
-    ``options``: count of axes, kind of hand, b, b_r, limit of force and torque in N and N m that
-    only the device applies, buttons, speed in m/s, share of the speed w/b at which it follows, and
-    ticks of pushing, waiting and following.
+    ``habits``: count of axes, kind of hand, b, b_r, limit of force and torque in N and N m that
+    only the device applies, buttons, speed in m/s, share of the speed w/b at which it follows,
+    ticks of pushing, waiting and following, and periods by which three samples in ten are late.
     """
     s, h = state[0], hand[0]
-    period = s.run.period
-    ratio = s.run.force_scale / s.run.scale
-    axes, kind = int(options[0]), int(options[1])
-    b, b_r = options[2], options[3]
-    speed, pace = options[7], options[8]
-    push, hold, follow = int(options[9]), int(options[10]), int(options[11])
-    d, t, w = np.zeros(3), np.zeros(3), np.zeros(6)
+    period, late = s.run.period, habits[12]
+    b, b_r = habits[2], habits[3]
+    w = np.zeros(6)
     for _ in range(CHUNK):
-        for i in range(6):
-            w[i] = s.loop.wrench_on_device[i]
-        _shortened(w[:3], options[4])
-        _shortened(w[3:], options[5])
-        step = h.tick % (push + hold + follow)
-        if kind == 0:  # wanders
-            for i in range(6):
-                fresh = 0.05 * speed if i < 3 else 0.3
-                h.velocity[i] = 0.98 * h.velocity[i] + fresh * np.random.randn()
-            d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
-        elif kind in (1, 2):  # stretches, waits, then follows the force or the tool alone
-            if step == 0:
-                for i in range(6):
-                    h.velocity[i] = np.random.randn()
-                h.velocity[min(axes, 3) : 3] = 0.0
-                h.velocity[:3] *= speed / np.sqrt(np.sum(h.velocity[:3] ** 2))
-            if step < push:
-                d[:], t[:] = h.velocity[:3] * period, h.velocity[3:] * period
-            elif step >= push + hold:
-                d[:], t[:] = w[:3] * (pace / b * period), w[3:] * (pace / b_r * period)
-                if kind == 2 and np.sum(d * h.velocity[:3]) < 0.0:
-                    d[:] = 0.0
-            else:
-                d[:], t[:] = 0.0, 0.0
-        elif kind == 3:  # shakes at one frequency
-            angle = 2.0 * np.pi * h.tick / (push + hold)
-            d[:] = (
-                1e-3 * speed * np.array([np.sin(angle), np.cos(1.3 * angle), np.sin(0.7 * angle)])
-            )
-            t[:] = 2e-3 * np.array([np.cos(angle), np.sin(1.1 * angle), np.cos(0.9 * angle)])
-        else:  # trembles without memory
-            for i in range(3):
-                d[i], t[i] = 1e-3 * speed * np.random.randn(), 5e-3 * np.random.randn()
-        d[min(axes, 3) :] = 0.0
-        if axes < 6:
-            t[:] = 0.0
-        _shortened(d, FASTEST * period)
-        _shortened(t, FASTEST_TURN * period)
-        for i in range(3):
-            h.net += (w[i] - b / period * d[i]) * d[i] + (w[3 + i] - b_r / period * t[i]) * t[i]
+        w[:] = s.loop.wrench_on_device
+        _shorten(w[:3], habits[4])
+        _shorten(w[3:], habits[5])
+        d, t = _move(h, w, habits, period, rng)
+        elapsed = period
+        if late > 0.0 and rng.random() < 0.3:
+            elapsed *= 1.0 + late * rng.random()
+            d *= elapsed / period
+            t *= elapsed / period
+        _shorten(d, FASTEST * elapsed)
+        _shorten(t, FASTEST_TURN * elapsed)
+        h.net += np.sum((w[:3] - b / elapsed * d) * d) + np.sum((w[3:] - b_r / elapsed * t) * t)
         released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
-        h.most = max(h.most, h.net + ratio * released)
-        for i in range(3):
-            h.position[i] += d[i]
-        _turned(h.quaternion, t)
-        sample[0].buttons = int(options[6])
+        h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * released)
+        h.position[:] += d
+        _turn(h.quaternion, t)
+        sample[0].buttons = int(habits[6])
         for i in range(3):
             sample[0].position[i] = h.position[i]
         for i in range(4):
             sample[0].quaternion[i] = h.quaternion[i]
-        for substep in range(s.run.substeps):
-            code = before_step(state, sample, row, substep, period)
-            if code != OK:
-                return code
-            advance(state)
-            code = after_step(state, row, substep)
-            if code != OK:
-                return code
+        code = before_step(state, sample, row, 0, elapsed)
+        if code != OK:
+            return code
+        advance(state)
+        code = after_step(state, row, 0)
+        if code != OK:
+            return code
         h.saturated += s.level.flags != 0
         h.tick += 1
     return OK
@@ -187,6 +188,7 @@ class Attack:
         method: Rendering method.
         presses: True if the hand presses buttons and switches the force.
         tunes: True if it changes the coupling.
+        late: Periods by which samples are late at most.
         is_limited_alone: True limits the force on the device alone, as a bridge must not.
     """
 
@@ -200,6 +202,7 @@ class Attack:
     method: str = "lossless"
     presses: bool = True
     tunes: bool = True
+    late: float = 0.0
     is_limited_alone: bool = False
 
     @classmethod
@@ -227,7 +230,7 @@ class Attack:
         strongest = self._coupling(rng, b / gain, b_r / gain_r, 1.0)
         limits = 10 ** rng.uniform(-0.5, 1.2), 10 ** rng.uniform(-2.0, -0.3)
         mass = 10 ** rng.uniform(-1.5, 0.0)
-        scene = load_scene(self.scene, **({"mass": mass} if self.scene in HEAVY else {}))
+        scene = load_scene(self.scene, **dict.fromkeys(["mass"] * (self.scene in HEAVY), mass))
         prepare(scene, strongest, period, 1, method, warns=False)
         start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         parameters = RunParameters(
@@ -244,27 +247,41 @@ class Attack:
             handle_origin=scene.grip_pose(),
             device_start=start,
             scheme=method.scheme,
+            device_damping=b,
+            device_rotational_damping=b_r,
             guarding=GuardParameters(clutch=1, fade_ticks=max(round(0.02 / period), 1)),
         )
         kernel = BoundKernel(scene.model, scene.data, parameters)
         hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)
         hand["quaternion"][0, 0] = 1.0
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
-        habits = 10 ** rng.uniform(-1.0, 0.4), rng.uniform(0.05, 0.6)
-        options = np.array([self.axes, self.kind, b, b_r, *limits, 0.0, *habits, *np.ceil(times)])
-        seed_hand(self.seed)
+        habits = np.array(
+            [
+                self.axes,
+                self.kind,
+                b,
+                b_r,
+                *limits,
+                0.0,
+                10 ** rng.uniform(-1.0, 0.4),
+                rng.uniform(0.05, 0.6),
+                *np.ceil(times),
+                self.late,
+            ]
+        )
+        draw = np.random.default_rng([self.seed, 2])
         code = OK
         for _ in range(ticks // CHUNK):
             if self.presses and rng.random() < 0.1:
-                options[6] = 1.0 - options[6]
+                habits[6] = 1.0 - habits[6]
             if self.presses and rng.random() < 0.05:
                 kernel.command(int(rng.choice([0, FORCE_OFF, CLUTCHED])))
             if self.tunes and rng.random() < 0.2:
                 wanted = self._coupling(rng, b / gain, b_r / gain_r, rng.uniform(0.1, 1.0))
                 law = method.law_coupling(wanted, period)
-                goal = RunParameters(**{**_fields(parameters), "coupling": law})
+                goal = replace(parameters, coupling=law)
                 kernel.tune(goal, method.gains(law, period), max(round(0.02 / period), 1))
-            code = _attack(kernel.state, sample, kernel.row, hand, options)
+            code = _attack(kernel.state, sample, kernel.row, hand, habits, draw)
             if code != OK:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code
@@ -278,7 +295,3 @@ class Attack:
             2.0 * (share * b_r - damping_r) * self.rate * (1 - 1e-9),
             damping_r,
         )
-
-
-def _fields(parameters: RunParameters) -> dict[str, object]:
-    return {name: getattr(parameters, name) for name in parameters.__dataclass_fields__}
