@@ -130,9 +130,16 @@ def _keep_residuals(s: State) -> None:
         mj_make_constraint(mj.model, mj.data)  # positions are still those before the move
         s.energy.equality_rows = min(ints(mj.ne, 1)[0], mj.equality_capacity)
         residuals = floats(pointer_at(mj.efc_pos), s.energy.equality_rows)
-        floats(mj.equality_before, s.energy.equality_rows)[:] = residuals
+        _copy(residuals, floats(mj.equality_before, residuals.size))
     if mj.ntendon > 0:
-        floats(mj.tendon_before, mj.ntendon)[:] = floats(mj.ten_length, mj.ntendon)
+        _copy(floats(mj.ten_length, mj.ntendon), floats(mj.tendon_before, mj.ntendon))
+
+
+@compiled
+def _copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    # an assignment to a slice could raise, which machine code without numba cannot
+    for i in range(source.size):
+        target[i] = source[i]
 
 
 @compiled

@@ -25,6 +25,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
@@ -50,6 +51,7 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     cap_dissipation,
     observe_reset,
+    releasable_energy,
 )
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
 from hapticbridge.record import TICK_DTYPE
@@ -189,13 +191,13 @@ class BoundKernel:
         self._take_tool_pose()
         move_handle_to_tool(s["pose"])
         discard_wrench(s["loop"])
-        refresh_energies(s)
+        direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
         request_anchor(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
-            restart_lossless(s)
+            direct(restart_lossless, s)(s)
 
     def _bind_model(self, parameters: RunParameters) -> None:
         model, data, mj = self._model, self._data, self._record["mj"]
@@ -255,10 +257,12 @@ class BoundKernel:
             mujoco.mj_fwdPosition(self._model, self._data)
             balance_contacts(s)
         else:
-            refresh_energies(s)
+            direct(refresh_energies, s)(s)
         start_energies(s["energy"])
         if parameters.scheme == Scheme.MIDPOINT:
-            note_twist(s)
+            direct(note_twist, s)(s)
+            direct(restart_lossless, s)
+        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

@@ -542,16 +542,18 @@ def publish_positions(
         (mj.mocap_pos, 3 * mj.nmocap),
         (mj.mocap_quat, 4 * mj.nmocap),
     ):
-        numbers[end : end + count] = floats(source, count)
-        end += count
+        for value in floats(source, count):
+            numbers[end] = value
+            end += 1
     shown = min(ints(mj.ncon, 1)[0], (numbers.size - end) // 6)
     for c in range(shown):
         contact = pointer_at(mj.contact) + c * mj.contact_size
         slot, frame = numbers[end : end + 6], floats(contact + mj.contact_frame, 9)
         mj_contact_force(mj.model, mj.data, c, slot.ctypes.data)  # along the axes of its frame
         normal, first, second = slot[0], slot[1], slot[2]
-        slot[:3] = floats(contact + mj.contact_point, 3)
+        point = floats(contact + mj.contact_point, 3)
         for axis in range(3):
+            slot[axis] = point[axis]
             slot[3 + axis] = (
                 normal * frame[axis] + first * frame[3 + axis] + second * frame[6 + axis]
             )
