@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, cached_property, update_wrapper
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,7 +24,7 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 
 
 @cache
-def cache_folder() -> Path:
+def cache_folder() -> str:
     """Returns the folder of the machine code, one per state of all compiled sources.
 
     numba checks only the file of the function that it loads, but compiled functions inline each
@@ -35,33 +36,27 @@ def cache_folder() -> Path:
         source = path.read_bytes()
         if b"hapticbridge.jit import" in source or path.parent.name == "kernel":
             digest.update(source)
-    base = os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_dir(
-        "hapticbridge", appauthor=False
-    )
-    return Path(base) / digest.hexdigest()[:16]
+    usual = platformdirs.user_cache_dir("hapticbridge", appauthor=False)
+    return str(Path(os.environ.get("NUMBA_CACHE_DIR") or usual) / digest.hexdigest()[:16])
 
 
 @cache
 def _environment() -> str:
-    """Returns all that decides a function's machine code besides the sources, as text."""
-    numba = find_spec("numba")  # without importing it
-    version = (
-        Path(numba.origin).with_name("_version.py").read_text() if numba and numba.origin else ""
-    )
+    """Returns the rest of what decides a function's machine code, as text."""
+    numba = find_spec("numba")  # the version without an import
+    assert numba is not None and numba.origin is not None
+    files = Path(numba.origin).with_name("_version.py"), Path(machine_code.__file__)
+    versions = llvmlite.__version__, mujoco.__version__, np.__version__, sys.version
     settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
-    _, machine = machine_code.machine()
-    versions = version, llvmlite.__version__, mujoco.__version__, np.__version__
-    return repr((Path(machine_code.__file__).read_bytes(), versions, settings, machine))
-
-
-_decorating = threading.Lock()
+    contents = tuple(file.read_bytes() for file in files)
+    return repr((contents, versions, settings, machine_code.processor()))
 
 
 class Deferred:
-    """Object of numba, built when numba first compiles a caller or Python first calls it.
+    """Object of numba that is built when numba compiles its first caller, or Python calls it.
 
     Args:
-        build: Returns what numba makes of the function.
+        build: Returns the object.
     """
 
     def __init__(self, build: Callable[[], Any]) -> None:
@@ -69,24 +64,24 @@ class Deferred:
 
     @cached_property
     def built(self) -> Any:
-        """What numba made."""
+        """The object of numba."""
         return self._build()
 
     @cached_property
     def _numba_type_(self) -> Any:
-        """Type by which numba treats this object in a caller as what was built."""
-        from numba.core.registry import cpu_target
-
-        context, built = cpu_target.typing_context, self.built
-        context.refresh()  # an intrinsic has just been registered
+        """Type that numba sees in a caller: that of the object which was built."""
+        context = import_module("numba.core.registry").cpu_target.typing_context
+        built = self.built
+        context.refresh()  # building an intrinsic has registered it
         return context.resolve_value_type(built)
 
     def __call__(self, *arguments: object) -> Any:
+        """Calls the object of numba."""
         return self.built(*arguments)
 
 
 class Compiled(Deferred):
-    """Function that numba compiles, cached on disk.
+    """Function that numba compiles, or that was compiled before and is on disk.
 
     Args:
         function: The function in Python.
@@ -97,69 +92,61 @@ class Compiled(Deferred):
         super().__init__(lambda: self._decorated(is_cached=True))
         update_wrapper(self, function)
         self._function, self._nogil = function, nogil
-        self._direct: dict[tuple[str, ...], Callable[..., Any]] = {}
+        self._direct: dict[tuple[machine_code.Kind, ...], Callable[..., Any]] = {}
+
+    def direct(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
+        """Returns the machine code for arguments of these types (``jit.direct``)."""
+        found = [machine_code.kind_of(argument) for argument in arguments]
+        kinds = tuple(kind for kind in found if kind is not None)
+        # the linker's rules for other systems are untested
+        if len(kinds) < len(found) or self._nogil or sys.platform != "linux":
+            return self._by_numba(arguments)
+        if kinds not in self._direct:
+            self._direct[kinds] = self._loaded(kinds, arguments) or self._by_numba(arguments)
+        return self._direct[kinds]
+
+    def _by_numba(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
+        return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
+
+    def _loaded(
+        self, kinds: tuple[machine_code.Kind, ...], arguments: tuple[object, ...]
+    ) -> Callable[..., Any] | None:
+        function = self._function
+        names = (function.__module__, function.__qualname__, *map(machine_code.name_of, kinds))
+        digest = hashlib.sha256(repr((names, _environment())).encode()).hexdigest()[:16]
+        path = Path(cache_folder()) / f"{function.__name__}-{digest}.o"
+        code = machine_code.read(path)
+        if code is None:
+            signature = _signature(arguments)
+            dispatcher = self._decorated(is_cached=False)  # a cached one prints no code
+            dispatcher.compile(signature)
+            found, ir = dispatcher.overloads[signature], dispatcher.inspect_llvm(signature)
+            result = str(found.signature.return_type)
+            code = machine_code.object_code(ir, found.fndesc.llvm_func_name, kinds, result)
+            machine_code.write(path, code)
+        try:
+            return machine_code.load(code, function.__name__) if code else None
+        except RuntimeError:
+            return None
 
     def _decorated(self, *, is_cached: bool) -> Any:
-        """Returns the function as numba's dispatcher."""
-        import numba
-
+        numba = import_module("numba")
         decorate = numba.njit(cache=is_cached, nogil=self._nogil, error_model="numpy")
         with _decorating:
             outside = numba.config.CACHE_DIR
-            numba.config.CACHE_DIR = str(cache_folder())
+            numba.config.CACHE_DIR = cache_folder()
             try:
                 return decorate(self._function)
             finally:
                 numba.config.CACHE_DIR = outside
 
-    def direct(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
-        """Returns the machine code for arguments of these types (``jit.direct``)."""
-        kinds = tuple(machine_code.kind_of(argument) for argument in arguments)
-        if self._nogil or not all(kinds):
-            return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
-        if kinds not in self._direct:
-            self._direct[kinds] = self._loaded(kinds, arguments)
-        return self._direct[kinds]
 
-    def _path(self, kinds: tuple[str, ...]) -> Path:
-        function = self._function
-        what = f"{function.__module__}.{function.__qualname__} {kinds} {_environment()}"
-        digest = hashlib.sha256(what.encode()).hexdigest()[:16]
-        return cache_folder() / f"{function.__name__}-{digest}.o"
-
-    def _loaded(self, kinds: tuple[str, ...], arguments: tuple[object, ...]) -> Callable[..., Any]:
-        path, name = self._path(kinds), self._function.__name__
-        code = machine_code.read(path)
-        if code is None:
-            code = self._object_code(kinds, _signature(arguments))
-            machine_code.write(path, code)
-        if code:
-            with suppress(RuntimeError):
-                return machine_code.load(code, name)
-        return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
-
-    def _object_code(self, kinds: tuple[str, ...], signature: tuple[Any, ...]) -> bytes:
-        """Returns the object code, empty if the function needs numba's runtime."""
-        dispatcher = self._decorated(is_cached=False)  # numba prints no code of a cached function
-        dispatcher.compile(signature)
-        found = dispatcher.overloads[signature]
-        try:
-            code = machine_code.object_code(
-                dispatcher.inspect_llvm(signature),
-                found.fndesc.llvm_func_name,
-                kinds,
-                str(found.signature.return_type),
-            )
-            machine_code.load(code, self._function.__name__)
-        except (RuntimeError, KeyError):
-            return b""
-        return code
+_decorating = threading.Lock()
+"""Held while numba's setting of the cache folder is another one."""
 
 
 def _signature(arguments: tuple[object, ...]) -> tuple[Any, ...]:
-    import numba
-
-    return tuple(numba.typeof(argument) for argument in arguments)
+    return tuple(map(import_module("numba").typeof, arguments))
 
 
 def compiled(function: _Function) -> _Function:
@@ -181,24 +168,16 @@ def compiled_for_threads(function: _Function) -> _Function:
 
 def intrinsic(function: Callable[..., Any]) -> Any:
     """Declares a function that writes LLVM code (``numba.extending.intrinsic``)."""
-
-    def build() -> Any:
-        import numba.extending
-
-        return numba.extending.intrinsic(function)
-
-    return Deferred(build)
+    return Deferred(lambda: import_module("numba.extending").intrinsic(function))
 
 
 def external(symbol: str, signature: str) -> Any:
     """Declares a C function for compiled callers, with a signature such as "void(intp, intp)"."""
 
     def build() -> Any:
-        from numba import types
-        from numba.core import sigutils
-
+        sigutils = import_module("numba.core.sigutils")
         arguments, result = sigutils.normalize_signature(signature)
-        return types.ExternalFunction(symbol, result(*arguments))
+        return import_module("numba.core.types").ExternalFunction(symbol, result(*arguments))
 
     return Deferred(build)
 

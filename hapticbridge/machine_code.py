@@ -1,8 +1,8 @@
 """Machine code of compiled functions, kept on disk and called without numba.
 
-Importing numba and its registries takes longer than all else in the start of a run. A file here
-holds one function as an object file of LLVM, with an entry for CPython's vectorcall convention, so
-that llvmlite alone can load it. The code is numba's own: the entry only unpacks the arguments.
+Importing numba and its registries takes longer than all else at the start of a run. A file of this
+module holds one function as an object file, which llvmlite loads alone. The code is numba's own;
+an entry in front of it takes Python objects apart (``METH_FASTCALL``).
 
 A function can be kept if it needs only MuJoCo, the C library and CPython. Code that may allocate or
 raise needs numba's runtime; the linker then refuses it, and the caller uses numba.
@@ -17,164 +17,151 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
 
+Kind = type | tuple[np.dtype[Any], int]
+"""Type of an argument: ``bool``, ``int`` or ``float``; or the type of an array's items and the
+number of its axes, 0 for a record."""
+
 _ENTRY = "hapticbridge_entry"
-_OBJECT = object.__basicsize__
-"""Size in bytes of what every Python object begins with. An array continues with the address of
-its data, the number of axes in a word of 8 bytes, and the address of its shape; a record with a
-word of 8 bytes and the address of its data. Both are in NumPy's public headers."""
+
+_HEADER = object.__basicsize__
+"""Size in bytes of the header of Python objects. In an array, the address of the data follows, the
+number of axes in 8 bytes, and the address of the shape; in a record, a size in 8 bytes and the
+address of the data. NumPy's public C headers declare both."""
 
 _FAST_CALL = 0x80
-"""Flag ``METH_FASTCALL``: the function takes an array of arguments and their count."""
+"""Flag ``METH_FASTCALL``: a function is called with an array of arguments and their number."""
 
 _RESULTS = {
-    "none": ("ptr", ""),
-    "bool": ("i8", "%wide = zext i8 %value to i64\n%result = call ptr @PyBool_FromLong(i64 %wide)"),
-    "int64": ("i64", "%result = call ptr @PyLong_FromLongLong(i64 %value)"),
-    "float64": ("double", "%result = call ptr @PyFloat_FromDouble(double %value)"),
+    "none": ("ptr", "call void @Py_IncRef(ptr @_Py_NoneStruct)\nret ptr @_Py_NoneStruct"),
+    "bool": (
+        "i8",
+        "%byte = load i8, ptr %place\n%wide = zext i8 %byte to i64\n"
+        "%object = call ptr @PyBool_FromLong(i64 %wide)\nret ptr %object",
+    ),
+    "int64": (
+        "i64",
+        "%number = load i64, ptr %place\n"
+        "%object = call ptr @PyLong_FromLongLong(i64 %number)\nret ptr %object",
+    ),
+    "float64": (
+        "double",
+        "%number = load double, ptr %place\n"
+        "%object = call ptr @PyFloat_FromDouble(double %number)\nret ptr %object",
+    ),
 }
-"""Type in memory of a result, and its way into a Python object, by numba's name of the type."""
+"""Type of a result in memory and the code that returns it as an object, by numba's name of it."""
 
-
-def kind_of(argument: object) -> str:
-    """Returns the type of an argument as text, empty if an entry cannot unpack it."""
-    if isinstance(argument, np.ndarray):
-        flags = argument.flags
-        is_plain = flags.c_contiguous and flags.writeable and argument.ndim > 0
-        return f"{argument.dtype.str}:{argument.ndim}:{argument.itemsize}" if is_plain else ""
-    if type(argument) is np.void:
-        return f"{argument.dtype.str}:record"
-    kinds = {bool: "bool", int: "int", float: "float"}
-    return kinds.get(type(argument), "")
-
-
-@cache
-def machine() -> tuple[Any, str]:
-    """Returns LLVM's description of this processor, and a text that distinguishes it."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    triple = llvm.get_process_triple()
-    target = llvm.Target.from_triple(triple).create_target_machine(
-        cpu=name, features=features, opt=3, reloc="pic", codemodel="default"
-    )
-    return target, f"{triple} {name} {features} {llvm.llvm_version_info}"
-
-
-def object_code(ir: str, symbol: str, kinds: Sequence[str], result: str) -> bytes:
-    """Compiles a function's optimised code together with an entry.
-
-    Args:
-        ir: LLVM code of the function and all that it calls, as numba prints it.
-        symbol: The function's name there.
-        kinds: Types of the arguments (``kind_of``).
-        result: numba's name of the result's type.
-
-    Raises:
-        RuntimeError: LLVM does not accept the code.
-        KeyError: An entry cannot return such a result.
-    """
-    target, _ = machine()
-    module = llvm.parse_assembly(ir)
-    module.link_in(llvm.parse_assembly(_entry(symbol, kinds, result)))
-    for value in (*module.functions, *module.global_variables):
-        if not value.is_declaration and value.name != _ENTRY:
-            value.linkage = "internal"
-    passes = llvm.create_new_module_pass_manager()
-    passes.add_global_dead_code_eliminate_pass()
-    passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
-    return bytes(target.emit_object(module))
-
-
-def _entry(symbol: str, kinds: Sequence[str], result: str) -> str:
-    """Returns LLVM code that unpacks Python objects and calls a function of numba.
-
-    numba's function takes the addresses of result and exception and returns 0 without an exception.
-    An array comes as owner (none here), parent, size, size of an item, data, shape and strides.
-    """
-    body: list[str] = []
-    types: list[str] = ["ptr", "ptr"]
-    values: list[str] = ["%place", "%exception"]
-
-    def pass_on(kind: str, value: str) -> None:
-        types.append(kind)
-        values.append(value)
-
-    for number, kind in enumerate(kinds):
-        a = f"%a{number}"
-        body += [
-            f"{a}.slot = getelementptr ptr, ptr %arguments, i64 {number}",
-            f"{a} = load ptr, ptr {a}.slot",
-        ]
-        if kind == "float":
-            body.append(f"{a}.value = call double @PyFloat_AsDouble(ptr {a})")
-            pass_on("double", f"{a}.value")
-        elif kind in ("int", "bool"):
-            body.append(f"{a}.value = call i64 @PyLong_AsLongLong(ptr {a})")
-            if kind == "bool":
-                body.append(f"{a}.byte = trunc i64 {a}.value to i8")
-            pass_on(*(("i8", f"{a}.byte") if kind == "bool" else ("i64", f"{a}.value")))
-        elif kind.endswith(":record"):
-            body += [
-                f"{a}.fields = getelementptr i8, ptr {a}, i64 {_OBJECT + 8}",
-                f"{a}.data = load ptr, ptr {a}.fields",
-            ]
-            pass_on("ptr", f"{a}.data")
-        else:
-            _, axes, size = kind.rsplit(":", 2)
-            lengths = [f"{a}.length{axis}" for axis in range(int(axes))]
-            body += [
-                f"{a}.fields = getelementptr i8, ptr {a}, i64 {_OBJECT}",
-                f"{a}.data = load ptr, ptr {a}.fields",
-                f"{a}.place = getelementptr i8, ptr {a}, i64 {_OBJECT + 16}",
-                f"{a}.shape = load ptr, ptr {a}.place",
-            ]
-            strides, total = [size], size
-            for axis, length in enumerate(lengths):
-                body += [
-                    f"{length}.place = getelementptr i64, ptr {a}.shape, i64 {axis}",
-                    f"{length} = load i64, ptr {length}.place",
-                ]
-            for length in reversed(lengths):
-                body.append(f"{length}.stride = mul i64 {length}, {total}")
-                total = f"{length}.stride"
-                strides.append(total)
-            body.append(f"{a}.size = udiv i64 {total}, {size}")
-            pass_on("ptr", "null")
-            pass_on("ptr", "null")
-            pass_on("i64", f"{a}.size")
-            pass_on("i64", size)
-            pass_on("ptr", f"{a}.data")
-            for value in (*lengths, *reversed(strides[:-1])):
-                pass_on("i64", value)
-    kind, convert = _RESULTS[result]
-    declared = ", ".join(types)
-    passed = ", ".join(f"{kind} {value}" for kind, value in zip(types, values, strict=True))
-    lines = "\n".join(body)
-    give = (
-        f"%value = load {kind}, ptr %place\n{convert}\nret ptr %result"
-        if convert
-        else ("call void @Py_IncRef(ptr @_Py_NoneStruct)\nret ptr @_Py_NoneStruct")
-    )
-    return f"""
-declare i32 @"{symbol}"({declared})
+_DECLARATIONS = """
 declare double @PyFloat_AsDouble(ptr)
 declare i64 @PyLong_AsLongLong(ptr)
+declare i32 @PyObject_IsTrue(ptr)
 declare ptr @PyBool_FromLong(i64)
 declare ptr @PyLong_FromLongLong(i64)
 declare ptr @PyFloat_FromDouble(double)
 declare void @Py_IncRef(ptr)
 @_Py_NoneStruct = external global i8
+"""
+
+
+def kind_of(argument: object) -> Kind | None:
+    """Returns the type of an argument; None if an entry cannot take it apart."""
+    if isinstance(argument, np.ndarray):
+        flags = argument.flags
+        is_plain = flags.c_contiguous and flags.writeable and argument.ndim > 0
+        return (argument.dtype, argument.ndim) if is_plain else None
+    if type(argument) is np.void:
+        return (argument.dtype, 0)
+    return type(argument) if type(argument) in (bool, int, float) else None
+
+
+@cache
+def name_of(kind: Kind) -> str:
+    """Returns a text that distinguishes the type from others, in every process."""
+    return repr(kind)
+
+
+@cache
+def _machine() -> tuple[Any, Any]:
+    """Returns LLVM's description of this processor, and a linker for it."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    cpu, features = processor()
+    target = llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(
+        cpu=cpu, features=features, opt=3, reloc="pic", codemodel="default"
+    )
+    return target, llvm.create_lljit_compiler(target, suppress_errors=True)
+
+
+@cache
+def processor() -> tuple[str, str]:
+    """Returns name and features of this processor, for which the code is made."""
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> bytes:
+    """Compiles a function's optimised code together with an entry.
+
+    Args:
+        ir: LLVM code of the function and all that it calls, as numba prints it.
+        symbol: Name of the function there.
+        kinds: Types of the arguments.
+        result: numba's name of the result's type.
+
+    Returns:
+        The object code, empty if it cannot be used without numba's runtime.
+    """
+    if result not in _RESULTS:
+        return b""
+    target, _ = _machine()
+    try:
+        module = llvm.parse_assembly(ir)
+        module.link_in(llvm.parse_assembly(_entry(symbol, kinds, result)))
+        for value in (*module.functions, *module.global_variables):
+            if not value.is_declaration and value.name != _ENTRY:
+                value.linkage = "internal"
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_global_dead_code_eliminate_pass()
+        passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
+        code = bytes(target.emit_object(module))
+        load(code, symbol)
+    except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
+        return b""
+    return code
+
+
+def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
+    """Returns LLVM code that calls a function of numba with Python objects.
+
+    The function takes places for its result and for an exception, and returns 0 without one. NULL
+    as the entry's result becomes a ``SystemError``.
+    """
+    lines: list[str] = []
+    passed = ["ptr %place", "ptr %exception"]
+    for number, kind in enumerate(kinds):
+        code, values = _unpacked(f"%a{number}", kind)
+        lines += (
+            f"%a{number}.place = getelementptr ptr, ptr %arguments, i64 {number}",
+            f"%a{number} = load ptr, ptr %a{number}.place",
+            *code,
+        )
+        passed += values
+    place, give = _RESULTS[result]
+    types = ", ".join(value.split()[0] for value in passed)
+    body = "\n".join(lines)
+    return f"""{_DECLARATIONS}
+declare i32 @"{symbol}"({types})
 define ptr @{_ENTRY}(ptr %self, ptr %arguments, i64 %count) {{
-%place = alloca {kind}
+%place = alloca {place}
 %exception = alloca ptr
-{lines}
-%status = call i32 @"{symbol}"({passed})
+{body}
+%status = call i32 @"{symbol}"({", ".join(passed)})
 %failed = icmp ne i32 %status, 0
 br i1 %failed, label %fail, label %done
 fail:
@@ -183,6 +170,44 @@ done:
 {give}
 }}
 """
+
+
+def _unpacked(a: str, kind: Kind) -> tuple[list[str], list[str]]:
+    """Returns the code that takes the object ``a`` apart, and what numba's function is passed.
+
+    An array is passed as owner (none), parent, size, size of an item, data, shape and strides.
+    """
+    if kind is float:
+        return [f"{a}.value = call double @PyFloat_AsDouble(ptr {a})"], [f"double {a}.value"]
+    if kind is int:
+        return [f"{a}.value = call i64 @PyLong_AsLongLong(ptr {a})"], [f"i64 {a}.value"]
+    if isinstance(kind, type):
+        lines = [f"{a}.truth = call i32 @PyObject_IsTrue(ptr {a})"]
+        return [*lines, f"{a}.value = trunc i32 {a}.truth to i8"], [f"i8 {a}.value"]
+    dtype, axes = kind
+    offset = _HEADER if axes else _HEADER + 8
+    lines = [
+        f"{a}.field = getelementptr i8, ptr {a}, i64 {offset}",
+        f"{a}.data = load ptr, ptr {a}.field",
+    ]
+    if not axes:
+        return lines, [f"ptr {a}.data"]
+    lines += [
+        f"{a}.last = getelementptr i8, ptr {a}, i64 {_HEADER + 16}",
+        f"{a}.shape = load ptr, ptr {a}.last",
+        f"{a}.stride{axes} = add i64 0, {dtype.itemsize}",
+    ]
+    for axis in reversed(range(axes)):
+        lines += [
+            f"{a}.place{axis} = getelementptr i64, ptr {a}.shape, i64 {axis}",
+            f"{a}.length{axis} = load i64, ptr {a}.place{axis}",
+            f"{a}.stride{axis} = mul i64 {a}.length{axis}, {a}.stride{axis + 1}",
+        ]
+    lines.append(f"{a}.size = udiv i64 {a}.stride0, {dtype.itemsize}")
+    lengths = [f"i64 {a}.length{axis}" for axis in range(axes)]
+    strides = [f"i64 {a}.stride{axis + 1}" for axis in range(axes)]
+    start = ["ptr null", "ptr null", f"i64 {a}.size", f"i64 {dtype.itemsize}", f"ptr {a}.data"]
+    return lines, [*start, *lengths, *strides]
 
 
 class _Definition(ctypes.Structure):
@@ -196,30 +221,33 @@ class _Definition(ctypes.Structure):
     )
 
 
-_loaded: list[object] = []
+_new_function = ctypes.PYFUNCTYPE(ctypes.py_object, *3 * (ctypes.c_void_p,))(
+    ("PyCFunction_NewEx", ctypes.pythonapi)
+)
+
+_numbers = count()
+"""Numbers of libraries, whose names must differ."""
+
+_loaded: list[tuple[object, object]] = []
 """All that must live as long as the functions, which is as long as the process."""
 
 
 def load(code: bytes, name: str) -> Callable[..., Any]:
-    """Returns a Python function that runs object code.
+    """Returns a function that runs object code.
 
     Raises:
         RuntimeError: It needs a symbol that neither MuJoCo nor this process has, or is no object
             file of this machine.
     """
-    target, _ = machine()
-    linker = llvm.create_lljit_compiler(target)
-    # numba's release of an array's owner; arrays that come through the entry have none
+    _, linker = _machine()
+    # numba's release of an array's owner, never called: arrays from an entry have none
     unused = ctypes.cast(ctypes.pythonapi.Py_FatalError, ctypes.c_void_p).value
     builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
     builder.import_symbol("NRT_MemInfo_call_dtor", unused).export_symbol(_ENTRY)
-    library = builder.link(linker, name)
+    library = builder.link(linker, f"{name} {next(_numbers)}")
     definition = _Definition(name.encode(), library[_ENTRY], _FAST_CALL, None)
-    _loaded.extend((linker, library, definition))
-    create = ctypes.pythonapi.PyCFunction_NewEx
-    create.restype = ctypes.py_object
-    create.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
-    function: Callable[..., Any] = create(ctypes.addressof(definition), None, None)
+    _loaded.append((library, definition))
+    function: Callable[..., Any] = _new_function(ctypes.addressof(definition), None, None)
     return function
 
 

@@ -12,7 +12,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "lazy", "record", "signals", "units"),
+    ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
     ("arguments", "clock", "coupling", "files", "pose"),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),

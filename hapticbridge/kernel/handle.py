@@ -107,9 +107,7 @@ def _place_first(run: Part, pose: Part) -> None:
 def stretch_at(s: State, sample: NDArray[np.void]) -> float:
     """Returns the distance in m between the tool and the handle that a sample would give."""
     pose, first = s.pose, sample[0]
-    handle, _ = handle_pose(
-        s.run, pose, vector_of(first.position), quaternion_of(first.quaternion)
-    )
+    handle, _ = handle_pose(s.run, pose, vector_of(first.position), quaternion_of(first.quaternion))
     return norm(subtract(handle, vector_of(pose.tool_position)))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +58,15 @@ mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, in
 mj_contact_force: Any = external("mj_contactForce", "void(intp, intp, int32, intp)")
 
 
-def _carray() -> Any:
-    import numba
-
-    return numba.carray
-
-
-_view = Deferred(_carray)
+_view = Deferred(lambda: import_module("numba").carray)
 
 
 @intrinsic
 def _as_pointer(_typing: Any, _address: Any) -> Any:
-    from numba.core import cgutils, types
+    types = import_module("numba.core.types")
 
-    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), generate
 
@@ -79,13 +74,12 @@ def _as_pointer(_typing: Any, _address: Any) -> Any:
 @intrinsic
 def release_fence(_typing: Any) -> Any:
     """Orders the record's bytes before the cursor that publishes them (release semantics)."""
-    from numba.core import types
 
     def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
         builder.fence("release")
         return context.get_dummy_value()
 
-    return types.void(), generate
+    return import_module("numba.core.types").void(), generate
 
 
 @compiled
