@@ -29,7 +29,7 @@ def weighted(
 ) -> float:
     total = factor * table[1, 2] + table[-1, -1] + pairs[1]["first"] + pair["first"] + table.size
     table[0, 0] = total + shift + pair["second"]
-    return -total if negates else total
+    return float(-total if negates else total)
 
 
 def is_above(pair: Any, limit: float) -> bool:
@@ -37,7 +37,7 @@ def is_above(pair: Any, limit: float) -> bool:
 
 
 def rows_of(table: NDArray[np.float64]) -> int:
-    return table.shape[0] + 10 * table.shape[1]
+    return int(table.shape[0] + 10 * table.shape[1])
 
 
 def clear(table: NDArray[np.float64]) -> None:

@@ -28,7 +28,13 @@ from numpy.typing import NDArray
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
-from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
+from hapticbridge.kernel.coupling import (
+    COUPLING_DTYPE,
+    Gains,
+    bind_coupling,
+    releasable_energy,
+    set_tuning_goal,
+)
 from hapticbridge.kernel.guard import (
     GUARD_DTYPE,
     bind_guard,
@@ -51,7 +57,6 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     cap_dissipation,
     observe_reset,
-    releasable_energy,
 )
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
 from hapticbridge.record import TICK_DTYPE
