@@ -28,12 +28,6 @@ from numpy.typing import NDArray
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
-from hapticbridge.kernel.guard import (
-    GUARD_DTYPE,
-    bind_guard,
-    restart_ramp,
-    set_commanded,
-)
 from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_to_tool, set_tool
 from hapticbridge.kernel.law import (
     COUPLING_DTYPE,
