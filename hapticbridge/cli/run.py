@@ -211,15 +211,12 @@ class Run:
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
     method: str | None = None
-    """Rendering method: 'lossless' (half of the coupling inside MuJoCo's implicit step,
-    half carried over: second order away from contact; the default), 'implicit' (all of it inside
-    the step, which adds K T to the damping that is felt; the default with substeps, which
-    'lossless' does not take), 'compensated' (the same, with that K T taken off the coupling's
-    damping), 'implicitfast' or 'implicitfast:compensated' (the same actuators under that
-    integrator, with K T more damping), 'explicit', 'explicit:implicitfast' or 'explicit:rk4'
-    (applied as a force and held, under Euler or the integrator named), 'weld' (MuJoCo's weld
-    constraint), 'direct' (a tool without mass, no coupling). All but the first three exist to be
-    compared."""
+    """Rendering method: 'lossless' (half of the coupling inside MuJoCo's implicit step, half
+    carried over: second order away from contact; the default), 'implicit' (all of it inside the
+    step, which adds K T to the damping that is felt; the default with substeps, which 'lossless'
+    does not take), 'compensated' (the same, with that K T taken off the coupling's damping), or a
+    method that exists to be compared, such as 'explicit', 'weld' or 'direct' (a tool without mass);
+    an unknown name lists them."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False

@@ -14,7 +14,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import Scheme, has_law, law_evaluations
+from hapticbridge.kernel.codes import Scheme, SchemeProperties
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
@@ -174,12 +174,9 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
     Raises:
         HapticBridgeError: The message gives the reason.
     """
-    reasons: dict[int, str] = {
-        Scheme.MASSLESS: "a tool without mass has no motion to divide",
-        Scheme.MIDPOINT: "a lossless coupling carries half of a tick's wrench over to the next",
-    }
-    if substeps != 1 and scheme in reasons:
-        raise HapticBridgeError(f"substeps is {substeps!r}; {reasons[scheme]}, so it must be 1")
+    reason = Scheme(scheme).properties.one_substep
+    if substeps != 1 and reason:
+        raise HapticBridgeError(f"substeps is {substeps!r}; {reason}, so it must be 1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,12 +240,14 @@ class RunParameters:
             if not math.isfinite(value) or value <= 0:
                 raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
         if self.scheme not in list(Scheme):
-            raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 4")
+            raise HapticBridgeError(
+                f"scheme is {self.scheme!r}; it must be 0 to {max(Scheme).value}"
+            )
         stiffness = self.contact_stiffness
         if (
             not math.isfinite(stiffness)
             or stiffness < 0
-            or (stiffness > 0) != (self.scheme == Scheme.MASSLESS)
+            or (stiffness > 0) == self.properties.has_tool_mass
         ):
             raise HapticBridgeError(
                 f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
@@ -271,14 +270,24 @@ class RunParameters:
             raise _no_rotation(self.axes)
 
     @property
+    def properties(self) -> SchemeProperties:
+        """Properties of the scheme."""
+        return Scheme(self.scheme).properties
+
+    @property
+    def holds_wrench(self) -> bool:
+        """True if the wrench is applied as a force during the next tick."""
+        return self.properties.holds_wrench
+
+    @property
     def law_evaluations(self) -> int:
         """Evaluations of the tool's wrench per tick."""
-        return law_evaluations(self.scheme, self.substeps)
+        return self.properties.law_evaluations(self.substeps)
 
     @property
     def has_law(self) -> bool:
         """True if the coupling law gives the wrench."""
-        return has_law(self.scheme)
+        return self.properties.has_law
 
     def slack_gains(self) -> tuple[float, float]:
         """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².

@@ -60,6 +60,7 @@ _FROM_PARAMETERS = (
     "scheme",
     "law_evaluations",
     "has_law",
+    "holds_wrench",
     "scale",
     "force_scale",
     "force_limit",
@@ -75,6 +76,7 @@ RUN_DTYPE = np.dtype(
         ("substeps", "<i8"),
         ("law_evaluations", "<i8"),
         ("has_law", "<i8"),
+        ("holds_wrench", "<i8"),
         ("watches_device", "<i8"),
         ("ramp_ticks", "<i8"),
         ("period", "<f8"),
@@ -208,8 +210,7 @@ class BoundKernel:
         mj["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
         grip = mj["grip_site_id"] = model.site(parameters.grip).id
         mj["grip_body_id"] = model.site_bodyid[grip]
-        is_weld = parameters.scheme == Scheme.WELD
-        mj["weld_id"] = model.equality(WELD_NAME).id if is_weld else -1
+        mj["weld_id"] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]

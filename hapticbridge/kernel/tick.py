@@ -233,7 +233,7 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
         scheme: One of ``Scheme``.
     """
     return (
-        scheme in (Scheme.IMPLICIT, Scheme.ZERO_ORDER_HOLD, Scheme.MIDPOINT)
+        Scheme(scheme).properties.may_split
         and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
         and model.nplugin == 0
         and mujoco.get_mjcb_control() is None
@@ -325,11 +325,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
     is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
-    if (
-        not math.isfinite(square)
-        or (scheme == Scheme.ZERO_ORDER_HOLD and is_too_large)
-        or has_warned(s.mj)
-    ):
+    if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or has_warned(s.mj):
         return _refuse(s)
     _render(s, force, torque)
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
