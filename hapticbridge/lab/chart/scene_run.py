@@ -363,7 +363,7 @@ class Staged(ABC):
             StudyError: The method omits the tool's own dynamics, which the workload judges.
         """
         method = setting.method
-        if self.needs_tool and not method.has_law:
+        if self.needs_tool and (method.is_weld or not method.has_coupling):
             raise StudyError(f"method '{method.name}' {self.needs_tool}")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 
