@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from typing import Any, TypeAlias
+from typing import Any
 
 import mujoco
 
@@ -14,7 +14,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
 from hapticbridge.kernel.codes import WELD_NAME, Scheme
-from hapticbridge.kernel.coupling import Gains
+from hapticbridge.kernel.coupling import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.scene import Scene
@@ -27,22 +27,6 @@ from hapticbridge.theory.compensation import (
     effective_damping,
     law_damping,
 )
-
-GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
-"""Gains of the coupling's actuators, for forces and for torques, by the law's coupling and MuJoCo's
-time step in s."""
-
-
-def implicit_gains(coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
-    """Returns the gains of actuators that evaluate the whole law inside MuJoCo's step."""
-    k, b = coupling.stiffness, coupling.damping
-    kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-    return (b, k, b), (br, kr, br)
-
-
-def no_gains(_coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
-    """Returns the gains of actuators without effect."""
-    return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

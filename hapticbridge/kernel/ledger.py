@@ -431,7 +431,7 @@ def judge_environment(s: State) -> bool:
 
         slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
 
-    g in N/m and g_r in N m/rad are those of ``RunParameters.slack_gains``: K + B/T and K_r + B_r/T
+    g in N/m and g_r in N m/rad are those of ``coupling.slack_gains``: K + B/T and K_r + B_r/T
     with one evaluation of the law per tick.
 
     Without a coupling law (a weld, a tool without mass) the device can receive too much energy even

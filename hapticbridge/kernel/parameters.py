@@ -150,11 +150,6 @@ UNGUARDED = GuardParameters()
 """Guard parameters of runs without a device, and of recordings older than the guard."""
 
 
-SLACK_SHARE = 0.5
-"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack with n > 1 evaluations of the law per tick; no
-unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
-environment counts as active sooner."""
-
 MAX_SUBSTEPS = 100
 """Largest number of MuJoCo steps per tick. More do not fit into the period of a haptic loop."""
 
@@ -288,28 +283,6 @@ class RunParameters:
     def has_law(self) -> bool:
         """True if the coupling law gives the wrench."""
         return self.properties.has_law
-
-    def slack_gains(self) -> tuple[float, float]:
-        """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
-
-        g = K + B/T with one evaluation of the law per tick, and half of K/n + B/T with n > 1. Zero
-        without a coupling law (a weld, a tool without mass), because the proof of a slack needs
-        one. With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device
-        damping at B = 0; half of it does not (``certificate.required_damping``). The records hold
-        the sum of the motions δx_i alone, and uniform motion gives the least slack for a sum.
-        """
-        if not self.has_law:
-            return 0.0, 0.0
-        coupling = self.coupling
-        share = 1.0 if self.law_evaluations == 1 else SLACK_SHARE
-        return (
-            share * (coupling.stiffness / self.law_evaluations + coupling.damping / self.period),
-            share
-            * (
-                coupling.rotational_stiffness / self.law_evaluations
-                + coupling.rotational_damping / self.period
-            ),
-        )
 
 
 _ROUNDING = 4 * np.finfo(np.float64).eps

@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
-from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
+from hapticbridge.kernel.coupling import (
+    COUPLING_DTYPE,
+    Gains,
+    bind_coupling,
+    implicit_gains,
+    set_tuning_goal,
+)
 from hapticbridge.kernel.guard import (
     GUARD_DTYPE,
     bind_guard,
@@ -275,10 +281,8 @@ class BoundKernel:
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters) -> tuple[float, ...]:
     """Returns the whole gains of the coupling's actuators, for forces and then for torques."""
     if parameters.scheme == Scheme.MIDPOINT:  # the model may have half of them
-        coupling = parameters.coupling
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return b, k, b, br, kr, br
+        forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
+        return (*forces, *torques)
     gains: list[float] = []
     first = model.actuator(COUPLING_ACTUATORS[0]).id
     for actuator in (first, first + 3):

@@ -6,8 +6,8 @@ from functools import partial
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import Scheme
-from hapticbridge.kernel.coupling import Gains
-from hapticbridge.rendering import METHODS, Method, no_gains
+from hapticbridge.kernel.coupling import Gains, no_gains
+from hapticbridge.rendering import METHODS, Method
 from hapticbridge.scene.checks import check_massless_tool
 from hapticbridge.scene.handle import check_weldable
 from hapticbridge.theory.compensation import IMPLICIT_LAG
