@@ -67,19 +67,6 @@ def effective_damping(stiffness: float, damping: float, period: float, lag: floa
     return damping + scalar("lag", lag, "") * stiffness * _period(period)
 
 
-def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) -> float:
-    """Returns the device damping b in N s/m required for K and effective B: K T/2 + B'.
-
-    Sufficient for any passive hand and any environment that is discrete-time passive (14).
-    Necessary against a wall, and for λ = ½ against a free tool of any mass. Arguments as for
-    ``law_damping``.
-
-    References:
-        Brown & Colgate 1997, eq. (6), for the law with B'; derivation in the module docstring.
-    """
-    return 0.5 * stiffness * _period(period) + law_damping(stiffness, felt, period, lag)
-
-
 def largest_felt_damping(
     device_damping: float, stiffness: float, period: float, lag: float
 ) -> float:
