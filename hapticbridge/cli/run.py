@@ -315,35 +315,7 @@ class Run:
         told: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
-        options = BridgeOptions(
-            rate=self.rate,
-            substeps=self.substeps,
-            method=self.method,
-            contact_stiffness=self.contact_stiffness,
-            i_know=self.i_know,
-            workspace=Workspace(
-                scale=self.scale,
-                force_scale=self.force_scale,
-                axes=SAME_FRAME.axes if self.axes is None else self.axes,
-                absolute=self.absolute,
-            ),
-            limits=Limits(
-                force=device.info.force_limit if self.force_limit is None else self.force_limit,
-                torque=(
-                    device.info.torque_limit if self.torque_limit is None else self.torque_limit
-                ),
-                ramp=self.ramp,
-                stretch=self.stretch_limit,
-                energy=self.energy_limit,
-                reach=self.reach_limit,
-            ),
-            controller=self.controller,
-            clutch=self.clutch,
-            dead_man=self.dead_man,
-            mark=self.mark,
-            live=not self.as_json and (err.is_terminal or not self.fast),
-            realtime=self.realtime or None,
-        )
+        options = self._options(device.info)
         coupling = self._coupling(device.info, options)
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
@@ -370,6 +342,35 @@ class Run:
             )
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _options(self, info: DeviceInfo) -> BridgeOptions:
+        return BridgeOptions(
+            rate=self.rate,
+            substeps=self.substeps,
+            method=self.method,
+            contact_stiffness=self.contact_stiffness,
+            i_know=self.i_know,
+            workspace=Workspace(
+                scale=self.scale,
+                force_scale=self.force_scale,
+                axes=SAME_FRAME.axes if self.axes is None else self.axes,
+                absolute=self.absolute,
+            ),
+            limits=Limits(
+                force=info.force_limit if self.force_limit is None else self.force_limit,
+                torque=info.torque_limit if self.torque_limit is None else self.torque_limit,
+                ramp=self.ramp,
+                stretch=self.stretch_limit,
+                energy=self.energy_limit,
+                reach=self.reach_limit,
+            ),
+            controller=self.controller,
+            clutch=self.clutch,
+            dead_man=self.dead_man,
+            mark=self.mark,
+            live=not self.as_json and (err.is_terminal or not self.fast),
+            realtime=self.realtime or None,
+        )
 
     def _window(self) -> Window:
         from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
