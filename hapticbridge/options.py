@@ -289,21 +289,21 @@ class RunSetup:
             period_of(options.rate),
             options.substeps,
         )
-        scales, laws = options.workspace.scales, method.law_evaluations(substeps)
+        scales, law_evaluations = options.workspace.scales, method.law_evaluations(substeps)
         if options.mark is not None and not is_recorded:
             raise RecordingError(
                 f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
                 " name a file to record to"
             )
         refuse_simulated_time(info, clock)
-        requested = coupling or default_coupling(info, period, *scales, laws, method)
-        law = method.used(requested, period / substeps)
+        requested = coupling or default_coupling(info, period, *scales, law_evaluations, method)
+        law = method.law_coupling(requested, period / substeps)
         limits = limits_for(info, options.limits)
         guard = guard_parameters_for(
             info,
             limits,
             period,
-            needed=required_axis_damping(info, law, period, *scales, laws, method),
+            needed=required_axis_damping(info, law, period, *scales, law_evaluations, method),
             scale=scales[0],
             controller=options.controller,
             clutch=button_mask(options.clutch, "clutch"),
@@ -333,12 +333,12 @@ class RunSetup:
     @property
     def law(self) -> Coupling:
         """Coupling of the law: K and B', for which the device needs b >= s (K T/2 + B')."""
-        return self.method.used(self.coupling, self.period / self.substeps)
+        return self.method.law_coupling(self.coupling, self.period / self.substeps)
 
     @property
     def attainable(self) -> Coupling:
         """Requested coupling, with damping raised to the least that the method can render."""
-        return self.method.rendered(self.law, self.period / self.substeps)
+        return self.method.requested_coupling(self.law, self.period / self.substeps)
 
     @property
     def law_evaluations(self) -> int:
@@ -371,7 +371,7 @@ class RunSetup:
             HapticBridgeError: A value is out of range.
         """
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
-        damping, rotational_damping = self.info.burning_damping
+        damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
         is_absolute = self.workspace.absolute
         return RunParameters(
@@ -389,7 +389,7 @@ class RunSetup:
             handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,
             scheme=self.method.scheme,
-            felt=effective,
+            effective=effective,
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,
             device_rotational_damping=rotational_damping,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
-from hapticbridge.device.family import Driver, Notify, ignore_message
+from hapticbridge.device.driver import Driver, Notify, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
@@ -28,21 +28,21 @@ DRIVERS = {
     "haply": "hapticbridge.device.haply.device",
     "forcedimension": "hapticbridge.device.force_dimension.device",
 }
-"""Module of each family by the family's name, in the order in which families are listed. The module
-holds the ``Driver`` as ``FAMILY``."""
+"""Module of each driver by the driver's name, in the order in which drivers are listed. The module
+holds the ``Driver`` as ``DRIVER``."""
 
 
-def family_named(name: str) -> Driver | None:
-    """Returns the family that ``open_device`` knows by a name, or None."""
+def driver_named(name: str) -> Driver | None:
+    """Returns the driver that ``open_device`` knows by a name, or None."""
     if name not in DRIVERS:
         return None
-    family: Driver = import_module(DRIVERS[name]).FAMILY
-    return family
+    driver: Driver = import_module(DRIVERS[name]).DRIVER
+    return driver
 
 
-def all_families() -> tuple[Driver, ...]:
-    """Returns every family; imports all drivers."""
-    return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)
+def all_drivers() -> tuple[Driver, ...]:
+    """Returns every driver; imports all drivers."""
+    return tuple(driver for name in DRIVERS if (driver := driver_named(name)) is not None)
 
 
 # Options of a device specification: ``name=value,name=value``
@@ -109,7 +109,7 @@ _SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPT
 _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
-def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) -> Device:
+def open_device(spec: str, *, notify: Notify = ignore_message, **options: object) -> Device:
     """Opens a device by its specification.
 
     A specification is a name, or a name, a colon and details of the device:
@@ -121,8 +121,8 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
       the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All text after the colon is the file's name, with commas and colons.
-    - a connected device, by the name of its family (``hapticbridge devices`` lists them), with
-      options of that family: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+    - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
+      options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
       ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` selects one of several,
       ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
@@ -130,7 +130,8 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
 
     Args:
         spec: The specification.
-        tell: Receives messages for the user while the device is opened: instructions and progress.
+        notify: Receives messages for the user while the device is opened: instructions and
+            progress.
         **options: The parameters as keyword arguments; the specification takes precedence. A
             trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
 
@@ -144,21 +145,21 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
         RecordingError: The file is a recording that cannot be read.
     """
     name, _, rest = spec.partition(":")
-    if (family := family_named(name)) is not None:
-        valid = tuple(dict.fromkeys((*family.options, "profile")))
+    if (driver := driver_named(name)) is not None:
+        valid = tuple(dict.fromkeys((*driver.options, "profile")))
         refuse_unknown(name, options, valid)
         requested = {**options, **parsed(name, rest, valid)}
         profile_option = requested.get("profile")
-        if "profile" not in family.options:
+        if "profile" not in driver.options:
             requested.pop("profile", None)
         profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
-        device = family.open(requested, tell)
+        device = driver.open(requested, notify)
         try:
             if profile_option is None:
                 model = device.info.name
                 profile = profile_of(name, device.info.serial, model)
                 if profile is None and (models := modelled(name)):
-                    tell(f"no profile of '{model}' exists; profiles: {choices(models)}")
+                    notify(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if profile is not None:
                 device.info = profile.fill(device.info)
         except BaseException:
@@ -171,7 +172,7 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
     return _OPENERS[name](rest, options)
 
 
-def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device:
+def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Device:
     """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
@@ -183,7 +184,7 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
     """
     name, _, rest = spec.partition(":")
     if name != "simulated":
-        return open_device(spec, tell=tell)
+        return open_device(spec, notify=notify)
     options: dict[str, object] = {}
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
@@ -191,7 +192,7 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
     path = scene.path.with_suffix(".csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, tell=tell, **options)
+    return open_device(spec, notify=notify, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

@@ -6,11 +6,11 @@ from functools import partial
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import Scheme
-from hapticbridge.kernel.coupling import Gains, no_gains
+from hapticbridge.kernel.law import Gains, no_gains
 from hapticbridge.rendering import METHODS, Method
 from hapticbridge.scene.checks import check_massless_tool
 from hapticbridge.scene.handle import check_weldable
-from hapticbridge.theory.compensation import IMPLICIT_LAG
+from hapticbridge.theory.compensation import IMPLICIT_SHARE
 
 __all__ = ["METHODS", "THEORIES"]
 
@@ -51,7 +51,7 @@ _COMPARED = (
         scheme=Scheme.IMPLICIT,
         integrator="implicitfast",
         gains=_gains_with_lag,
-        adds=IMPLICIT_LAG,
+        added_share=IMPLICIT_SHARE,
     ),
     *(
         Method(
