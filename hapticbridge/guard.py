@@ -354,13 +354,10 @@ def guard_parameters_for(
     needed: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
     controller: str | None = None,
-    clutch: int = 0,
-    dead_man: int = 0,
-    is_absolute: bool = False,
 ) -> GuardParameters:
-    """Returns the guard's parameters for a run.
+    """Returns the guard's parameters for a run without buttons and with relative poses.
 
-    A device with prescribed motion has no hand; it gets limits, slew and buttons only.
+    A device with prescribed motion has no hand; it gets limits and slew only.
 
     Args:
         info: The device. Unknown damping is replaced by ``certificate.assumed_damping``; with
@@ -375,18 +372,12 @@ def guard_parameters_for(
             than the coupling needs, else ``environment``. With enough damping the device port needs
             no controller. A spring turned far beyond the torque limit returns more than the credit
             covers, and an account of both ports would then blame a passive run.
-        clutch: Bit of the button that lets the device move without the handle; 0 without one.
-        dead_man: Bit of the button that must be held for any force; 0 without one.
-        is_absolute: True if the device's pose is a pose in the scene; it is then not re-anchored
-            before the first tick.
     """
     force_slew, torque_slew = limits.slew_limits(period)
     common = GuardParameters(
         force_slew=force_slew,
         torque_slew=torque_slew,
         fade_ticks=max(round(FADE / period), 1),
-        clutch=clutch,
-        dead_man=dead_man,
         stretch=limits.stretch * scale,
         angle=limits.angle,
         reach=limits.reach_of(info),
@@ -413,7 +404,7 @@ def guard_parameters_for(
         energy_credit_limit=ENERGY_CREDIT,
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         longest_stall=max(LONGEST_STALL, STALL_PERIODS * period),
-        reanchors_at_start=not is_absolute,
+        reanchors_at_start=True,
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict, cast
 
 import numpy as np
@@ -306,9 +306,12 @@ class RunSetup:
             needed=required_axis_damping(info, law, period, *scales, law_evaluations, method),
             scale=scales[0],
             controller=options.controller,
+        )
+        guard = replace(
+            guard,
             clutch=button_mask(options.clutch, "clutch"),
             dead_man=button_mask(options.dead_man, "dead-man"),
-            is_absolute=options.workspace.absolute,
+            reanchors_at_start=guard.reanchors_at_start and not options.workspace.absolute,
         )
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
         is_real_clock = clock.name == RealClock.name

@@ -31,7 +31,7 @@ ECHO = Driver(
     axes="",
     force="",
     rate="",
-    options=(),
+    options={},
     open=open_rawhid,
 )
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, choices
@@ -14,6 +14,10 @@ from hapticbridge.errors import DeviceError, choices
 Notify = Callable[[str], None]
 """Receives a message for the user while a device is opened or started: an instruction or
 progress."""
+
+Options = Mapping[str, type[Any]]
+"""Options of a device by name, with the type of each value: ``float``, ``int``, ``str`` for text
+up to the next comma (a serial number may have leading zeros), ``Path`` for all remaining text."""
 
 RULES_COMMAND = "hapticbridge devices --udev-rules"
 """Command that prints the udev rules; messages about a missing permission name it."""
@@ -56,7 +60,7 @@ class Driver:
         rate: Rate of reports, in words.
         on_stall: Fate of the force while the host is stalled, in words; empty without force. The
             host cannot act then, only the device itself.
-        options: Options of ``open``.
+        options: Options of ``open``, with their types.
         open: Finds and opens the device; its arguments are the options and a receiver of messages.
         usage: Usage page and usage of the HID collection with the protocol, if a product has
             several; None if any fits.
@@ -74,7 +78,7 @@ class Driver:
     axes: str
     force: str
     rate: str
-    options: tuple[str, ...]
+    options: Options
     open: Callable[[Mapping[str, object], Notify], Device]
     on_stall: str = ""
     usage: tuple[int, int] | None = None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
-from hapticbridge.device.driver import Driver, Notify, ignore_message
+from hapticbridge.device.driver import Driver, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
@@ -47,24 +47,16 @@ def all_drivers() -> tuple[Driver, ...]:
 
 # Options of a device specification: ``name=value,name=value``
 
-FILES = ("path",)
-"""Options that take all remaining text as a file's name, commas included."""
 
-TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
-"""Options that are text up to the next comma; a serial number may have leading zeros."""
-
-WHOLE = ("delay",)
-"""Options that are whole numbers; all others are numbers."""
-
-
-def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
+def parsed(device: str, text: str, valid: Options) -> dict[str, object]:
     """Parses the options after a device's name, separated by commas.
+
+    A ``Path`` takes all remaining text, commas included.
 
     Raises:
         DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
             not a number.
     """
-    names = tuple(valid)
     values: dict[str, object] = {}
     while text:
         name, equals, text = text.partition("=")
@@ -73,23 +65,18 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
             raise DeviceError(f"'{name}' is not an option; write options as name=value")
         if name in values:
             raise DeviceError(f"option '{name}' is set twice; set it once")
-        refuse_unknown(device, [name], names)
-        if name in FILES:
+        refuse_unknown(device, [name], valid)
+        kind = valid[name]
+        if kind is Path:
             value, text = text, ""
         else:
             value, _, text = text.partition(",")
-        values[name] = _value(name, value.strip())
+        try:
+            values[name] = kind(value.strip())
+        except ValueError:
+            number = "a whole number" if kind is int else "a number"
+            raise DeviceError(f"{name} = '{value.strip()}': must be {number}") from None
     return values
-
-
-def _value(name: str, text: str) -> object:
-    if name in FILES or name in TEXTS:
-        return text
-    try:
-        return int(text) if name in WHOLE else float(text)
-    except ValueError:
-        kind = "a whole number" if name in WHOLE else "a number"
-        raise DeviceError(f"{name} = '{text}': must be {kind}") from None
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
@@ -105,7 +92,12 @@ def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) ->
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HAND_PREFIX = "hand_"
 _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
-_SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS)
+_SIMULATED_OPTIONS: Options = {
+    **dict.fromkeys((*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS), float),
+    "delay": int,
+    "hand": str,
+    "path": Path,
+}
 _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
@@ -146,7 +138,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     """
     name, _, rest = spec.partition(":")
     if (driver := driver_named(name)) is not None:
-        valid = tuple(dict.fromkeys((*driver.options, "profile")))
+        valid: Options = {**driver.options, "profile": str}
         refuse_unknown(name, options, valid)
         requested = {**options, **parsed(name, rest, valid)}
         profile_option = requested.get("profile")

@@ -321,6 +321,6 @@ DRIVER = Driver(
     axes="6, by rate",
     force="none; shown, not felt",
     rate="about 125 Hz",
-    options=("serial", "log", *_NUMBERS),
+    options={"serial": str, "log": str, **dict.fromkeys(_NUMBERS, float)},
     open=open_spacemouse,
 )

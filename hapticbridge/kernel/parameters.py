@@ -40,11 +40,24 @@ _NOT_NEGATIVE = (
 )
 
 
+_FILE_KEYS = {
+    "assumed_damping": "credit",
+    "assumed_rotational_damping": "rotational_credit",
+    "max_damping": "most_damping",
+    "max_rotational_damping": "most_rotational_damping",
+    "energy_credit_limit": "surplus",
+    "force_slew": "force_rise",
+    "torque_slew": "torque_rise",
+    "reanchors_at_start": "reseats",
+}
+"""Keys of the metadata ``guard`` that differ from the names of ``GuardParameters``."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
 
-    The names are those of the metadata ``guard`` of a recording.
+    A recording holds them as its metadata ``guard``, some under older names (``_FILE_KEYS``).
 
     Attributes:
         controller: ``OFF``, ``DAMPER`` or ``ENVIRONMENT``.
@@ -121,7 +134,7 @@ class GuardParameters:
 
     def to_json(self) -> str:
         """Returns the text for a recording's metadata; infinity becomes null."""
-        values = asdict(self)
+        values = {_FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         return json.dumps({k: None if v == math.inf else v for k, v in values.items()})
 
     @classmethod
@@ -135,10 +148,12 @@ class GuardParameters:
             values = dict(read_json(text))
         except (ValueError, TypeError):
             values = {}
-        names = {field.name for field in fields(cls)}
-        if not names - LATER <= values.keys() <= names:
+        names = {_FILE_KEYS.get(field.name, field.name): field.name for field in fields(cls)}
+        if not names.keys() - LATER <= values.keys() <= names.keys():
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
-        numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
+        numbers: dict[str, Any] = {
+            names[key]: math.inf if value is None else value for key, value in values.items()
+        }
         return cls(**numbers)
 
 

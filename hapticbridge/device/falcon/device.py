@@ -322,7 +322,7 @@ DRIVER = Driver(
     axes="x, y, z",
     force="8 N",
     rate="1 kHz",
-    options=("serial", "firmware", *_NUMBERS, "log"),
+    options={"serial": str, "firmware": str, **dict.fromkeys(_NUMBERS, float), "log": str},
     open=open_falcon,
     on_stall="the last force stays on: no watchdog is known, so keep a hand on its power switch",
 )

@@ -321,7 +321,7 @@ DRIVER = Driver(
     rate="4 kHz, as stated by the maker",
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
     "one is reported at its start",
-    options=("library", "serial", "gravity", *_NUMBERS),
+    options={"library": str, "serial": str, **dict.fromkeys(("gravity", *_NUMBERS), float)},
     open=open_forcedimension,
     find=find,
     medium=medium,

@@ -402,7 +402,12 @@ DRIVER = Driver(
     force=f"{FORCE_LIMIT:g} N, or more with force_limit",
     rate="1 kHz",
     on_stall="the maker's service ends the force; the time until then is not documented",
-    options=("service", "serial", "force_gate", *_NUMBERS, "log"),
+    options={
+        "service": str,
+        "serial": str,
+        **dict.fromkeys(("force_gate", *_NUMBERS), float),
+        "log": str,
+    },
     open=open_haply,
     find=find,
     medium=medium,

@@ -608,7 +608,15 @@ DRIVER = Driver(
     force="a share of full scale, which newtons= states",
     rate="125 Hz to 1 kHz, one axis at a time",
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
-    options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
+    options={
+        "serial": str,
+        "log": str,
+        "newtons": float,
+        "travel": float,
+        "reverse": str,
+        "profile": str,
+        **dict.fromkeys(CHANGES, float),
+    },
     open=open_pid,
     recognises=has_force_feedback,
 )

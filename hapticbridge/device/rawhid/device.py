@@ -395,7 +395,7 @@ DRIVER = Driver(
     axes="1 to 6, as built",
     force="as built",
     rate="to 1 kHz, as built",
-    options=("serial", "log", *CHANGES),
+    options={"serial": str, "log": str, **dict.fromkeys(CHANGES, float)},
     open=open_rawhid,
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
     "to the protocol",
