@@ -33,6 +33,7 @@ from hapticbridge.kernel.law import (
     COUPLING_DTYPE,
     Gains,
     bind_coupling,
+    implicit_gains,
     releasable_energy,
     set_tuning_goal,
 )
@@ -67,6 +68,7 @@ _FROM_PARAMETERS = (
     "scheme",
     "law_evaluations",
     "has_law",
+    "holds_wrench",
     "scale",
     "force_scale",
     "force_limit",
@@ -82,6 +84,7 @@ RUN_DTYPE = np.dtype(
         ("substeps", "<i8"),
         ("law_evaluations", "<i8"),
         ("has_law", "<i8"),
+        ("holds_wrench", "<i8"),
         ("watches_device", "<i8"),
         ("ramp_ticks", "<i8"),
         ("period", "<f8"),
@@ -215,8 +218,7 @@ class BoundKernel:
         mj["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
         grip = mj["grip_site_id"] = model.site(parameters.grip).id
         mj["grip_body_id"] = model.site_bodyid[grip]
-        is_weld = parameters.scheme == Scheme.WELD
-        mj["weld_id"] = model.equality(WELD_NAME).id if is_weld else -1
+        mj["weld_id"] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
@@ -283,10 +285,8 @@ class BoundKernel:
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters) -> tuple[float, ...]:
     """Returns the whole gains of the coupling's actuators, for forces and then for torques."""
     if parameters.scheme == Scheme.MIDPOINT:  # the model may have half of them
-        coupling = parameters.coupling
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return b, k, b, br, kr, br
+        forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
+        return (*forces, *torques)
     gains: list[float] = []
     first = model.actuator(COUPLING_ACTUATORS[0]).id
     for actuator in (first, first + 3):
