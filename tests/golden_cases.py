@@ -22,7 +22,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from audit_cases import rewritten
+from audit_cases import ScriptedDevice, SlowClock, rewritten
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -36,9 +36,6 @@ RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", 
 
 Pose = tuple[float, ...]
 Json = dict[str, Any]
-
-STALE_SAMPLE = 256
-"""Bit of a record's ``flags``, and what a device's ``read`` returns without a new sample."""
 
 DIGITS = 12
 """Hexadecimal digits of a digest: 48 bits. Two of some thousand differing columns collide with a
@@ -165,81 +162,21 @@ def broken(tick: int) -> Pose:
     return (x if tick < 150 else math.nan, *rest)
 
 
-class Scripted:
-    """A device whose poses, buttons and gaps come from its tick.
-
-    Args:
-        pose: Position in m and quaternion (w, x, y, z) by tick.
-        buttons: Button bits by tick.
-        stale: Whether a tick has no new sample.
-        lost: Tick from which the device is gone; None for never.
-        changes: Fields of the data sheet that differ from the simulated device's.
-    """
-
-    def __init__(
-        self,
-        pose: Callable[[int], Pose] = sway,
-        *,
-        buttons: Callable[[int], int] = lambda _: 0,
-        stale: Callable[[int], bool] = lambda _: False,
-        lost: int | None = None,
-        **changes: Any,
-    ) -> None:
-        self._inner = hb.open_device("simulated")
-        self.info = replace(self._inner.info, name="scripted", duration=None, **changes)
-        self._pose, self._buttons, self._stale, self._lost = pose, buttons, stale, lost
-        self._tick = 0
-        self.writes: list[NDArray[np.float64]] = []
-
-    def start(self, period: float) -> NDArray[np.void]:
-        sample = self._inner.start(period)
-        self._report(sample, 0)
-        return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        tick = self._tick
-        self._tick += 1
-        if self._lost is not None and tick >= self._lost:
-            raise hb.DeviceError("the device is gone")
-        if self._stale(tick):
-            return STALE_SAMPLE
-        self._report(sample, tick)
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.writes.append(wrench.copy())
-
-    def close(self) -> None:
-        self._inner.close()
-
-    def _report(self, sample: NDArray[np.void], tick: int) -> None:
-        pose = self._pose(tick)
-        sample["position"][0] = pose[:3]
-        sample["quaternion"][0] = pose[3:]
-        sample["buttons"] = self._buttons(tick)
+def lost(tick: int) -> Pose:
+    """As ``sway``, until the device is gone."""
+    if tick >= 150:
+        raise hb.DeviceError("the device is gone")
+    return sway(tick)
 
 
-class StallingClock(hb.SimulatedClock):
-    """Simulated time that skips deadlines before certain ticks."""
+class Scripted(ScriptedDevice):
+    """A scripted device with the simulated device's data sheet, but for what is changed in it."""
 
-    def __init__(self, stalls: Mapping[int, int]) -> None:
-        super().__init__()
-        self._stalls, self._count, self._step = stalls, 0, 0
-        self._late = 0
-
-    def start(self, period_ns: int) -> None:
-        super().start(period_ns)
-        self._step = period_ns
-
-    def wait(self) -> tuple[int, int, int]:
-        deadline, _, _ = super().wait()
-        skipped = self._stalls.get(self._count, 0)
-        self._count += 1
-        self._late += skipped * self._step
-        return deadline + self._late, self.now(), skipped
-
-    def now(self) -> int:
-        return super().now() + self._late
+    def __init__(self, pose: Callable[[int], Pose] = sway, **options: Any) -> None:
+        functions = {name: options.pop(name) for name in ("buttons", "is_stale") if name in options}
+        super().__init__(pose, **functions)
+        sheet = hb.open_device("simulated").info
+        self.info = replace(sheet, name="scripted", duration=None, **options)
 
 
 def command(bridge: hb.Bridge, asked: Command) -> None:
@@ -398,8 +335,8 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
     yield "clutch", Run(PEG, lambda: Scripted(buttons=_held(100, 200)), {"clutch": 0})
     yield "dead man", Run(PEG, lambda: Scripted(buttons=_held(50, 250, 1)), {"dead_man": 1})
     yield "reach", Run(PEG, Scripted, {"limits": {"reach": 0.012}})
-    yield "stale samples", Run(PEG, lambda: Scripted(stale=lambda tick: tick % 7 in (2, 3)))
-    yield "silence", Run(PEG, lambda: Scripted(stale=lambda tick: 100 <= tick < 250))
+    yield "stale samples", Run(PEG, lambda: Scripted(is_stale=lambda tick: tick % 7 in (2, 3)))
+    yield "silence", Run(PEG, lambda: Scripted(is_stale=lambda tick: 100 <= tick < 250))
     yield "leap of the device", Run(PEG, lambda: Scripted(jump))
     yield "trip: stretch", Run(WALL, lambda: Scripted(leave), {"limits": {"stretch": 0.05}})
     yield "trip: angle", Run("drawer", lambda: Scripted(turn), {"limits": {"angle": 1.0}})
@@ -412,10 +349,10 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
         ),
     )
     yield "trip: not a number", Run(PEG, lambda: Scripted(broken))
-    yield "trip: device lost", Run(PEG, lambda: Scripted(lost=150))
+    yield "trip: device lost", Run(PEG, lambda: Scripted(lost))
     yield (
         "skipped deadlines",
-        Run(PEG, Scripted, {"clock": lambda: StallingClock({60: 1, 120: 3, 200: 80})}),
+        Run(PEG, Scripted, {"clock": lambda: SlowClock({60: 1, 120: 3, 200: 80})}),
     )
     for method in METHODS:
         for is_ahead in (False, True):

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded, rewritten, without_model
-from numpy.typing import NDArray
 from report_runs import ANVIL, LOOSE
 
 from hapticbridge.audit import audit
@@ -435,21 +434,16 @@ def test_a_mark_is_an_event_and_changes_nothing_else(run: Callable[..., Any]) ->
     assert audit(path).resimulation == "bit for bit"
 
 
-class Pressed(ScriptedDevice):
-    """Has button 2 pressed before the first tick, and in ticks 30 to 39 and 50."""
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        tick = self._tick
-        flags = super().read(sample)
-        is_down = tick < 5 or 30 <= tick < 40 or tick == 50
-        sample["buttons"] = 0b1 | (0b100 if is_down else 0)
-        return flags
+def pressed(tick: int) -> int:
+    """Button 2 before the first tick, and in ticks 30 to 39 and 50; button 0 all the time."""
+    return 0b1 | (tick < 5 or 30 <= tick < 40 or tick == 50) << 2
 
 
 def test_each_press_of_the_button_marks_the_recording_once(tmp_path: Path) -> None:
     file, path = tmp_path / "scene.xml", tmp_path / "run.mcap"
     file.write_text(FLOOR)
-    recorded(path, str(file), Pressed(swaying), LOOSE, duration=0.1, mark=2)
+    device = ScriptedDevice(swaying, buttons=pressed)
+    recorded(path, str(file), device, LOOSE, duration=0.1, mark=2)
     recording = read_recording(path)
     marks = [event for event in recording.events if event["event"] == "mark"]
     assert [(event["tick"], event["by"]) for event in marks] == [(30, "button"), (50, "button")]

@@ -221,8 +221,8 @@ def test_what_the_device_repeats_is_flagged_and_must_be_the_same(tmp_path: Path)
         is_honest = True
 
         def read(self, sample: NDArray[np.void]) -> int:
-            repeats, self._tick = self._tick % 3, self._tick + 1
-            self._report(sample, self._tick - (repeats if self.is_honest else 0))
+            repeats, self.tick = self.tick % 3, self.tick + 1
+            self.report(sample, self.tick - (repeats if self.is_honest else 0))
             return int(TickFlag.STALE_SAMPLE) if repeats else 0
 
     path = tmp_path / "run.mcap"

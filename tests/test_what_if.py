@@ -322,17 +322,6 @@ TOO_STIFF = Coupling(
 )
 
 
-class Pressed(ScriptedDevice):
-    """A slow push to the side, and a button that is down from tick 100 to tick 199."""
-
-    def __init__(self) -> None:
-        super().__init__(lambda tick: (1e-4 * tick, 0, 0, 1, 0, 0, 0))
-
-    def _report(self, sample: NDArray[np.void], tick: int) -> None:
-        super()._report(sample, tick)
-        sample["buttons"] = int(100 <= tick < 200)
-
-
 def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
     scene = path.with_suffix(".xml")
     scene.write_text(LIGHTLY_HELD)
@@ -346,7 +335,8 @@ def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
 def test_a_button_does_again_what_it_did(button: str, tmp_path: Path) -> None:
     path = tmp_path / "pressed.mcap"
     options: dict[str, Any] = {button: 0}
-    recorded(path, "point_mass", Pressed(), duration=0.3, **options)
+    device = ScriptedDevice(drift(1e-4), buttons=lambda tick: int(100 <= tick < 200))
+    recorded(path, "point_mass", device, duration=0.3, **options)
     same, slower = what_if(path, {}), what_if(path, {"rate": 500})
     before, after = same.runs[0].ticks, same.runs[1].ticks
     # else the handle would be 10 mm further on, or the wrench there all the time
@@ -358,14 +348,6 @@ def test_a_button_does_again_what_it_did(button: str, tmp_path: Path) -> None:
         pressed = (times >= 0.1) & (times < 0.2)
         assert pressed.all() == (button == "clutch")
         assert released.sum() * run.period == pytest.approx(0.1 if button == "clutch" else 0.2)
-
-
-class Silent(ScriptedDevice):
-    """A device that has nothing new from tick 20 on."""
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        super().read(sample)
-        return int(TickFlag.STALE_SAMPLE) if len(self.writes) >= 20 else 0
 
 
 class Moved(ScriptedDevice):
@@ -396,7 +378,7 @@ REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
         TickFlag.CLUTCH,
     ),
     "old samples": (
-        Silent(lambda tick: (1e-4 * min(tick, 19), 0, 0, 1, 0, 0, 0)),
+        ScriptedDevice(drift(1e-4), is_stale=lambda tick: tick >= 20),
         {},
         TickFlag.STALE_SAMPLE,
     ),
