@@ -14,7 +14,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +27,9 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main, terminal
+from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
+from hapticbridge.device.transport import usb
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -584,25 +586,7 @@ def audits(folder: Path) -> Json:
     }
 
 
-COMMANDS = (
-    "",
-    "run",
-    "audit",
-    "render",
-    "view",
-    "scenes",
-    "devices",
-    "check",
-    "stability",
-    "chart",
-    "doctor",
-    "export",
-    "compare",
-    "repair",
-    "zwidth",
-    "bound",
-    "identify",
-)
+COMMANDS = ("", *TABLE)
 """Commands whose help is frozen; the empty one is the program itself."""
 
 
@@ -619,51 +603,10 @@ def help_text(name: str) -> str:
     return "\n".join(line.rstrip() for line in words.getvalue().splitlines()) + "\n"
 
 
-_SHORT = "run point_mass --fast --duration 0.1"
-_ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5"
-SESSIONS = {
-    "run": (
-        f"{_SHORT} --record FOLDER/run.mcap",
-        f"{_SHORT} --stiffness 2000 --damping 1.5",
-        f"{_SHORT} --damping 0.5",
-        f"{_SHORT} --damping 3",
-        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
-        f"{_SHORT} --substeps 2",
-        f"{_SHORT} --method compensated",
-        f"{_SHORT} --method implicit",
-        f"{_SHORT} --method explicit",
-        f"{_SHORT} --method weld --stiffness 1000",
-        "run peg_in_hole --fast --duration 0.1 --method direct --contact-stiffness 5000",
-        "run drawer --fast --duration 0.1",
-        "run hammer --fast --duration 0.1",
-    ),
-    "audit": (
-        "run virtual_wall --fast --duration 0.2 --record FOLDER/wall.mcap",
-        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
-        "audit FOLDER/wall.mcap",
-        "audit FOLDER/stiff.mcap",
-        "audit FOLDER/wall.mcap FOLDER/stiff.mcap FOLDER/missing.mcap",
-        "compare FOLDER/wall.mcap FOLDER/wall.mcap",
-        "export FOLDER/wall.mcap --format csv --out FOLDER/wall.csv",
-    ),
-    "zwidth": (
-        _ZWIDTH,
-        "zwidth --damping 2 --mass 1e9",
-        "zwidth --damping 2 --friction 0 --resolution 1e-5 --delay 1",
-        "zwidth --damping 2 --filter-time 0.001",
-    ),
-    "bound": (
-        "bound --stiffness 2000",
-        "bound --stiffness 2000 --damping 1",
-        "bound --stiffness 2000 --damping 0.5 --device-damping 2",
-        "bound --stiffness 2000 --damping 1.5 --device-damping 2",
-        "bound --stiffness 2400 --damping 3 --device-damping 2",
-        "bound --stiffness 5000 --damping 1 --device-damping 2",
-        "bound --stiffness 5000 --damping 3 --device-damping 2",
-    ),
-    "scenes": ("scenes", "scenes planar_peg", "scenes virtual_wall"),
-}
-"""Commands of each golden session, in order; FOLDER is a folder of its own."""
+SESSIONS = sorted(path.stem for path in (GOLDEN / "sessions").glob("*.txt"))
+"""Names of the golden sessions: commands in order, what they print, and their exit codes."""
+
+_PROMPT = "$ hapticbridge "
 
 
 def session_file(name: str) -> Path:
@@ -686,19 +629,28 @@ def consoles_of(width: int) -> Iterator[None]:
 
 
 def session_text(name: str, folder: Path) -> str:
-    """Returns a session as a terminal of 100 columns shows it, with exit codes, paths masked."""
+    """Returns what the commands of a session's file print now, paths masked.
+
+    They run in a folder of their own, FOLDER, on a machine without devices, and a terminal of 100
+    columns shows them.
+    """
+    lines = session_file(name).read_text(encoding="utf-8").splitlines()
+    commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
     shown, plain = [], {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     models = str(Path(hb.__file__).parents[1])
-    for command in SESSIONS[name]:
+    for command in commands:
         out, err = io.StringIO(), io.StringIO()
         with (
             consoles_of(100),
+            chdir(folder),
             patch.dict(os.environ, plain),
+            patch.object(usb, "on_the_bus", list),
+            patch.object(usb, "libusb", lambda: None),
             redirect_stdout(out),
             redirect_stderr(err),
         ):
             code = main(command.replace("FOLDER", str(folder)).split())
         words = err.getvalue() + out.getvalue()
         words = words.replace(str(folder), "FOLDER").replace(models, "HOME")
-        shown += [f"$ hapticbridge {command}", *map(str.rstrip, words.splitlines()), f"({code})"]
+        shown += [_PROMPT + command, *map(str.rstrip, words.splitlines()), f"({code})"]
     return "\n".join(shown) + "\n"

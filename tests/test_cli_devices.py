@@ -1,3 +1,5 @@
+"""``hapticbridge devices``: devices that are plugged in, access to them, and what helps."""
+
 from __future__ import annotations
 
 import json

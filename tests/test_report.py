@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 import report_runs
 from chromium import browser
-from cli_cases import Called
 from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.errors import RecordingError
 from hapticbridge.kernel.parameters import DAMPER, GuardParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
@@ -168,21 +166,6 @@ def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
     assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
     others = [{"event": "resume", "tick": i} for i in range(2 * MAX_EVENTS)]
     assert len(event_rows([*inputs, *others])) == MAX_EVENTS
-
-
-@pytest.mark.parametrize("name", ["page.mcap", "page", "nowhere/page.html"])
-def test_a_page_replaces_no_recording_and_no_picture(
-    name: str, call: Called, run_file: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / name
-    if target.parent.exists():
-        target.write_bytes(b"what was there")
-    code, out, err = call("audit", run_file, "--report", target)
-    assert (code, out) == (2, "")  # before anything is computed
-    assert str(target) in err
-    with pytest.raises(RecordingError, match="page"):
-        write_report(read_recording(run_file), audit(run_file), target)
-    assert not target.exists() or target.read_bytes() == b"what was there"
 
 
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(

@@ -7,7 +7,9 @@ import http.client
 import io
 import json
 import socket
+import subprocess
 import threading
+import time
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -322,12 +324,29 @@ def test_the_server_answers_its_own_page_alone_and_a_browser_keeps_its_token(
             probe.connect(("127.0.0.2", port))  # served on loopback's first address alone
 
 
-def test_visers_way_out_to_the_internet_and_its_store_of_files_are_gone() -> None:
-    server = serve(Address(0))
+def test_visers_way_out_to_the_internet_and_its_store_of_files_are_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    address, asked = Address(0), list[str]()
+    server = serve(address)
+    for name in ("request_share_url", "disconnect_share_url"):
+        monkeypatch.setattr(server, name, lambda name=name: asked.append(name))
+    box, upload = server.gui.add_checkbox("box", False), server.gui.add_upload_button("upload")
     try:
-        handlers = server._websock_server._incoming_handlers
-        gone = ("ShareUrl", "FileTransferStart")
-        assert not any(handlers[kind] for kind in handlers if kind.__name__.startswith(gone))
+        with hand(address.url(server.get_port())) as page:
+            page.find("upload")
+            file = {"filename": "a", "mime_type": "", "part_count": 0, "size_bytes": 0}
+            page.say(type="ShareUrlRequest")
+            page.say(type="ShareUrlDisconnect")
+            place = {"source_component_uuid": page.find("upload")["uuid"], "transfer_uuid": "b"}
+            page.say(type="FileTransferStartUpload", **place, **file)
+            page.send("box", value=True)  # heard after all that
+            end = time.monotonic() + PATIENCE
+            while not box.value:
+                assert time.monotonic() < end
+                assert "FileTransferPartAck" not in {each["type"] for each in page.read(0.05)}
+            assert "FileTransferPartAck" not in {each["type"] for each in page.read(0.05)}
+        assert (asked, upload.value.content) == ([], b"")
     finally:
         stop(server)
 
@@ -374,6 +393,31 @@ def test_whatever_a_browser_sends_for_the_time_the_replay_plays_on(
 SWITCH = line_of(Switch(force=False))
 
 
+class SayingProcess:
+    """A view's process that serves its page and says something; it keeps what it is told."""
+
+    def __init__(self, said: bytes) -> None:
+        self.is_heard, self.is_told = threading.Event(), threading.Event()
+        lines = [b'{"url": "u"}\n', *said.splitlines(keepends=True)]
+        self.stdout = types.SimpleNamespace(readline=self.readline, close=lambda: None)
+        self.stdin = types.SimpleNamespace(
+            write=self.write, flush=lambda: None, close=self.is_told.set
+        )
+        self.said, self.told = io.BytesIO(b"".join(lines)), b""
+
+    def readline(self, limit: int = -1) -> bytes:
+        line = self.said.readline(limit)
+        if not line.endswith(b"\n"):  # the end, or a line that is too long
+            self.is_heard.set()
+        return line
+
+    def write(self, piece: bytes) -> None:
+        self.told += piece
+
+    def wait(self, _timeout: float) -> None:
+        """Has ended."""
+
+
 @pytest.mark.parametrize(
     ("said", "heard", "refused"),
     [
@@ -393,14 +437,17 @@ def test_a_run_hears_commands_and_nothing_else(
     said: bytes, heard: list[Command], refused: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hapticbridge.view.window.INTERVAL", 0.0)
-    window = Window(Address(0))
-    commands: list[Command] = []
+    process = SayingProcess(said)
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: process)
+    window, commands = Window(Address(0)), list[Command]()
     window.on_command = commands.append
-    process = types.SimpleNamespace(stdout=io.BytesIO(said))
-    window._process = process  # type: ignore[assignment] # of a process, only what it says
-    window._listen()
+    window.start("ring", "snapshot", {}, ())
+    process.is_heard.wait(PATIENCE)
+    window.close()
+    process.is_told.wait(PATIENCE)
     assert commands == heard
-    answers = [json.loads(window._outbox.get() or b"") for _ in range(window._outbox.qsize())]
+    job, *answers = [json.loads(line) for line in process.told.splitlines()]
+    assert job["ring"] == "ring"
     assert [answer["event"] for answer in answers] == ["refused"] * refused
 
 
