@@ -29,7 +29,8 @@ import hapticbridge as hb
 from hapticbridge.cli import main, terminal
 from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
-from hapticbridge.device.transport import usb
+from hapticbridge.device.force_dimension.dhd import VARIABLE
+from hapticbridge.device.transport import hid, usb
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -450,7 +451,7 @@ TAMPERED = "commands, lossless"
 TICK = 120
 """The record that is changed."""
 
-NUMBERS = (
+NUMBERS = [
     "stiffness",
     "damping",
     "rotational_stiffness",
@@ -464,7 +465,7 @@ NUMBERS = (
     "ramp_ticks",
     "start_kinetic",
     "start_potential",
-)
+]
 """Metadata that are a number."""
 
 LISTS = ("axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start")
@@ -636,7 +637,8 @@ def session_text(name: str, folder: Path) -> str:
     """
     lines = session_file(name).read_text(encoding="utf-8").splitlines()
     commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
-    shown, plain = [], {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb", VARIABLE: "/no/such.so"}
+    shown = []
     models = str(Path(hb.__file__).parents[1])
     for command in commands:
         out, err = io.StringIO(), io.StringIO()
@@ -646,6 +648,7 @@ def session_text(name: str, folder: Path) -> str:
             patch.dict(os.environ, plain),
             patch.object(usb, "on_the_bus", list),
             patch.object(usb, "libusb", lambda: None),
+            patch.object(hid, "hid_api", lambda: None),
             redirect_stdout(out),
             redirect_stderr(err),
         ):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, balance_of, recorded
 from numpy.typing import NDArray
+from report_runs import LOOSE, circling
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
@@ -18,27 +18,13 @@ from hapticbridge.audit.energy import energy_deviations
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.guard import wrench_deviations
 from hapticbridge.audit.motion import turn_between
-from hapticbridge.bridge import Bridge
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SafetyTrip
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
-from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run_description import parameters_of
 from hapticbridge.scene import scene_names
 from hapticbridge.scene.load import scene_path
-
-AUDIT = Path(__file__).resolve().parent.parent / "hapticbridge" / "audit"
-
-
-def swing(tick: int) -> tuple[float, ...]:
-    angle = 2 * np.pi * 3e-3 * tick
-    return (0.02 * np.sin(angle), 0.01 * (1 - np.cos(angle)), 0, 1, 0, 0, 0)
-
-
-LOOSE = Coupling(stiffness=2000, damping=0.2, rotational_stiffness=2, rotational_damping=5e-4)
 
 
 def energy_by_hand(recording: Recording) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -106,22 +92,9 @@ def test_rotation_vectors_are_those_of_scipy() -> None:
     np.testing.assert_allclose(ours, (b * a.inv()).as_rotvec(), rtol=0, atol=1e-12)
 
 
-def test_trip_leaves_a_recording_that_audits_and_tells(tmp_path: Path) -> None:
-    path = tmp_path / "trip.mcap"
-    device = ScriptedDevice(lambda k: (np.nan if k == 50 else 1e-5 * k, 0, 0, 1, 0, 0, 0))
-    with pytest.raises(SafetyTrip):
-        recorded(path, "point_mass", device, duration=1.0)
-    report = audit(path)
-    assert (report.verdict, report.ticks) == ("passive", 50)
-    assert report.events == {"start": 1, "trip": 1, "stop": 1}
-    assert "tick 50" in next(
-        e["reason"] for e in read_recording(path).events if e["event"] == "trip"
-    )
-
-
 def test_energy_that_an_integrator_creates_is_active(tmp_path: Path) -> None:
     path = tmp_path / "fast.mcap"
-    device = ScriptedDevice(swing)
+    device = ScriptedDevice(circling)
     summary = recorded(path, "point_mass", device, LOOSE, duration=0.3, method="implicitfast")
     report = audit(path)
     assert report.resimulation == "bit for bit"  # an honest file of a bad run
@@ -137,7 +110,7 @@ def test_energy_that_an_integrator_creates_is_active(tmp_path: Path) -> None:
 
 def test_same_motion_under_the_default_integrator_is_strict(tmp_path: Path) -> None:
     path = tmp_path / "discrete.mcap"
-    recorded(path, "point_mass", ScriptedDevice(swing), LOOSE, duration=0.3)
+    recorded(path, "point_mass", ScriptedDevice(circling), LOOSE, duration=0.3)
     report = audit(path, strict=True)
     assert (report.verdict, report.environment) == ("passive", "strict")
 
@@ -170,7 +143,7 @@ def test_strict_refuses_what_the_slack_allows(tmp_path: Path) -> None:
     path = tmp_path / "slack.mcap"
     # more damping in the coupling: the same creation stays below the slack
     coupling = Coupling(stiffness=2000, damping=2, rotational_stiffness=2, rotational_damping=5e-4)
-    device = ScriptedDevice(swing, damping=4.0)  # it needs 3 N s/m; with less there is no slack
+    device = ScriptedDevice(circling, damping=4.0)  # it needs 3 N s/m; with less there is no slack
     recorded(path, "point_mass", device, coupling, duration=0.3, method="implicitfast")
     loose, strict = audit(path), audit(path, strict=True)
     created, slack = energy_by_hand(read_recording(path))
@@ -230,42 +203,3 @@ def test_scales_enter_the_device_condition(tmp_path: Path) -> None:
         workspace=Workspace(scale=1.2, force_scale=1.0),
     )
     assert audit(path).certified is True  # 1.2 · 1.5 N s/m < 2
-
-
-def imports_of(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {name.name for name in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {f"{node.module}.{name.name}" for name in node.names}
-    return found
-
-
-def test_audit_shares_no_arithmetic_with_the_loop() -> None:
-    for path in AUDIT.glob("*.py"):
-        assert not [name for name in imports_of(path) if "bridge.bridge" in name], path
-        assert not [name for name in imports_of(path) if name == "hapticbridge.summary.Summary"]
-    for own in ("motion.py", "guard.py", "energy.py"):
-        names = {name for name in imports_of(AUDIT / own) if name.startswith("hapticbridge")}
-        others = {name for name in names if not name.startswith("hapticbridge.audit.")}
-        assert {name.rpartition(".")[0] for name in others} <= {
-            "hapticbridge.kernel.parameters",
-            "hapticbridge.record",
-        }
-        assert {name for name in others if "kernel" in name} <= {
-            "hapticbridge.kernel.parameters.RunParameters"
-        }
-
-
-def test_all_fields_but_the_clock_are_compared() -> None:
-    assert set(CLOCK_FIELDS) == {n for n in TICK_DTYPE.names or () if n.endswith("_ns")}
-
-
-def test_bridge_and_audit_agree_on_the_verdict_of_a_run_that_is_continued(tmp_path: Path) -> None:
-    path = tmp_path / "twice.mcap"
-    with Bridge("planar_peg", "simulated", recording=path, clock=SimulatedClock()) as bridge:
-        bridge.run(0.1)
-        summary = bridge.run(0.1)
-    report = audit(path)
-    assert (report.verdict, report.ticks) == (summary.verdict, 200)

@@ -27,7 +27,7 @@ HEAVY = frozenset(
 """Packages that neither the version nor the top-level help needs."""
 
 NOT_FOR_A_RUN = frozenset(
-    {
+    [
         "matplotlib",
         "scipy.signal",
         "scipy.spatial",
@@ -62,7 +62,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.lab",
         "hapticbridge.view",
         "hapticbridge.whatif",
-    }
+    ]
 )
 """Packages and modules that a run with the simulated device, without view, does not need."""
 

@@ -209,13 +209,6 @@ def test_an_isolated_core_is_taken_first(tmp_path: Path, monkeypatch: pytest.Mon
     assert "isolated core 4" in named(grants, "core").sentence
 
 
-def test_a_core_that_is_not_there_is_said() -> None:
-    with real_time(core=4095) as grants:
-        assert not named(grants, "core").is_granted
-        assert "4095" in named(grants, "core").sentence
-        assert named(grants, "core").remedy.startswith("choose a core from 0 to ")
-
-
 @pytest.mark.parametrize(
     ("code", "words"),
     [

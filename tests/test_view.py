@@ -30,7 +30,6 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
 from hapticbridge.recording.snapshot import Snapshot
-from hapticbridge.view.page import LINES
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
@@ -106,18 +105,6 @@ def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay:
     # at rest what the coupling pushes the floor gives back
     np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.force, atol=2e-2)
     assert not len(replay.at(0.0).contact_places)
-
-
-def test_curves_are_those_of_the_record(replay: Replay) -> None:
-    time, lines = replay.trace.curves()
-    records = read_recording(replay.stage.recording.path).ticks
-    assert len(lines) == LINES
-    force = np.linalg.norm(records["wrench_on_tool"][:, :3], axis=1)
-    assert lines[0].max() == pytest.approx(force.max())  # peaks between two instants are kept
-    assert lines[2][-1] == pytest.approx(1e3 * records["device_energy"][-1])
-    created = 1e-3 * lines[3]
-    assert (1e-3 * lines[4] + created)[-1] == pytest.approx(replay.stage.slack)
-    assert time[-1] == pytest.approx(1.5)
 
 
 class Watcher:
