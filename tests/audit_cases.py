@@ -28,9 +28,7 @@ from hapticbridge.run_description import MODEL_ATTACHMENT
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
 
-COUPLING = Coupling(
-    stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
-)
+COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 
 FLOAT_FIELDS = tuple(name for name in TICK_DTYPE.names or () if TICK_DTYPE[name].base.kind == "f")
 

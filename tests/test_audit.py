@@ -123,9 +123,7 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
         'solref="0.002 1" solimp="0.9 0.95', 'solref="-1000000 -500" solimp="0.99 0.99'
     )
     scene.write_text(text.replace('mass="0.05"', 'mass="0.01"'))
-    coupling = Coupling(
-        stiffness=2e4, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
-    )
+    coupling = Coupling(2e4, 0.5, 2.4, 5e-4)
 
     def press(tick: int) -> tuple[float, ...]:
         x = 0.0115 * min(tick / 100, 1) + 1e-3 * np.sin(2 * np.pi * 0.02 * tick)
@@ -142,7 +140,7 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
 def test_strict_refuses_what_the_slack_allows(tmp_path: Path) -> None:
     path = tmp_path / "slack.mcap"
     # more damping in the coupling: the same creation stays below the slack
-    coupling = Coupling(stiffness=2000, damping=2, rotational_stiffness=2, rotational_damping=5e-4)
+    coupling = Coupling(2000, 2, 2, 5e-4)
     device = ScriptedDevice(circling, damping=4.0)  # it needs 3 N s/m; with less there is no slack
     recorded(path, "point_mass", device, coupling, duration=0.3, method="implicitfast")
     loose, strict = audit(path), audit(path, strict=True)
@@ -168,12 +166,7 @@ def test_certificate_is_the_device_condition_with_what_is_used(
 ) -> None:
     path = tmp_path / "run.mcap"
     # b = 2 N s/m and 2e-3 N m s/rad at 1 ms: K < 2 (2 − 0.5) / 1e-3 and the thousandth of it
-    used = Coupling(
-        stiffness=stiffness,
-        damping=0.5,
-        rotational_stiffness=rotational_stiffness,
-        rotational_damping=5e-4,
-    )
+    used = Coupling(stiffness, 0.5, rotational_stiffness, 5e-4)
     felt = METHODS[method].rendered(used, 1e-3)
     recorded(path, "point_mass", "simulated", felt, duration=0.05, method=method)
     assert float(read_recording(path).meta["damping"]) == pytest.approx(0.5)  # the law's
@@ -187,9 +180,7 @@ def test_certificate_is_the_device_condition_with_what_is_used(
 
 def test_scales_enter_the_device_condition(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    coupling = Coupling(
-        stiffness=2000, damping=1.5, rotational_stiffness=2, rotational_damping=1.5e-3
-    )
+    coupling = Coupling(2000, 1.5, 2, 1.5e-3)
     recorded(
         path, "point_mass", "simulated", coupling, duration=0.05, workspace=Workspace(scale=1.2)
     )

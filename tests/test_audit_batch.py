@@ -28,8 +28,8 @@ from hapticbridge.recording import read_recording
 
 # their packages hold functions of these names
 batch = importlib.import_module("hapticbridge.audit.batch")
-WEAK = Coupling(stiffness=1000, damping=0.9, rotational_stiffness=1, rotational_damping=9e-4)
-STIFF = Coupling(stiffness=6000, damping=0.5, rotational_stiffness=1, rotational_damping=9e-4)
+WEAK = Coupling(1000, 0.9, 1, 9e-4)
+STIFF = Coupling(6000, 0.5, 1, 9e-4)
 
 
 @pytest.fixture(scope="module")

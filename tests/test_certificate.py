@@ -22,7 +22,7 @@ from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.rendering import default_method
 
 T = 1e-3
-SPRING = Coupling(stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0)
+SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
 
 
 def info(**changes: Any) -> DeviceInfo:

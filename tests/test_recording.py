@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
-from recording_cases import EPOCH, FILES, META, chunk_ends, random_rows, same, write
+from recording_cases import EPOCH, FILES, META, chunks, random_rows, same, write
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
@@ -124,7 +124,7 @@ def test_event_of_a_trip_is_written_whatever_it_holds() -> None:
 
 def test_repair_keeps_all_that_is_left_and_makes_it_whole(whole: Path, tmp_path: Path) -> None:
     cut, mended = tmp_path / "cut.mcap", tmp_path / "mended.mcap"
-    cut.write_bytes(whole.read_bytes()[: chunk_ends(whole)[2][0] + 100])
+    cut.write_bytes(whole.read_bytes()[: chunks(whole)[2][1] + 100])
     before = read_recording(cut)
     after = repair(cut, mended)
     assert not after.is_cut
@@ -429,7 +429,7 @@ def test_record_that_is_not_one_is_a_problem(whole: Path, tmp_path: Path) -> Non
 
 def test_cut_anywhere_reads_to_the_last_whole_chunk(whole: Path, tmp_path: Path) -> None:
     data, rows = whole.read_bytes(), random_rows(1500)
-    ends = chunk_ends(whole)
+    ends = [(end, size) for _, end, size in chunks(whole)]
     assert len(ends) >= 4
     path = tmp_path / "cut.mcap"
     edges = [edge + step for edge, _ in ends for step in (-1, 0, 1)]
@@ -453,7 +453,7 @@ def test_cut_before_first_chunk_keeps_metadata_or_is_refused(whole: Path, tmp_pa
     data = whole.read_bytes()
     path = tmp_path / "cut.mcap"
     kept = 0
-    for offset in (*range(0, 4000, 41), *range(4000, chunk_ends(whole)[0][0], 5003)):
+    for offset in (*range(0, 4000, 41), *range(4000, chunks(whole)[0][1], 5003)):
         path.write_bytes(data[:offset])
         try:
             recording = read_recording(path)
@@ -467,21 +467,13 @@ def test_cut_before_first_chunk_keeps_metadata_or_is_refused(whole: Path, tmp_pa
     assert kept
 
 
-def starts(path: Path) -> list[int]:
-    """Returns where each chunk begins."""
-    with path.open("rb") as stream:
-        summary = SeekingReader(stream).get_summary()
-    assert summary is not None
-    return sorted(index.chunk_start_offset for index in summary.chunk_indexes)
-
-
 def changed(path: Path, data: bytes | bytearray) -> Recording:
     path.write_bytes(data)
     return read_recording(path)
 
 
 def test_zeros_behind_the_last_record_are_a_cut(whole: Path, tmp_path: Path) -> None:
-    path, kept = tmp_path / "cut.mcap", whole.read_bytes()[: starts(whole)[2]]
+    path, kept = tmp_path / "cut.mcap", whole.read_bytes()[: chunks(whole)[2][0]]
     recording = changed(path, kept + bytes(5000))
     assert (recording.is_cut, recording.problems) == (True, ())
     (problem, *_) = changed(path, kept + bytes(50) + b"x" + bytes(50)).problems
@@ -522,7 +514,7 @@ def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
 
 def test_damaged_chunk_is_named_and_the_others_are_kept(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
-    data[chunk_ends(whole)[1][0] - 5000] ^= 0x10
+    data[chunks(whole)[1][1] - 5000] ^= 0x10
     recording = changed(tmp_path / "run.mcap", data)
     assert not recording.is_cut
     assert any("chunk 2 (at byte " in problem for problem in recording.problems)
@@ -531,7 +523,7 @@ def test_damaged_chunk_is_named_and_the_others_are_kept(whole: Path, tmp_path: P
 
 
 def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> None:
-    data, second = bytearray(whole.read_bytes()), starts(whole)[1]
+    data, second = bytearray(whole.read_bytes()), chunks(whole)[1][0]
     data[second + 7] ^= 0x40
     recording = changed(tmp_path / "run.mcap", data)
     ticks = recording.ticks["tick"]
@@ -542,5 +534,5 @@ def test_damaged_length_loses_no_later_chunk(whole: Path, tmp_path: Path) -> Non
 
 def test_chunk_that_claims_exabytes_is_not_allocated(whole: Path, tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
-    struct.pack_into("<Q", data, starts(whole)[0] + 9 + 16, 1 << 60)
+    struct.pack_into("<Q", data, chunks(whole)[0][0] + 9 + 16, 1 << 60)
     assert any("beyond" in problem for problem in changed(tmp_path / "a.mcap", data).problems)

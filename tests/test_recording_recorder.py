@@ -49,10 +49,6 @@ def ring() -> Iterator[Ring]:
     ring.close()
 
 
-def process_of(recorder: Recorder) -> int:
-    return recorder.pid
-
-
 def test_recorder_writes_every_record_and_event_of_a_run(ring: Ring, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     rows = numbered(0, 3000)
@@ -87,10 +83,10 @@ def test_records_that_wait_at_the_close_are_drained(ring: Ring, tmp_path: Path) 
 def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    os.kill(process_of(recorder), signal.SIGSTOP)
+    os.kill(recorder.pid, signal.SIGSTOP)
     for number in range(3000):
         recorder.event({"event": "mark", "text": "x" * 100, "number": number}, number)
-    os.kill(process_of(recorder), signal.SIGCONT)
+    os.kill(recorder.pid, signal.SIGCONT)
     recorder.close()
     events = read_recording(tmp_path / "run.mcap").events
     assert [event["number"] for event in events] == list(range(3000))
@@ -99,9 +95,9 @@ def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) 
 def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    assert os.getpgid(process_of(recorder)) != os.getpgid(0)
+    assert os.getpgid(recorder.pid) != os.getpgid(0)
     for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        os.kill(process_of(recorder), signal_number)
+        os.kill(recorder.pid, signal_number)
     produce(ring, recorder, numbered(0, 600))
     recorder.close()
     assert read_recording(tmp_path / "run.mcap").ticks.size == 600
@@ -110,7 +106,7 @@ def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path:
 def test_recorder_loads_neither_mujoco_nor_the_compiler(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    loaded = Path(f"/proc/{process_of(recorder)}/maps").read_text()
+    loaded = Path(f"/proc/{recorder.pid}/maps").read_text()
     recorder.close()
     assert "zstandard" in loaded
     assert "mujoco" not in loaded
@@ -140,7 +136,7 @@ def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_pa
     recorder = Recorder(ring, path, META, ())
     recorder.wait_until_ready()
     # stands for a full disk: the process may not let a file grow beyond this
-    resource.prlimit(process_of(recorder), resource.RLIMIT_FSIZE, (50_000, 50_000))
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
     rows = numbered(0, 20_000)
     done = 0
     while done < rows.size and recorder.is_alive():
@@ -158,7 +154,7 @@ def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_pa
 def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    os.kill(process_of(recorder), signal.SIGKILL)
+    os.kill(recorder.pid, signal.SIGKILL)
     limit = time.monotonic() + PATIENCE
     while recorder.is_alive():
         assert time.monotonic() < limit

@@ -181,9 +181,7 @@ def test_the_closed_loop_is_what_a_live_run_with_that_setting_does(
     """The same simulated hand, asked directly; the what-if knows only what it did elsewhere."""
     scene = load_scene("virtual_wall", **live.get("scene", {}))
     stiffness, damping = live.get("coupling", (2400.0, 1.7))
-    coupling = Coupling(
-        stiffness=stiffness, damping=damping, rotational_stiffness=2.4, rotational_damping=1.7e-3
-    )
+    coupling = Coupling(stiffness, damping, 2.4, 1.7e-3)
     path, hand = tmp_path / "live.mcap", wall.with_name("hand.csv")
     rate, specification = live.get("rate", 1000), f"simulated:path={hand}"
     recorded(path, scene, specification, coupling, duration=DURATION, rate=rate)
@@ -289,9 +287,7 @@ LIGHTLY_HELD = report_runs.ANVIL.replace(
 )
 """A tool that stays where it is, and a hand that burns nothing: a stiff spring swings up."""
 
-TOO_STIFF = Coupling(
-    stiffness=10_000.0, damping=0.05, rotational_stiffness=0.1, rotational_damping=1e-4
-)
+TOO_STIFF = Coupling(10_000.0, 0.05, 0.1, 1e-4)
 
 
 def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
