@@ -179,18 +179,9 @@ def test_certificate_is_the_device_condition_with_what_is_used(
 
 
 def test_scales_enter_the_device_condition(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    coupling = Coupling(2000, 1.5, 2, 1.5e-3)
-    recorded(
-        path, "point_mass", "simulated", coupling, duration=0.05, workspace=Workspace(scale=1.2)
-    )
-    assert audit(path).certified is False  # 1.44 · 1.5 N s/m > 2
-    recorded(
-        path,
-        "point_mass",
-        "simulated",
-        coupling,
-        duration=0.05,
-        workspace=Workspace(scale=1.2, force_scale=1.0),
-    )
-    assert audit(path).certified is True  # 1.2 · 1.5 N s/m < 2
+    path, coupling = tmp_path / "run.mcap", Coupling(2000, 1.5, 2, 1.5e-3)
+    # 1.44 · 1.5 N s/m > 2, and 1.2 · 1.5 N s/m < 2
+    for force_scale, is_certified in ((None, False), (1.0, True)):
+        workspace = Workspace(scale=1.2, force_scale=force_scale)
+        recorded(path, "point_mass", "simulated", coupling, duration=0.05, workspace=workspace)
+        assert audit(path).certified is is_certified

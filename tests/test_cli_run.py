@@ -61,17 +61,6 @@ def test_options_of_a_run_reach_the_recording(call: Called, tmp_path: Path) -> N
     assert json.loads(meta["axes"]) == [0, -1, 0, 1, 0, 0, 0, 0, 1]
 
 
-def test_default_stiffness_changes_with_what_the_user_gives_only(
-    call: Called, tmp_path: Path
-) -> None:
-    path = tmp_path / "run.mcap"
-    call("run", "point_mass", "--fast", "--duration", 0.01, "--stiffness", 900, "--record", path)
-    meta = read_recording(path).meta
-    assert float(meta["stiffness"]) == 900
-    assert float(meta["damping"]) == pytest.approx(1.7 - 0.45)  # 1.7 N s/m are felt as before
-    assert float(meta["rotational_stiffness"]) == pytest.approx(2.4)
-
-
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
     path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")

@@ -241,13 +241,3 @@ def test_a_piece_is_cut_where_deadlines_were_not_where_ticks_are_counted(tmp_pat
     write(tmp_path / "late.mcap", rows)
     done = export(tmp_path / "late.mcap", "csv", span=(0.3, 0.56))
     assert from_csv(done.files[0])[0]["tick"].tolist() == list(range(40, 59))
-
-
-def test_the_command_line_cuts_and_tells_the_marks(recording: Path, call: Called) -> None:
-    code, out, _ = call("export", recording, "--format", "csv", "--from", "0.05", "--to", "0.12")
-    assert code == 0
-    assert "70 ticks, 1 events" in " ".join(out.split())
-    assert "marks at 0.000 s, 0.100 s" in out
-    arguments = ("--format", "csv", "--from", "0.05", "--overwrite", "--json")
-    told = json.loads(call("export", recording, *arguments)[1])
-    assert (told["ticks"], told["marks"]) == (101, [0.0, 0.1])
