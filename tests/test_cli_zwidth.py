@@ -32,7 +32,7 @@ def test_the_next_command_runs_certified_and_is_rendered_as_it_asks(
     code, out, err = call(*f"{following.strip()} --fast --duration 0.05 --json".split())
     told, asked = json.loads(out), following.split("--damping ")[1].split()[0]
     assert (code, told["is_certified"], "warning" in err) == (0, True, False)
-    assert f"B = {float(asked):.4g} N s/m felt" in told["rendered"][0]
+    assert f"B = {float(asked):.4g} N s/m felt" in told["coupling_sentences"][0]
 
 
 def test_the_json_holds_the_whole_region(call: Called) -> None:

@@ -84,7 +84,11 @@ def test_concepts_do_not_import_each_other_in_a_circle() -> None:
 def test_the_audit_never_imports_the_bridge() -> None:
     for path in (PACKAGE / "audit").glob("*.py"):
         assert not {"bridge", "session", "options"} & imported_concepts(path), path.name
-    for name in ("motion", "guard", "energy"):  # a second opinion has an arithmetic of its own
+    for name in (
+        "motion",
+        "wrench_limits",
+        "energy",
+    ):  # a second opinion has an arithmetic of its own
         modules = imported_modules(PACKAGE / "audit" / f"{name}.py")
         others = {module for module in modules if not module.startswith("hapticbridge.audit")}
         assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.record"}, name
@@ -188,11 +192,11 @@ INTERFACES = {
 WRITERS = {
     "mj": "state",
     "run": "state",
-    "coupling": "coupling",
+    "coupling": "law",
     "pose": "handle",
     "loop": "tick",
     "energy": "ledger",
-    "guard": "guard",
+    "guard": "tick_guard",
     "observer": "passivity_controller",
     "lossless": "lossless",
 }

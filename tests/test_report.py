@@ -115,7 +115,7 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     ticks = recording.ticks.copy()
     ticks["flags"] = 0
     ticks["flags"][20:50] = int(TickFlag.STALE_SAMPLE)
-    ticks["flags"][50] = int(TickFlag.RESEATED)
+    ticks["flags"][50] = int(TickFlag.REANCHORED)
     ticks["flags"][60:70] = int(TickFlag.CONTROLLER_ACTIVE)
     ticks["injected_damping"][60:70] = 1.5
     events = [*recording.events, {"event": "trip", "tick": len(ticks), "reason": "it jumped"}]
@@ -124,7 +124,7 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     evidence = evidence_of(guarded)
     shown = dict(activities(evidence))
     assert np.flatnonzero(shown["faded: no samples"]).tolist() == list(range(30, 50))
-    assert np.flatnonzero(shown["re-seated"]).tolist() == [50]
+    assert np.flatnonzero(shown["re-anchored"]).tolist() == [50]
     assert np.flatnonzero(shown["tripped"]).tolist() == [len(ticks) - 1]
     damped = draw_timing(evidence).axes[-1].get_lines()[0]
     assert np.asarray(damped.get_ydata()).max() == 1.5
