@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.plotting import ENDINGS, check_ending, new_figure, write_picture
-from hapticbridge.theory.spectrum import damping_spectrum_of
 from hapticbridge.theory.z_width import z_width
 from hapticbridge.theory_plots import alternatives, draw_z_width
 
@@ -38,16 +37,6 @@ def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float
         assert wall.needed == pytest.approx(a + a**2 / (2 * damping) + damping, rel=1e-9)
     else:
         assert wall.needed == pytest.approx(3 * a - damping, rel=1e-9)
-
-
-@given(st.floats(1, 1e5), st.floats(0, 50))
-@settings(max_examples=30)
-def test_no_damping_suffices_behind_one_sample_of_delay(stiffness: float, damping: float) -> None:
-    frequency = np.linspace(1, np.pi / T, 200)
-    needed = damping_spectrum_of(
-        lambda z: (stiffness + damping / T * (1 - 1 / z)) / z, T, frequency
-    )
-    assert np.isinf(needed).any()
 
 
 def test_each_spectrum_reaches_what_its_alternative_needs() -> None:

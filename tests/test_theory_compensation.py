@@ -16,7 +16,6 @@ from hapticbridge.theory.compensation import (
     needed_for_felt,
 )
 from hapticbridge.theory.rigid_body import drive_mass
-from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
 LAGS = {"implicit": 1.0, "midpoint": 0.5}
@@ -51,46 +50,6 @@ def test_no_free_tool_needs_more_than_a_wall(k: float, b: float, mass: float, sc
         assert spectrum[-1] == pytest.approx(needed, rel=1e-6)
     wall = tool_spectrum(theta, k, damping, 1e12, scheme)
     assert wall[-1] == pytest.approx(needed, rel=1e-6)
-
-
-def looped(hand: WorstHand, stiffness: float, damping: float, mass: float, scheme: str) -> float:
-    """Runs hand, law K, B' and tool sample by sample; returns how much the force still grows."""
-    p, q, r = hand.recursion()
-    gain = (T**2 / mass) * (0.5 if scheme == "midpoint" else 1.0)  # of x_k by f_k
-    handle, speed, x, v, stretch, force = 1e-3, 0.0, 0.0, 0.0, 1e-3, 0.0
-    signal = np.zeros(20_000)
-    for k in range(signal.size):
-        rate = stiffness + damping / T
-        before = force
-        force = (rate * (handle - x - T * v) - damping / T * stretch) / (1 + rate * gain)
-        x += T * v + gain * force
-        v += T / mass * force
-        stretch = handle - x
-        speed = p * speed - q * force - r * before
-        handle += T * speed
-        signal[k] = force
-    return float(np.abs(signal[-4000:]).max() / np.abs(signal[-8000:-4000]).max())
-
-
-@pytest.mark.parametrize("scheme", ["midpoint", "implicit"])
-@pytest.mark.parametrize("mass", [0.01, 0.1, 1e9])  # the last one is a wall
-def test_worst_hand_in_time_domain_needs_what_spectrum_says(scheme: str, mass: float) -> None:
-    damping = law_damping(1000.0, 2.0, T, LAGS[scheme])
-    theta = np.linspace(0.05, np.pi, 20_001)
-    spectrum = tool_spectrum(theta, 1000.0, damping, mass, scheme)
-    most = int(np.argmax(spectrum))
-    bound = needed_for_felt(1000.0, 2.0, T, LAGS[scheme])
-    # a light tool helps the compensated coupling, and never the lossless one
-    is_as_hard = mass > 1 or scheme == "midpoint"
-    assert spectrum[most] == pytest.approx(bound, rel=1e-6) or not is_as_hard
-    assert spectrum[most] < 0.995 * bound or is_as_hard
-    back = np.exp(-1j * theta[most])
-    law = 1000.0 + damping * (1 - back) / T
-    moved = T**2 / mass / (1 - back) ** 2 * ((1 + back) / 2 if scheme == "midpoint" else 1.0)
-    response = complex(law / (1 + law * moved))
-    for share, grows in ((0.98, True), (1.02, False)):
-        hand = WorstHand(share * float(spectrum[most]), float(theta[most]) / T, T, response)
-        assert (looped(hand, 1000.0, damping, mass, scheme) > 1) == grows
 
 
 def test_formulas_of_the_theory_where_nothing_is_clipped() -> None:
