@@ -71,9 +71,10 @@ def test_records_are_those_of_the_live_loop_to_the_bit(scene: str, method: str) 
         limits=limits,
         controller="off",  # the study looks at methods without one
     ) as bridge:
-        bridge.run(duration=1.5)
+        summary = bridge.run(duration=1.5)
         expected = bridge.latest_records(1500)
     assert len(outcome.records) == len(expected) == 1500
+    assert (outcome.environment, outcome.fault) == (summary.environment, summary.fault)
     for name in fields_without_times():
         assert np.array_equal(outcome.records[name], expected[name]), name
 

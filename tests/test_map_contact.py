@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,26 +9,22 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from map_runs import recorded_and_audited
+from map_runs import boundary_of
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
-from hapticbridge.lab.maps.base import loop_in, run_map, set_tool_mass
-from hapticbridge.lab.maps.contact import CONTACT, method_runs, points
+from hapticbridge.lab.maps.base import loop_in, set_tool_mass
+from hapticbridge.lab.maps.contact import CONTACT, method_runs
 from hapticbridge.lab.maps.contact_rigs import (
     PERIOD,
     SHIPPED,
     TREATMENTS,
     Treatment,
-    peg_device,
     peg_runs,
-    start_in_hole,
-    ticks_of,
     wall_runs,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.scene import load_scene
 from hapticbridge.scene.contacts import SUGGESTED
 
 LIGHT = [(0.03, 0.0, 1)]
@@ -80,23 +74,6 @@ def test_pyramidal_cone_is_active_where_friction_is_low_and_the_elliptic_one_is_
     assert {run.environment for run in peg_runs(soft, 1000.0, slippery)} == {"strict"}
 
 
-def test_direct_format_is_the_same_contact_in_other_words() -> None:
-    # k = 1/(timeconst dampratio)², b = 2/timeconst
-    (one,) = peg_runs(Treatment((0.002, 1.0)), 1000.0, LIGHT)
-    (other,) = peg_runs(Treatment((-2.5e5, -1000.0)), 1000.0, LIGHT)
-    assert other.created == pytest.approx(one.created, rel=1e-6)
-    assert other.depth == pytest.approx(one.depth, rel=1e-6)
-
-
-def test_a_row_that_the_step_cannot_resolve_is_replaced_unless_refsafe_is_off() -> None:
-    cases = [(0.05, 0)]
-    (resolved,) = wall_runs(Treatment((0.001, 1.0)), 2000.0, cases)
-    (stiffer,) = wall_runs(Treatment((0.00025, 1.0)), 2000.0, cases)
-    (as_written,) = wall_runs(Treatment((0.00025, 1.0), refsafe=False), 2000.0, cases)
-    assert stiffer.depth == pytest.approx(resolved.depth, rel=1e-3)
-    assert as_written.depth < 0.97 * resolved.depth
-
-
 @pytest.mark.parametrize("stiffness", [2000.0, 20_000.0])
 def test_implicitfast_creates_energy_on_a_wall_where_implicit_creates_none(
     stiffness: float,
@@ -113,38 +90,6 @@ def test_bouncing_contact_is_active_on_a_wall_and_a_critically_damped_one_is_not
     assert bouncing.first_active > 0
     (damped,) = wall_runs(Treatment((0.02, 2.0)), 2000.0, [(0.05, 1)])
     assert damped.environment == "strict"
-
-
-@pytest.mark.parametrize(("ratio", "verdict"), [(3.0, "active"), (5.0, "passive")])
-def test_the_audit_of_a_bridge_names_the_tick_at_which_the_map_sees_a_contact_create(
-    ratio: float, verdict: str, tmp_path: Path
-) -> None:
-    # at timeconst T/2 a light peg is active up to dampratio 4, strict from 6 on
-    treatment = Treatment((0.5 * PERIOD, ratio))
-    (mapped,) = peg_runs(treatment, 1000.0, LIGHT)
-    ((mass, friction, hand),) = LIGHT
-    scene = load_scene("peg_in_hole")
-    start_in_hole(scene.model)
-    treatment.apply(scene.model, friction)
-    set_tool_mass(scene.model, "peg", mass)
-    mujoco.mj_setConst(scene.model, scene.data)
-    scene.reset()
-    device, coupling = peg_device(1000.0, hand)
-    with warnings.catch_warnings(record=True) as concerns:
-        warnings.simplefilter("always")
-        report = recorded_and_audited(
-            scene, device, coupling, "implicit", PERIOD, ticks_of(device), tmp_path
-        )
-    assert bool(concerns) == (verdict == "active")  # the rule for scenes sees it coming
-    assert report.resimulation == "bit for bit"
-    assert report.certified  # the device is not to blame
-    assert report.verdict == verdict
-    assert report.environment == mapped.environment
-    assert report.slack_share == pytest.approx(mapped.slack_share, rel=1e-6)
-    if verdict == "active":
-        assert (report.tick, report.port) == (mapped.first_active, "environment")
-    else:
-        assert mapped.first_active == -1
 
 
 def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() -> None:
@@ -178,19 +123,16 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     monkeypatch.setattr(contact, "peg_runs", few)
     names = (SHIPPED, "damped: 0.0005 8")
     monkeypatch.setattr(contact, "HANDS", 1)
-    chosen = [
-        p
-        for p in points(1)
-        if p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names)
-    ]
-    files = run_map(
-        replace(CONTACT, points=lambda _: chosen), tmp_path, executor=ThreadPoolExecutor(2)
+    boundary = boundary_of(
+        replace(CONTACT, points=lambda _: CONTACT.points(1)),
+        tmp_path,
+        4,
+        lambda p: p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names),
     )
-    assert files.failed == 0
-    rule = files.finding.boundary["rule"]
+    rule = boundary["rule"]
     assert rule["strict"]["strict"] == rule["strict"]["cells"] > 0
     assert rule["abrupt"]["strict"] < rule["abrupt"]["cells"]
-    shipped, damped = files.finding.boundary["search"]
+    shipped, damped = boundary["search"]
     assert shipped["active"] > 0
     assert damped["strict"] == damped["runs"]
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from map_runs import NEVER, recorded_and_audited
+from audit_cases import recorded
+from map_runs import boundary_of
 
+from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.lab.maps import run_map
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.guard import Limits
 from hapticbridge.lab.maps.base import (
     Point,
     free_tool_and_wall,
@@ -28,11 +29,13 @@ from hapticbridge.lab.maps.coupling import (
     PERIOD,
     TOOL_MASS,
     evaluate,
-    points,
 )
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 from hapticbridge.theory.virtual_mass import environment_minimum_damping
+
+NEVER = 1e9
+"""Force in N and torque in N m that no run reaches."""
 
 
 def cell(method: str, stiffness: float, damping: float) -> Point:
@@ -139,26 +142,29 @@ def test_the_audit_of_a_bridge_names_the_tick_and_the_port_of_the_map(
         damping=DEVICE_DAMPING, path=PATH, force_limit=NEVER, torque_limit=NEVER
     )
     coupling = Coupling(stiffness, damping, 1.0, 1e-3)
-    report = recorded_and_audited(
-        free_tool_and_wall(), device, coupling, method, PERIOD, 500, tmp_path
-    )
+    limits = Limits(force=NEVER, torque=NEVER, ramp=0.0)  # a map shows what happens unguarded
+    with suppress(SafetyTrip):
+        recorded(
+            tmp_path / "run.mcap",
+            free_tool_and_wall(),
+            device,
+            coupling,
+            duration=500 * PERIOD,
+            rate=1 / PERIOD,
+            method=method,
+            limits=limits,
+            is_guarded=False,
+        )
+    report = audit(tmp_path / "run.mcap")
     assert report.resimulation == "bit for bit"
     assert (report.verdict, report.port) == ("active" if port else "passive", port)
     assert mapped["fault_port"] == port
     assert (-1 if report.tick is None else report.tick) == mapped["fault_tick"]
 
 
-def few(count: int) -> list[Point]:
-    return [point for point in points(count) if point["method"] == "implicit"]
-
-
-def test_map_leaves_picture_table_and_boundary(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as pool:
-        files = run_map(replace(COUPLING, points=few), tmp_path, points=24, executor=pool)
-    assert files.failed == 0
-    assert files.picture.exists()
-    said = json.loads(files.boundary.read_text(encoding="utf-8"))
-    implicit = said["boundary"]["methods"]["implicit"]
+def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
+    boundary = boundary_of(COUPLING, tmp_path, 24, lambda p: p["method"] == "implicit")
+    implicit = boundary["methods"]["implicit"]
     assert implicit["largest_deviation"] < 0.01
     assert implicit["passive_share_below_6"] == 1.0
     assert np.isfinite(implicit["measured_on_wall"]).all()

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from map_runs import boundary_of
 
 from hapticbridge.lab.closed_loop import LoopOutcome
-from hapticbridge.lab.maps.base import Point, run_map
-from hapticbridge.lab.maps.device import DAMPERS as DAMPING
 from hapticbridge.lab.maps.device import (
+    DAMPERS,
     DEVICE,
     LARGE,
     METHODS_SHOWN,
@@ -132,18 +130,14 @@ def test_regions_follow_from_what_the_runs_did(small: str, large: str, region: s
     assert region_of(small, large) == region
 
 
-def few(count: int) -> list[Point]:
-    """Returns the grid and one damper of each method."""
-    points = DEVICE.points(count)
-    cells = [point for point in points if point["what"] == "cell"]
-    return cells + [p for p in points if p["what"] == "friction" and p["damping"] == DAMPING[1]]
-
-
-def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as executor:
-        files = run_map(replace(DEVICE, points=few), tmp_path, points=9, executor=executor)
-    assert files.failed == 0
-    said = files.finding.boundary
+def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
+    # the grid and one damper of each method
+    said = boundary_of(
+        DEVICE,
+        tmp_path,
+        9,
+        lambda p: p["what"] == "cell" or (p["what"], p.get("damping")) == ("friction", DAMPERS[1]),
+    )
     assert said["regions"]["agreement"] >= 0.9
     for name in ("beta", "sigma"):
         edge = said["regions"]["measured_edges"][name]

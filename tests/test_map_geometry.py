@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from map_runs import boundary_of
 
-from hapticbridge.lab.maps.base import Point, run_map
+from hapticbridge.lab.maps.base import Point
 from hapticbridge.lab.maps.geometry import (
     BEHIND,
     GEOMETRY,
@@ -116,10 +116,7 @@ def test_the_peg_fills_its_hole_and_touches_nothing_else() -> None:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as executor:
-        files = run_map(GEOMETRY, tmp_path, points=16, executor=executor)
-    assert files.failed == 0
-    boundary = files.finding.boundary
+    boundary = boundary_of(GEOMETRY, tmp_path, 16)
     assert boundary["direct"]["largest_deviation"] < 0.15
     for name in BEHIND:
         assert boundary[name]["largest_over_smallest"] < 1.05

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
+from map_runs import boundary_of
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.lab.closed_loop import PARTS, Timing
-from hapticbridge.lab.maps.base import Point, run_map, set_tool_mass
+from hapticbridge.lab.maps.base import Point
 from hapticbridge.lab.maps.rate import (
     DAMPING,
     DELAYS,
@@ -23,7 +21,6 @@ from hapticbridge.lab.maps.rate import (
     SEEDS,
     TICKS,
     UNEVEN_PERIOD,
-    WALL_MASS,
     evaluate,
     finite_hand,
     unevenness,
@@ -31,7 +28,6 @@ from hapticbridge.lab.maps.rate import (
     worst_hand,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.scene import Scene, load_scene
 
 
 def point(name: str, period: float, delay: int) -> Point:
@@ -151,38 +147,22 @@ def test_below_the_bound_at_the_longest_interval_nothing_fails(hand: str, timing
     longest = timing.intervals(2000).max() / 16 * UNEVEN_PERIOD
     assert finite_hand("implicit", hand, 0.98 * 2 * DEVICE_DAMPING / longest, timing).is_stable
 
-
-def wall() -> Scene:
-    scene = load_scene("virtual_wall")
-    set_tool_mass(scene.model, "tool", WALL_MASS)
-    mujoco.mj_setConst(scene.model, scene.data)
-    return scene
-
     # K T/(2b): 0.55 and 1.1, their mean; theory at a delay of 5 is 0.526
 
 
-def few(count: int) -> list[Point]:
-    """Returns one method without a delay and with the longest, and free devices that lose ticks."""
-    return [
-        each
-        for each in RATE.points(count)
-        if (
-            each["hand"] == "worst hand"
-            and each["delay"] in (0, 5)
-            and each["method"] == "lossless"
-        )
-        or (each["hand"] == "no hand" and each["what"] == "drops")
-    ]
+def is_kept(each: Point) -> bool:
+    """Keeps one method without a delay and with the longest, and free devices that lose ticks."""
+    if each["hand"] == "worst hand":
+        return each["delay"] in (0, 5) and each["method"] == "lossless"
+    return (each["hand"], each["what"]) == ("no hand", "drops")
 
 
-def test_the_map_is_drawn_and_says_what_was_found(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(2) as executor:
-        files = run_map(replace(RATE, points=few), tmp_path, points=20, executor=executor)
-    assert files.failed == 0
-    by_delay = files.finding.boundary["methods"]["lossless"]
+def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
+    boundary = boundary_of(RATE, tmp_path, 20, is_kept)
+    by_delay = boundary["methods"]["lossless"]
     assert set(by_delay) == {"0", "5"}
     for mine in by_delay.values():
         assert mine["worst_ratio_error"] < 2e-3
         assert mine["slope"] == pytest.approx(-1, abs=0.01)
-    free = files.finding.boundary["uneven"]["drops"]["no hand"]
+    free = boundary["uneven"]["drops"]["no hand"]
     assert free["at_longest"][-1] < free["measured"][-1] < free["at_mean"][-1]

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from map_runs import NEVER, recorded_and_audited
+from map_runs import boundary_of
 
-from hapticbridge.device import Motion, TrajectoryDevice
-from hapticbridge.lab.maps.base import Point, run_map
+from hapticbridge.lab.maps.base import Point
 from hapticbridge.lab.maps.rotation import (
-    INERTIA,
-    MIDDLE,
-    OBLIQUE,
-    PERIOD,
     ROTATION,
     TICKS,
     coupling_of,
@@ -25,9 +19,7 @@ from hapticbridge.lab.maps.rotation import (
     gyroscopic_speed,
     speed_of_cut,
     spin,
-    spinning_scene,
     sudden,
-    turning,
 )
 
 SOFT = 2.0
@@ -77,14 +69,6 @@ def test_with_the_translation_alone_the_gyroscopic_term_creates_what_theory_says
         assert found.created == pytest.approx(free_creation(speed), rel=0.03)
 
 
-def test_one_explicit_step_of_a_free_body_gains_that_much() -> None:
-    omega = 30.0 * OBLIQUE / np.linalg.norm(OBLIQUE)
-    torque = np.cross(omega, INERTIA * omega)
-    after = omega - PERIOD * torque / INERTIA
-    gained = 0.5 * np.sum(INERTIA * after**2) - 0.5 * np.sum(INERTIA * omega**2)
-    assert free_creation(30.0, ticks=1) == pytest.approx(float(gained), rel=1e-6)
-
-
 def test_stiffer_in_rotation_creates_less() -> None:
     created = [spin("implicit", coupling_of(k), 50.0).created for k in (0.0, SOFT, 10 * SOFT)]
     assert created[0] > 10 * created[1] > 10 * created[2]
@@ -116,36 +100,8 @@ def test_explicit_creates_energy_at_the_cut_and_implicit_does_not() -> None:
     assert explicit.first_active >= 0
 
 
-@pytest.mark.parametrize(
-    ("method", "share", "port"),
-    [("explicit", 1.02, "environment"), ("explicit", 0.98, ""), ("implicit", 1.02, "")],
-)
-def test_the_audit_of_a_bridge_names_the_tick_at_which_the_angle_passes_pi(
-    method: str, share: float, port: str, tmp_path: Path
-) -> None:
-    speed = share * cut_speed(SOFT)
-    path = Motion(
-        PERIOD * np.arange(TICKS + 1), np.zeros((TICKS + 1, 3)), turning(speed, axis=MIDDLE)
-    )
-    device = TrajectoryDevice(path, force_limit=NEVER, torque_limit=NEVER, speed_limit=NEVER)
-    report = recorded_and_audited(
-        spinning_scene(), device, coupling_of(SOFT), method, PERIOD, 200, tmp_path
-    )
-    assert report.resimulation == "bit for bit"
-    assert (report.verdict, report.port) == ("active" if port else "passive", port)
-    mapped = sudden(method, SOFT, speed)
-    assert (mapped.crossed >= 0) == (share > 1)
-    # the trajectory's first sample is where it starts, the map's is a tick later
-    assert report.tick == (mapped.first_active + 1 if port else None)
-    if port:
-        assert mapped.first_active == mapped.crossed
-
-
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-        files = run_map(ROTATION, tmp_path, points=190, executor=executor)
-    assert files.failed == 0
-    boundary = files.finding.boundary
+    boundary = boundary_of(ROTATION, tmp_path, 190)
     assert boundary["fastest_passive"]["implicit"] > 0
     assert boundary["fastest_passive"]["explicit"] is None
     assert boundary["cut"]["speed_measured"] == pytest.approx(cut_speed(SOFT), rel=0.02)

@@ -30,7 +30,6 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
     default_coupling,
-    device_conditions,
     required_damping,
     run_conditions,
 )
@@ -40,14 +39,13 @@ from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import IMPLICIT, check_prepared, default_method, method_named, prepare
+from hapticbridge.rendering import IMPLICIT, check_prepared, method_named, prepare
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand
@@ -146,37 +144,6 @@ def test_a_scene_that_a_method_cannot_render_is_refused(
     with pytest.raises(SceneError, match=message):
         prepare(loaded, coupling, T, 1, method_named(method))
     prepare(loaded, COUPLING, T, 1)
-
-
-PARAMETERS: dict[str, Any] = {
-    "grip": "grip",
-    "period": T,
-    "substeps": 1,
-    "coupling": COUPLING,
-    "force_limit": 1.0,
-    "torque_limit": 1.0,
-    "ramp_ticks": 0,
-    "device_origin": (0, 0, 0, 1, 0, 0, 0),
-    "handle_origin": (0, 0, 0, 1, 0, 0, 0),
-    "device_start": (0, 0, 0, 1, 0, 0, 0),
-}
-MASSLESS = METHODS["direct"].scheme
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"scheme": 7}, "scheme is 7"),
-        ({"scheme": MASSLESS}, r"contact stiffness is 0\.0"),
-        ({"contact_stiffness": 5.0}, r"contact stiffness is 5\.0"),
-        ({"scheme": MASSLESS, "contact_stiffness": 5.0, "substeps": 2}, "substeps is 2"),
-    ],
-)
-def test_parameters_that_contradict_each_other_are_refused(
-    changes: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(HapticBridgeError, match=message):
-        RunParameters(**(PARAMETERS | changes))
 
 
 @pytest.mark.parametrize(
@@ -483,29 +450,6 @@ def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) 
     assert sent == pytest.approx(work_on_handle, rel=1e-9)
 
 
-@pytest.mark.parametrize("substeps", [2, 4])
-def test_torque_over_substeps_is_the_mean_of_the_single_laws(substeps: int) -> None:
-    """About one axis: J ω̇ = K_r φ + B_r (turn of the handle per time − ω), step by step."""
-    count, inertia = 300, 0.4 * 0.05 * 0.01**2
-    stiff = Coupling(2000.0, 2.0, 2e-2, 1e-4)
-    angle = 0.2 * np.sin(2 * np.pi * 3 * T * np.arange(1, count + 1))
-    turning = Rotation.from_rotvec(angle[:, None] * [0, 0, 1])
-    run = rendered("implicit", stiff, samples_of(np.zeros((count, 3)), turning), substeps=substeps)
-    h, k_, b_ = T / substeps, stiff.rotational_stiffness, stiff.rotational_damping
-    step = np.diff(angle, prepend=0.0) / substeps
-    x = v = position = 0.0
-    for k in range(count):
-        mean = 0.0
-        for _ in range(substeps):
-            position += step[k]
-            v = (inertia * v / h + k_ * (position - x) + b_ * step[k] / h) / (
-                inertia / h + k_ * h + b_
-            )
-            x += h * v
-            mean += (k_ * (position - x) + b_ * (step[k] / h - v)) / substeps
-        assert run.ticks["wrench_on_tool"][k, 5] == pytest.approx(mean, abs=1e-8)
-
-
 def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_delay() -> None:
     assert required_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
     undamped = Coupling(2000.0, 0.0, 2.0, 0.0)
@@ -517,8 +461,6 @@ def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_de
         [2.6429, 2.4423, 2.3350], abs=1e-4
     )
     assert required_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
-    with pytest.raises(CouplingError, match="substeps"):
-        required_damping(damped, T, 0)
 
 
 def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
@@ -831,17 +773,3 @@ def test_worst_hand_behind_substeps_diverges_below_the_limit_and_not_above(
     assert (below.is_stable, above.is_stable) == (False, True)
     assert below.environment == above.environment == "strict"
     assert run(required_damping(LIGHT, T, laws)).is_stable
-
-
-@pytest.mark.parametrize("laws", [1, 2, 8, 32])
-@pytest.mark.parametrize("period", [1e-4, 5e-3])
-def test_default_coupling_is_certified_with_any_number_of_substeps(
-    laws: int, period: float
-) -> None:
-    info = SimulatedDevice().info
-    for scales in ((1.0, 1.0), (3.0, 0.5)):
-        coupling = default_coupling(info, period, *scales, laws)
-        used = default_method(laws).used(coupling, period / laws)
-        conditions = device_conditions(info, used, period, *scales, laws)
-        assert all(c.needed <= 0.85 * (c.available or 0.0) * (1 + 1e-6) for c in conditions)
-        assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)
