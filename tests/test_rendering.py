@@ -463,29 +463,6 @@ def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_de
     assert required_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
 
 
-def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
-    """The inequality that defines it holds for motions that return to rest, and fails below."""
-    coupling, n = Coupling(2000.0, 1.0, 0.0, 0.0), 4
-    needed = required_damping(coupling, T, n)
-    rng = np.random.default_rng(3)
-    k_, b_ = coupling.stiffness, coupling.damping * n / T
-    for _ in range(50):
-        ticks = 40
-        d = rng.normal(size=ticks) * 1e-3
-        d[[0, -1]] = 0.0
-        d[-2] -= d.sum()
-        h = np.cumsum(np.repeat(d / n, n))
-        e = rng.normal(size=ticks * n) * 1e-3 * rng.uniform(0, 2)
-        e[: 2 * n], e[-2 * n :] = 0.0, 0.0
-        x = h - e
-        step_e, step_x = np.diff(e, prepend=0.0), np.diff(x, prepend=0.0)
-        f = k_ * e + b_ * step_e
-        mean = f.reshape(ticks, n).mean(axis=1)
-        sides = np.sum(mean[:-1] * d[1:]) - np.sum(f * step_x)
-        sides -= 0.25 * (k_ + b_) * np.sum(step_x**2)
-        assert sides + needed / T * np.sum(d**2) > -1e-12
-
-
 @pytest.mark.parametrize(
     ("method", "substeps", "verdict"),
     [
@@ -737,14 +714,11 @@ def test_error_of_a_free_mass_falls_with_the_number_of_substeps(laws: int, perce
 
 
 def test_strict_environments_need_less_than_the_form_grants() -> None:
-    masses = (RIGID, 1.0, 0.2, 0.05, 0.02, 0.01)
-    for laws, wall, most in ((1, 1.70, 1.70), (2, 1.30, 1.30), (4, 1.60, 1.65), (8, 1.75, 2.03)):
-        found = [worst(laws, mass)[0] for mass in masses]
-        assert found[0] == pytest.approx(wall, abs=6e-3)
-        assert max(found) == pytest.approx(most, abs=6e-3)
-        assert max(found) <= required_damping(LIGHT, T, laws) * (1 + 1e-9)
     needed = [required_damping(LIGHT, T, n) for n in (1, 2, 4, 8)]
     assert needed == pytest.approx([1.70, 1.63, 1.90, 2.42], abs=6e-3)  # what is printed
+    for laws, granted in zip((1, 2, 4, 8), needed, strict=True):
+        found = max(worst(laws, mass)[0] for mass in (RIGID, 1.0, 0.2, 0.05, 0.02, 0.01))
+        assert 0.75 * granted < found <= granted * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("laws", "mass"), [(4, 0.05), (8, 0.05)])

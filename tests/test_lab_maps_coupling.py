@@ -93,11 +93,14 @@ def test_explicit_free_tool_fails_where_its_own_bound_says_and_implicit_does_not
     assert implicit["stable_free"]
 
 
-def test_position_explicit_coupling_is_named_active_below_the_bound() -> None:
-    found = evaluate(cell("implicitfast", 1500.0, 0.6))
-    assert found["environment"] == "active"
-    assert float(found["slack_share"]) > 1
-    assert float(found["created"]) > 0
+def test_implicitfast_is_at_fault_where_explicit_stays_within_its_slack() -> None:
+    fast = evaluate(cell("implicitfast", 1500.0, 0.6))
+    assert (fast["environment"], fast["fault_port"]) == ("active", "environment")
+    assert fast["fault_tick"] == 25
+    assert float(fast["slack_share"]) > 1
+    assert float(fast["created"]) > 0
+    explicit = evaluate(cell("explicit", 1500.0, 0.6))
+    assert (explicit["environment"], explicit["fault_tick"]) == ("within slack", -1)
     assert evaluate(cell("implicit", 1500.0, 0.6))["created"] == 0.0
 
 
@@ -111,15 +114,6 @@ def test_weld_is_judged_by_its_device_port_and_has_no_wall_without_contact() -> 
     twin = evaluate(cell("implicit", 1500.0, 0.6))
     assert (twin["fault_tick"], twin["fault_port"]) == (-1, "")
     assert twin["stable_tapping"] is True
-
-
-def test_explicit_stays_within_its_slack_where_implicitfast_is_at_fault() -> None:
-    explicit = evaluate(cell("explicit", 1500.0, 0.6))
-    assert explicit["environment"] == "within slack"
-    assert explicit["fault_tick"] == -1
-    fast = evaluate(cell("implicitfast", 1500.0, 0.6))
-    assert fast["fault_port"] == "environment"
-    assert fast["fault_tick"] == 25
 
 
 @pytest.mark.parametrize(

@@ -80,17 +80,6 @@ def test_a_delay_costs_stiffness_as_the_spectrum_says(name: str, lag: float) -> 
         assert needed.max() == pytest.approx(DEVICE_DAMPING, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "delay", "slow"),
-    # b = K T (d + ½) − B' as θ → 0: d + 3/2 with B − K T, d + 1 with B − K T/2, d + ½ without B'
-    [("compensated", 1, 4 / 3), ("compensated", 4, 3 / 5.5), ("lossless", 1, 3 / 2)],
-)
-def test_what_is_taken_off_the_damper_leaves_a_limit_at_low_frequency(
-    name: str, delay: int, slow: float
-) -> None:
-    assert wall_limit(name, 1e-3, delay) * 1e-3 == pytest.approx(slow, rel=1e-4)
-
-
 def test_a_search_finds_the_bound() -> None:
     for name, delay in (("implicit", 2), ("compensated", 1), ("lossless", 0)):
         found = evaluate(point(name, 1e-3, delay))
