@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
     NEEDED_SHARE,
     damping_for_delay,
@@ -18,10 +17,8 @@ from hapticbridge.certificate import (
     felt_period,
     is_certified,
 )
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
-from hapticbridge.errors import DeviceError
 from hapticbridge.rendering import default_method
 
 T = 1e-3
@@ -114,11 +111,3 @@ def test_a_real_device_of_unknown_damping_is_taken_for_one_of_a_tenth() -> None:
     assert default_coupling(turning, T).rotational_stiffness == pytest.approx(
         0.1 * simulated.rotational_stiffness
     )
-
-
-def test_a_real_device_refuses_simulated_time() -> None:
-    device = SimulatedDevice()
-    Bridge("point_mass", device, clock=SimulatedClock())
-    device.info = dataclasses.replace(device.info, is_real=True)
-    with pytest.raises(DeviceError, match=r"moves in real time.*--fast"):
-        Bridge("point_mass", device, clock=SimulatedClock())

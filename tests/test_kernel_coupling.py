@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_runs import (
-    DEFAULT,
     FREE_BALL,
     Array,
     Run,
@@ -44,32 +43,6 @@ TILTED_BOX = mjcf("""
       <geom type="box" size="0.02 0.03 0.04" mass="0.2"/>
       <site name="grip" pos="0.02 -0.01 0.03" quat="0.6 0 0.8 0"/>
     </body>""")
-
-
-def _implicit_euler(handle: Array, coupling: Coupling, mass: float) -> tuple[Array, Array]:
-    """Implicit Euler with the coupling solved for the end of the step, from rest at 0."""
-    stiffness, damping = coupling.stiffness, coupling.damping
-    effective = mass + T * damping + T**2 * stiffness
-    x, v, before = np.zeros(3), np.zeros(3), np.zeros(3)
-    positions, forces = [], []
-    for h in handle:
-        # m (v' − v) = T f,  f = K (h − x − T v') + B ((h − before)/T − v')
-        pull = T * (stiffness * (h - x) + damping * (h - before) / T)
-        v = (mass * v + pull) / effective
-        forces.append(stiffness * (h - x - T * v) + damping * ((h - before) / T - v))
-        x, before = x + T * v, h
-        positions.append(x)
-    return np.array(positions), np.array(forces)
-
-
-@pytest.mark.parametrize("coupling", [DEFAULT, STIFF, Coupling(20000.0, 0.0, 0.0, 0.0)])
-def test_free_mass_follows_the_implicit_euler_recursion(coupling: Coupling) -> None:
-    handle = sines(2000, 0.01, 3.0)
-    run = fast(FREE_BALL, samples_of(handle), coupling)
-    position, force = _implicit_euler(handle, coupling, MASS)
-    assert np.abs(run.ticks["tool_position"] - position).max() <= 1e-12
-    assert np.abs(run.ticks["wrench_on_tool"][:, :3] - force).max() <= 1e-9
-    assert np.abs(force).max() > 0.01  # and there is a force to compare
 
 
 def _by_substep(scene: str, samples: np.ndarray, coupling: Coupling, substeps: int) -> Run:

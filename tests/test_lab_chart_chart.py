@@ -15,6 +15,7 @@ import pytest
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import Scheme
+from hapticbridge.lab.chart import setting
 from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import (
     Chart,
@@ -26,14 +27,6 @@ from hapticbridge.lab.chart.chart import (
     pareto_front,
 )
 from hapticbridge.lab.chart.output import prepared_files, recommendation, recommended, write_chart
-from hapticbridge.lab.chart.setting import (
-    CONTACTS,
-    SHIPPED,
-    Setting,
-    chosen_methods,
-    chosen_periods,
-    settings_for,
-)
 from hapticbridge.lab.chart.workload import Score, Verdict
 from hapticbridge.lab.methods import METHODS
 
@@ -46,7 +39,7 @@ def made_up(
     period: float = 1e-3,
     verdict: Verdict = "strict",
     spread: float = 0.0,
-    contact: str = SHIPPED,
+    contact: str = setting.SHIPPED,
     substeps: int = 1,
     iterations: int | None = None,
     limit_apart: float = 0.0,
@@ -54,7 +47,7 @@ def made_up(
     """Returns a point of panel ``panel`` that costs and errs as said."""
     return Measurement(
         "panel",
-        Setting(METHODS[method], period, substeps, contact, iterations),
+        setting.Setting(METHODS[method], period, substeps, contact, iterations),
         Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
         Score(felt=felt, created=0.0, verdict=verdict),
         limit_apart=limit_apart,
@@ -136,21 +129,21 @@ def test_no_further_round_begins_when_patience_is_over_but_three_are_done() -> N
 
 
 def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
-    methods, periods = chosen_methods(None), chosen_periods(None)
-    settings = settings_for(methods, periods, has_contact=True)
+    methods, periods = setting.chosen_methods(None), setting.chosen_periods(None)
+    settings = setting.settings_for(methods, periods, has_contact=True)
     assert len(set(settings)) == len(settings)
     for method in METHODS.values():
         assert {s.period for s in settings if s.method is method} == set(periods)
-    assert {s.contact for s in settings} == set(CONTACTS)
+    assert {s.contact for s in settings} == set(setting.CONTACTS)
     undivided = [s for s in settings if s.method.scheme in (Scheme.MIDPOINT, Scheme.MASSLESS)]
     assert {s.substeps for s in undivided} == {1}
     for name in ("implicit", "lossless"):
         tried = {s.period for s in settings if (s.method.name, s.contact) == (name, "damped")}
         assert tried == {1e-3, 5e-4}
     for steps, neighbour in (([2e-3, 1e-3], 2e-3), ([1e-3], 1e-3)):
-        found = settings_for(methods, steps, has_contact=True)
-        assert {s.period for s in found if s.contact != SHIPPED} == {1e-3, neighbour}
-    without = settings_for(methods, periods, has_contact=False)
+        found = setting.settings_for(methods, steps, has_contact=True)
+        assert {s.period for s in found if s.contact != setting.SHIPPED} == {1e-3, neighbour}
+    without = setting.settings_for(methods, periods, has_contact=False)
     assert {(s.contact, s.iterations) for s in without} == {("as shipped", None)}
 
 
@@ -165,14 +158,14 @@ def test_selection_has_every_method_at_every_step_and_no_point_twice() -> None:
 )
 def test_bad_steps_are_refused_in_a_sentence(steps: list[float], said: str) -> None:
     with pytest.raises(StudyError, match=said):
-        chosen_periods(steps)
+        setting.chosen_periods(steps)
 
 
 @pytest.fixture(scope="module")
 def chart() -> Chart:
     """A good method, and one that a step of 20 ms throws out of bounds."""
     settings = [
-        Setting(METHODS[name], period)
+        setting.Setting(METHODS[name], period)
         for name in ("implicit", "explicit")
         for period in (0.02, 2e-3, 1e-3)
     ]
@@ -217,7 +210,7 @@ def test_files_hold_every_setting(chart: Chart, tmp_path: Path) -> None:
 def test_chart_without_a_point_is_refused() -> None:
     workload = open_workload("spinning_body", Extent(4e-3, 4e-3))
     with pytest.raises(StudyError, match="no point could be simulated; first: method 'weld'"):
-        measure_chart(workload, [Setting(METHODS["weld"], 4e-3)], repeats=1)
+        measure_chart(workload, [setting.Setting(METHODS["weld"], 4e-3)], repeats=1)
 
 
 def test_hand_path_beside_a_scene_is_never_overwritten(
@@ -254,7 +247,7 @@ def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_table_says_what_contacts_and_solver_really_were() -> None:
     workload = open_workload("rod_impact", Extent(4e-3, 1e-3))
     settings = [
-        Setting(METHODS["implicit"], 1e-3, contact=contact, iterations=iterations)
+        setting.Setting(METHODS["implicit"], 1e-3, contact=contact, iterations=iterations)
         for contact, iterations in (
             ("as shipped", None),
             ("damped", None),

@@ -13,23 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import contact_bodies, free_bodies
+from hapticbridge.lab.chart import contact_bodies, free_bodies, peg
 from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import measure_chart
-from hapticbridge.lab.chart.peg import (
-    CLEARANCE,
-    DURATION,
-    HOME,
-    JUDGED,
-    POSES,
-    RAMP,
-    PegInHole,
-    end_of_hold,
-    gaps,
-    peg_path,
-    resting_peg,
-)
-from hapticbridge.lab.chart.peg import COUPLING as PEG_COUPLING
 from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import Score, Workload
@@ -134,7 +120,7 @@ def test_gaps_of_the_peg_are_negative_exactly_where_mujoco_finds_it_inside() -> 
     for _ in range(300):
         place = generator.uniform((-2e-4, -2e-4, -0.008), (2e-4, 2e-4, 0.02))
         turn = generator.uniform(-0.005, 0.005, 3)
-        least = float(gaps(place, turn).min())
+        least = float(peg.gaps(place, turn).min())
         if abs(least) < 2e-6:
             continue  # edge against edge, where MuJoCo's boxes touch a micrometre early or late
         q = Rotation.from_rotvec(turn).as_quat()[[3, 0, 1, 2]]
@@ -147,23 +133,23 @@ def test_gaps_of_the_peg_are_negative_exactly_where_mujoco_finds_it_inside() -> 
 
 def test_resting_peg_has_the_closed_form_where_it_touches_one_wall_or_the_bottom() -> None:
     stiff = Coupling(1000.0, 0.0, 1e5, 0.0)  # hardly turns
-    wall = resting_peg(stiff, (2e-3, 0.0, 0.01))
-    np.testing.assert_allclose(wall.position, [CLEARANCE, 0.0, 0.01], atol=1e-7)
-    assert wall.wrench[0] == pytest.approx(1000 * (2e-3 - CLEARANCE), rel=1e-3)
-    bottom = resting_peg(stiff, (0.0, 0.0, -0.012))
+    wall = peg.resting_peg(stiff, (2e-3, 0.0, 0.01))
+    np.testing.assert_allclose(wall.position, [peg.CLEARANCE, 0.0, 0.01], atol=1e-7)
+    assert wall.wrench[0] == pytest.approx(1000 * (2e-3 - peg.CLEARANCE), rel=1e-3)
+    bottom = peg.resting_peg(stiff, (0.0, 0.0, -0.012))
     np.testing.assert_allclose(bottom.position, [0.0, 0.0, -0.01], atol=1e-8)
-    free = resting_peg(stiff, (1e-4, 0.0, 0.01))
+    free = peg.resting_peg(stiff, (1e-4, 0.0, 0.01))
     np.testing.assert_allclose(free.position, [1e-4, 0.0, 0.01], atol=1e-8)
 
 
-@pytest.mark.parametrize("index", JUDGED)
+@pytest.mark.parametrize("index", peg.JUDGED)
 def test_resting_peg_is_held_by_pushes_of_the_walls_that_it_touches(index: int) -> None:
-    found = resting_peg(PEG_COUPLING, *POSES[index])
+    found = peg.resting_peg(peg.COUPLING, *peg.POSES[index])
     turned = Rotation.from_rotvec(found.rotation)
 
     def moved(twist: np.ndarray) -> np.ndarray:
         rotation = (Rotation.from_rotvec(twist[3:]) * turned).as_rotvec()
-        return gaps(found.position + twist[:3], rotation)
+        return peg.gaps(found.position + twist[:3], rotation)
 
     touching = np.flatnonzero(found.gaps < 1e-7)
     step = 1e-7 * np.eye(6)
@@ -177,19 +163,19 @@ def test_resting_peg_is_held_by_pushes_of_the_walls_that_it_touches(index: int) 
 
 def test_resting_peg_wants_a_coupling_that_holds_it() -> None:
     with pytest.raises(StudyError, match="must hold the peg's place and turning"):
-        resting_peg(Coupling(1000.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.01))
+        peg.resting_peg(Coupling(1000.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.01))
 
 
 def test_path_of_the_peg_starts_at_home_and_rests_at_every_pose() -> None:
-    places, turns = peg_path(np.array([0.0]))
+    places, turns = peg.peg_path(np.array([0.0]))
     np.testing.assert_allclose(places[0], 0.0, atol=1e-15)
-    for index, (place, turn) in enumerate(POSES):
-        end = end_of_hold(index) - 1e-6
-        places, turns = peg_path(np.array([end - 0.3, end]))
-        np.testing.assert_allclose(places + HOME, [place, place], atol=1e-12)
+    for index, (place, turn) in enumerate(peg.POSES):
+        end = peg.end_of_hold(index) - 1e-6
+        places, turns = peg.peg_path(np.array([end - 0.3, end]))
+        np.testing.assert_allclose(places + peg.HOME, [place, place], atol=1e-12)
         rotated = Rotation.from_quat(turns[-1, [1, 2, 3, 0]]).as_rotvec()
         np.testing.assert_allclose(rotated, turn, atol=1e-12)
-    assert len(POSES) * RAMP < DURATION
+    assert len(peg.POSES) * peg.RAMP < peg.DURATION
 
 
 def test_sliding_block_in_closed_form_is_what_a_solver_with_an_event_finds() -> None:
@@ -300,14 +286,14 @@ def test_rod_that_meets_a_damped_contact_is_nearer_to_an_impact_without_rebound(
 
 
 @lru_cache
-def peg() -> PegInHole:
+def quick_peg() -> peg.PegInHole:
     """Returns the peg, with a reference that is quick rather than fine."""
-    return PegInHole(PEG_COUPLING, GRID, 1e-3, refinement=4)
+    return peg.PegInHole(peg.COUPLING, GRID, 1e-3, refinement=4)
 
 
 def test_settled_peg_is_nearer_to_the_rigid_one_the_stiffer_its_contacts() -> None:
     stiff, soft = (
-        peg().run(Setting(METHODS["implicit"], 1e-3, contact=contact)).scores()["settled"]
+        quick_peg().run(Setting(METHODS["implicit"], 1e-3, contact=contact)).scores()["settled"]
         for contact in ("2 steps", "soft")
     )
     assert stiff.position_peak < 2e-5
@@ -318,14 +304,14 @@ def test_settled_peg_is_nearer_to_the_rigid_one_the_stiffer_its_contacts() -> No
 
 
 def test_peg_that_never_reaches_its_hole_has_lost_contact() -> None:
-    run = peg().run(Setting(METHODS["explicit:implicitfast"], 4e-3))
+    run = quick_peg().run(Setting(METHODS["explicit:implicitfast"], 4e-3))
     assert run.scores()["settled"].verdict in ("lost contact", "diverged")
 
 
 def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
     for name in ("implicit", "explicit", "weld"):
-        peg().run(Setting(METHODS[name], 2e-3)).scores()
-    references = peg().references
+        quick_peg().run(Setting(METHODS[name], 2e-3)).scores()
+    references = quick_peg().references
     assert isinstance(references, OwnReferences)
     apart = references.disagreement()
     assert apart["explicit"] < 0.3
@@ -334,7 +320,7 @@ def test_methods_agree_on_where_the_moving_peg_goes_in_the_limit() -> None:
 
 
 def test_measured_points_carry_how_far_the_limit_of_their_method_lies() -> None:
-    workload = PegInHole(PEG_COUPLING, GRID, GRID, refinement=2)
+    workload = peg.PegInHole(peg.COUPLING, GRID, GRID, refinement=2)
     settings = [Setting(METHODS[name], GRID) for name in ("implicit", "weld")]
     found = measure_chart(workload, settings, repeats=1)
     apart = {

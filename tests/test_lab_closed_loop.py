@@ -22,7 +22,6 @@ from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.scene import load_scene
-from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 T = 1e-3
 COUPLING = Coupling(2000, 0.5, 2, 5e-4)
@@ -33,10 +32,6 @@ STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
 @pytest.fixture(scope="module")
 def point_mass() -> ClosedLoop:
     return ClosedLoop(load_scene("point_mass"))
-
-
-def fields_without_times() -> list[str]:
-    return [name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS]
 
 
 @pytest.mark.parametrize(
@@ -74,29 +69,8 @@ def test_records_are_those_of_the_live_loop_to_the_bit(scene: str, method: str) 
         expected = bridge.latest_records(1500)
     assert len(outcome.records) == len(expected) == 1500
     assert (outcome.environment, outcome.fault) == (summary.environment, summary.fault)
-    for name in fields_without_times():
+    for name in set(TICK_DTYPE.names or ()) - set(CLOCK_FIELDS):
         assert np.array_equal(outcome.records[name], expected[name]), name
-
-
-def run_worst_hand(loop: ClosedLoop, share: float, ticks: int = 3000) -> LoopOutcome:
-    theory = SampledLoop(COUPLING, T, mass=0.1)
-    frequency = theory.worst_frequency()
-    bound = float(theory.damping_spectrum(frequency))
-    hand = WorstHand(share * bound, frequency, T, complex(theory.response(frequency)))
-    device = SimulatedDevice(hand=hand)
-    return loop.run(device, COUPLING, METHODS["implicit"], ticks=ticks, knock=KNOCK)
-
-
-def test_with_mujoco_in_the_loop_the_worst_hand_diverges_below_the_bound_and_not_above(
-    point_mass: ClosedLoop,
-) -> None:
-    below, above = (run_worst_hand(point_mass, share) for share in (0.98, 1.02))
-    assert not below.is_stable
-    assert below.ticks < 3000
-    assert above.is_stable
-    assert above.ticks == 3000
-    # the simulation is passive in both: it is the device that lacks damping
-    assert below.environment == above.environment == "strict"
 
 
 def test_runs_in_threads_are_the_run_alone() -> None:

@@ -150,17 +150,12 @@ def test_mujoco_as_a_peer_moves_a_scene_as_mujoco_does(scene: Scene, tmp_path: P
     assert abs(quaternion @ data.qpos[3:]) == pytest.approx(1, abs=1e-12)
 
 
+TENDON = '<tendon><spatial><site site="grip"/><site site="o"/></spatial></tendon>'
 REFUSED = {
     "joints": ({"child": '<body><joint/><geom size="0.01"/></body>'}, "2 joint"),
     "bodies": ({"child": '<body><geom size="0.01"/></body>'}, "several bodies"),
     "mocap": ({"world": '<body mocap="true"><geom size="0.01"/></body>'}, "mocap"),
-    "tendon": (
-        {
-            "top": '<tendon><spatial><site site="grip"/><site site="o"/></spatial></tendon>',
-            "world": '<site name="o"/>',
-        },
-        "tendons",
-    ),
+    "tendon": ({"top": TENDON, "world": '<site name="o"/>'}, "tendons"),
     "equality": ({"top": '<equality><weld body1="tool"/></equality>'}, "constraints"),
     "actuator": ({"top": '<actuator><motor joint="tool"/></actuator>'}, "actuators"),
     "pair": ({"top": '<contact><pair geom1="handle" geom2="floor"/></contact>'}, "pairs"),

@@ -27,12 +27,10 @@ from hapticbridge.lab.maps.coupling import (
     DEVICE_DAMPING,
     PATH,
     PERIOD,
-    TOOL_MASS,
     evaluate,
 )
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
-from hapticbridge.theory.virtual_mass import environment_minimum_damping
 
 NEVER = 1e9
 """Force in N and torque in N m that no run reaches."""
@@ -60,14 +58,6 @@ def test_the_bound_of_a_method_is_that_of_the_coupling_it_uses(method: str) -> N
     assert needed_by_6(method, limit, 1.2, PERIOD) == pytest.approx(DEVICE_DAMPING)
 
 
-@pytest.mark.parametrize("method", ["compensated", "lossless"])
-def test_what_takes_its_lag_off_is_stable_on_a_wall_beyond_the_bound_of_implicit(
-    method: str,
-) -> None:
-    point: Point = {"what": "limit", "method": method, "stiffness": 0.0, "damping": 1.2}
-    assert evaluate(point)["limit"] == pytest.approx(2 * DEVICE_DAMPING / PERIOD, rel=0.01)
-
-
 def test_coupling_that_the_device_cannot_bear_is_unstable_though_the_scene_is_passive() -> None:
     limit = float(maximum_stiffness(DEVICE_DAMPING, PERIOD, 0.5))
     below = evaluate(cell("implicit", 0.95 * limit, 0.5))
@@ -77,20 +67,6 @@ def test_coupling_that_the_device_cannot_bear_is_unstable_though_the_scene_is_pa
     assert below["environment"] == "strict"
     assert not above["stable_on_wall"]
     assert above["environment"] == "strict"
-
-
-def test_explicit_free_tool_fails_where_its_own_bound_says_and_implicit_does_not() -> None:
-    # an undamped coupling: no device damping saves the explicit scheme, whatever the mass
-    stiffness = 1500.0
-    needed = environment_minimum_damping(
-        Coupling(stiffness, 0.0, 1.0, 0.0), PERIOD, TOOL_MASS, "semi_implicit"
-    )
-    assert needed > DEVICE_DAMPING
-    explicit = evaluate(cell("explicit", stiffness, 0.0))
-    implicit = evaluate(cell("implicit", stiffness, 0.0))
-    assert explicit["stable_on_wall"]
-    assert not explicit["stable_free"]
-    assert implicit["stable_free"]
 
 
 def test_implicitfast_is_at_fault_where_explicit_stays_within_its_slack() -> None:

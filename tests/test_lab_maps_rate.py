@@ -8,26 +8,9 @@ import numpy as np
 import pytest
 from map_runs import boundary_of
 
-from hapticbridge.coupling import Coupling
 from hapticbridge.lab.closed_loop import PARTS, Timing
+from hapticbridge.lab.maps import rate
 from hapticbridge.lab.maps.base import Point
-from hapticbridge.lab.maps.rate import (
-    DAMPING,
-    DELAYS,
-    DEVICE_DAMPING,
-    METHODS_SHOWN,
-    RATE,
-    SEARCHED,
-    SEEDS,
-    TICKS,
-    UNEVEN_PERIOD,
-    evaluate,
-    finite_hand,
-    unevenness,
-    wall_limit,
-    worst_hand,
-)
-from hapticbridge.lab.methods import METHODS
 
 
 def point(name: str, period: float, delay: int) -> Point:
@@ -35,36 +18,36 @@ def point(name: str, period: float, delay: int) -> Point:
     return at | {"delay": delay, "share": 0.0}
 
 
-@pytest.mark.parametrize("name", METHODS_SHOWN)
+@pytest.mark.parametrize("name", rate.METHODS_SHOWN)
 @pytest.mark.parametrize(("period", "delay"), [(1e-4, 1), (1e-3, 0), (5e-3, 5)])
 def test_the_worst_hand_is_unstable_above_the_bound_and_stable_below(
     name: str, period: float, delay: int
 ) -> None:
-    limit = wall_limit(name, period, delay)
-    failed = worst_hand(name, 1.02 * limit, period, delay)
+    limit = rate.wall_limit(name, period, delay)
+    failed = rate.worst_hand(name, 1.02 * limit, period, delay)
     assert not failed.is_stable
     # the wall gives nothing: at fault is the port to the device, which is given energy (the meter
     # knows what was sent, so with a delay its sum says nothing)
     assert failed.environment == "strict"
     assert delay > 0 or failed.device_energy > 0
-    assert worst_hand(name, 0.98 * limit, period, delay).is_stable
+    assert rate.worst_hand(name, 0.98 * limit, period, delay).is_stable
 
 
-@pytest.mark.parametrize("delay", [0, DELAYS - 1])
+@pytest.mark.parametrize("delay", [0, rate.DELAYS - 1])
 def test_a_wall_far_too_stiff_is_unstable_too(delay: int) -> None:
     # there the worst hand swings once in hundreds of ticks
-    for name in METHODS_SHOWN:
-        for stiffness in (3 * wall_limit(name, 5e-3, delay), SEARCHED[1]):
-            assert not worst_hand(name, stiffness, 5e-3, delay).is_stable
+    for name in rate.METHODS_SHOWN:
+        for stiffness in (3 * rate.wall_limit(name, 5e-3, delay), rate.SEARCHED[1]):
+            assert not rate.worst_hand(name, stiffness, 5e-3, delay).is_stable
 
 
 def test_without_delay_the_bound_is_that_of_the_paper_and_doubles_with_the_rate() -> None:
-    assert wall_limit("implicit", 1e-3, 0) == pytest.approx(
-        2 * (DEVICE_DAMPING - DAMPING) / 1e-3, rel=1e-3
+    assert rate.wall_limit("implicit", 1e-3, 0) == pytest.approx(
+        2 * (rate.DEVICE_DAMPING - rate.DAMPING) / 1e-3, rel=1e-3
     )
-    for name in METHODS_SHOWN:
+    for name in rate.METHODS_SHOWN:
         for delay in (0, 3):
-            ratio = wall_limit(name, 5e-4, delay) / wall_limit(name, 1e-3, delay)
+            ratio = rate.wall_limit(name, 5e-4, delay) / rate.wall_limit(name, 1e-3, delay)
             assert ratio == pytest.approx(2, rel=1e-3)
 
 
@@ -74,67 +57,52 @@ def test_without_delay_the_bound_is_that_of_the_paper_and_doubles_with_the_rate(
 def test_a_delay_costs_stiffness_as_the_spectrum_says(name: str, lag: float) -> None:
     theta = np.linspace(1e-4, np.pi, 20_001)
     for delay in (1, 4):
-        kt = wall_limit(name, 1e-3, delay) * 1e-3
+        kt = rate.wall_limit(name, 1e-3, delay) * 1e-3
         needed = kt / 2 * np.sin((2 * delay + 1) * theta / 2) / np.sin(theta / 2)
-        needed -= max(DAMPING - lag * kt, 0.0) * np.cos((delay + 1) * theta)
-        assert needed.max() == pytest.approx(DEVICE_DAMPING, rel=1e-3)
+        needed -= max(rate.DAMPING - lag * kt, 0.0) * np.cos((delay + 1) * theta)
+        assert needed.max() == pytest.approx(rate.DEVICE_DAMPING, rel=1e-3)
 
 
 def test_a_search_finds_the_bound() -> None:
     for name, delay in (("implicit", 2), ("compensated", 1), ("lossless", 0)):
-        found = evaluate(point(name, 1e-3, delay))
-        assert found["limit"] == pytest.approx(wall_limit(name, 1e-3, delay), rel=2e-3)
-
-
-@pytest.mark.parametrize("hand", ["no hand", "ordinary hand"])
-@pytest.mark.parametrize("timing", [Timing(jitter=0.9, seed=2), Timing(drops=0.5, seed=1)])
-def test_of_no_damper_nothing_is_taken_off_at_uneven_ticks_too(hand: str, timing: Timing) -> None:
-    # stable, and diverging: the map runs one of the methods
-    for stiffness in (500.0, 20_000.0):
-        one, *others = (finite_hand(name, hand, stiffness, timing) for name in METHODS_SHOWN)
-        assert one.is_stable is (stiffness == 500.0)
-        for other in others:
-            assert (other.ticks, other.is_stable) == (one.ticks, one.is_stable)
-            # what diverges moves even this wall a little, and by method
-            assert other.peak_force == pytest.approx(one.peak_force, rel=1e-4)
-            assert other.device_energy == pytest.approx(one.device_energy, rel=1e-4)
-    # with a damper they differ
-    told = {name: METHODS[name].used(Coupling(500.0, 1.0, 0, 0), 1e-3) for name in METHODS_SHOWN}
-    assert [used.damping for used in told.values()] == [1.0, 0.5, 0.75]
+        found = rate.evaluate(point(name, 1e-3, delay))
+        assert found["limit"] == pytest.approx(rate.wall_limit(name, 1e-3, delay), rel=2e-3)
 
 
 def test_half_of_all_ticks_lost_costs_a_free_device_two_thirds_of_its_stiffness() -> None:
     # geometric gaps: E[T]/E[T²] = (1 − p)/(1 + p)/T, a third of the even ticks' 1/T
     even, lost = Timing(), Timing(drops=0.5, seed=1)
-    full = 2 * DEVICE_DAMPING / UNEVEN_PERIOD
-    assert finite_hand("implicit", "no hand", 0.97 * full, even).is_stable
-    assert not finite_hand("implicit", "no hand", 0.97 * full, lost).is_stable
-    assert not finite_hand("implicit", "no hand", 1.3 * full / 3, lost).is_stable
-    assert finite_hand("implicit", "no hand", 0.75 * full / 3, lost).is_stable
-    assert finite_hand("implicit", "ordinary hand", 0.97 * full, lost).is_stable
+    full = 2 * rate.DEVICE_DAMPING / rate.UNEVEN_PERIOD
+    assert rate.finite_hand("implicit", "no hand", 0.97 * full, even).is_stable
+    assert not rate.finite_hand("implicit", "no hand", 0.97 * full, lost).is_stable
+    assert not rate.finite_hand("implicit", "no hand", 1.3 * full / 3, lost).is_stable
+    assert rate.finite_hand("implicit", "no hand", 0.75 * full / 3, lost).is_stable
+    assert rate.finite_hand("implicit", "ordinary hand", 0.97 * full, lost).is_stable
 
 
 def test_uneven_ticks_are_told_by_three_periods_and_an_ordinary_hand_bears_more() -> None:
-    told = unevenness([1e-3, 1e-3, 2e-3])
+    told = rate.unevenness([1e-3, 1e-3, 2e-3])
     assert told == pytest.approx({"mean": 4e-3 / 3, "longest": 2e-3, "balanced": 6e-3 / 4})
     lost: Point = {"what": "drops", "method": "implicit", "hand": "no hand", "share": 0.5}
-    found = evaluate(lost | {"period": 1e-3, "delay": 0})
+    found = rate.evaluate(lost | {"period": 1e-3, "delay": 0})
     # geometric gaps: E[T] = T/(1 − p), E[T²]/E[T] = T (1 + p)/(1 − p)
     assert found["mean"] == pytest.approx(2e-3, rel=0.05)
     assert found["balanced"] == pytest.approx(3e-3, rel=0.05)
-    held = evaluate(lost | {"period": 1e-3, "delay": 0, "hand": "ordinary hand"})
+    held = rate.evaluate(lost | {"period": 1e-3, "delay": 0, "hand": "ordinary hand"})
     assert float(held["limit"]) > 3 * float(
         found["limit"]
     )  # an ordinary hand takes its share of the energy
-    longest = max(Timing(drops=0.5, seed=s).intervals(TICKS).max() for s in range(SEEDS))
+    longest = max(Timing(drops=0.5, seed=s).intervals(rate.TICKS).max() for s in range(rate.SEEDS))
     assert found["longest"] == pytest.approx(1e-3 * longest / PARTS)
 
 
 @pytest.mark.parametrize("hand", ["no hand", "ordinary hand"])
 @pytest.mark.parametrize("timing", [Timing(jitter=0.9, seed=2), Timing(drops=0.3, seed=2)])
 def test_below_the_bound_at_the_longest_interval_nothing_fails(hand: str, timing: Timing) -> None:
-    longest = timing.intervals(2000).max() / 16 * UNEVEN_PERIOD
-    assert finite_hand("implicit", hand, 0.98 * 2 * DEVICE_DAMPING / longest, timing).is_stable
+    longest = timing.intervals(2000).max() / 16 * rate.UNEVEN_PERIOD
+    assert rate.finite_hand(
+        "implicit", hand, 0.98 * 2 * rate.DEVICE_DAMPING / longest, timing
+    ).is_stable
 
     # K T/(2b): 0.55 and 1.1, their mean; theory at a delay of 5 is 0.526
 
@@ -147,7 +115,7 @@ def is_kept(each: Point) -> bool:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(RATE, tmp_path, 20, is_kept)
+    boundary = boundary_of(rate.RATE, tmp_path, 20, is_kept)
     by_delay = boundary["methods"]["lossless"]
     assert set(by_delay) == {"0", "5"}
     for mine in by_delay.values():

@@ -10,20 +10,8 @@ from map_runs import boundary_of
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
+from hapticbridge.lab.maps import tool_mass
 from hapticbridge.lab.maps.base import Point
-from hapticbridge.lab.maps.tool_mass import (
-    DAMPING,
-    DEVICE_DAMPING,
-    PERIOD,
-    TOOL_MASS,
-    evaluate,
-    felt,
-    held_still,
-    min_mass,
-    predicted_limit,
-    worst_angle,
-    worst_hand,
-)
 from hapticbridge.theory.sampled_loop import SampledLoop
 from hapticbridge.theory.virtual_mass import Integrator, environment_minimum_damping, minimum_mass
 
@@ -33,13 +21,17 @@ TWINS: dict[str, Integrator] = {"implicit": "implicit", "explicit": "semi_implic
 @pytest.mark.parametrize("method", TWINS)
 def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
     coupling, angle = Coupling(1000.0, 2.0, 0.0, 0.0), np.array([0.1, 1.0, 3.0])
-    assert min_mass(method, 1000.0, 2.0, 1e-3) == minimum_mass(coupling, 1e-3, TWINS[method])
+    assert tool_mass.min_mass(method, 1000.0, 2.0, 1e-3) == minimum_mass(
+        coupling, 1e-3, TWINS[method]
+    )
     for mass in (0.005, 0.05):
         other = SampledLoop(coupling, 1e-3, mass=mass, integrator=TWINS[method])
-        mine = felt(method, 1000.0, 2.0, mass, 1e-3, angle)
+        mine = tool_mass.felt(method, 1000.0, 2.0, mass, 1e-3, angle)
         np.testing.assert_allclose(mine, other.response(angle / 1e-3), rtol=1e-12)
         needed = environment_minimum_damping(coupling, 1e-3, mass, TWINS[method])
-        assert worst_angle(method, 1000.0, 2.0, mass, 1e-3)[1] == pytest.approx(needed, rel=1e-6)
+        assert tool_mass.worst_angle(method, 1000.0, 2.0, mass, 1e-3)[1] == pytest.approx(
+            needed, rel=1e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -49,13 +41,13 @@ def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
 def test_behind_a_handle_held_still_a_method_fails_where_theory_says(
     method: str, stiffness: float
 ) -> None:
-    least = min_mass(method, stiffness, DAMPING, PERIOD)
-    failed = held_still(method, stiffness, 0.97 * least)
+    least = tool_mass.min_mass(method, stiffness, tool_mass.DAMPING, tool_mass.PERIOD)
+    failed = tool_mass.held_still(method, stiffness, 0.97 * least)
     assert not failed.is_stable
     assert failed.environment == "active"  # the ledger's port: what lies behind the coupling
     assert failed.first_active >= 0
-    assert held_still(method, stiffness, 1.03 * least).is_stable
-    twin = held_still("implicit", stiffness, 0.97 * least)
+    assert tool_mass.held_still(method, stiffness, 1.03 * least).is_stable
+    twin = tool_mass.held_still("implicit", stiffness, 0.97 * least)
     assert twin.is_stable
     assert twin.environment == "strict"
 
@@ -66,15 +58,15 @@ def test_behind_a_handle_held_still_a_method_fails_where_theory_says(
 def test_the_worst_hand_turns_a_light_tool_unstable_where_theory_says(
     method: str, stiffness: float
 ) -> None:
-    limit = float(predicted_limit(method, stiffness, is_held=False)["limit"])
-    assert not worst_hand(method, stiffness, 0.9 * limit).is_stable
-    assert worst_hand(method, stiffness, 1.1 * limit).is_stable
-    assert worst_hand("implicit", stiffness, 0.9 * limit).is_stable
+    limit = float(tool_mass.predicted_limit(method, stiffness, is_held=False)["limit"])
+    assert not tool_mass.worst_hand(method, stiffness, 0.9 * limit).is_stable
+    assert tool_mass.worst_hand(method, stiffness, 1.1 * limit).is_stable
+    assert tool_mass.worst_hand("implicit", stiffness, 0.9 * limit).is_stable
 
 
 def test_implicit_fails_at_no_mass() -> None:
     for mass in (1e-3, 0.1, 10.0):
-        outcome = evaluate(
+        outcome = tool_mass.evaluate(
             {"what": "cell", "method": "implicit", "stiffness": 25_000.0, "mass": mass}
         )
         assert outcome["stable_held_still"] is True
@@ -84,40 +76,40 @@ def test_implicit_fails_at_no_mass() -> None:
 
 @pytest.mark.parametrize("method", ["compensated", "lossless"])
 def test_without_the_lag_no_mass_fails_up_to_twice_b_over_t(method: str) -> None:
-    limit = 2 * DEVICE_DAMPING / PERIOD
-    assert held_still(method, 0.98 * limit, 1e-3).is_stable
+    limit = 2 * tool_mass.DEVICE_DAMPING / tool_mass.PERIOD
+    assert tool_mass.held_still(method, 0.98 * limit, 1e-3).is_stable
     for mass in (2e-3, 5.0):
-        assert worst_hand(method, 0.98 * limit, mass).is_stable
-    assert not worst_hand(method, 1.02 * limit, 5.0).is_stable
+        assert tool_mass.worst_hand(method, 0.98 * limit, mass).is_stable
+    assert not tool_mass.worst_hand(method, 1.02 * limit, 5.0).is_stable
     # the twin that keeps its lag bears a quarter less
-    assert not worst_hand("implicit", 0.98 * limit, 5.0).is_stable
+    assert not tool_mass.worst_hand("implicit", 0.98 * limit, 5.0).is_stable
 
 
 def test_a_light_tool_is_no_help_to_the_lossless_coupling() -> None:
-    limit = 2 * DEVICE_DAMPING / PERIOD
-    assert not worst_hand("lossless", 1.02 * limit, 2e-3).is_stable
-    assert worst_hand("compensated", 1.02 * limit, 2e-3).is_stable
+    limit = 2 * tool_mass.DEVICE_DAMPING / tool_mass.PERIOD
+    assert not tool_mass.worst_hand("lossless", 1.02 * limit, 2e-3).is_stable
+    assert tool_mass.worst_hand("compensated", 1.02 * limit, 2e-3).is_stable
 
 
 def test_a_heavy_tool_on_a_soft_coupling_decays() -> None:
     # it swings twice a second: a fifth of 2 s holds less than a swing, and would show growth
-    assert held_still("explicit", 2000.0, 10.0).is_stable
+    assert tool_mass.held_still("explicit", 2000.0, 10.0).is_stable
 
 
 def test_implicitfast_uses_up_the_slack_where_the_spring_outweighs_the_damper() -> None:
     # E_k is K δx² and the slack ½ (K + B/T) δx², whatever the mass
     for stiffness, verdict in ((4000.0, "within slack"), (6000.0, "active")):
-        share = 2 * stiffness / (stiffness + DAMPING / PERIOD)
+        share = 2 * stiffness / (stiffness + tool_mass.DAMPING / tool_mass.PERIOD)
         point: Point = {"what": "cell", "method": "implicitfast"}
         point |= {"stiffness": stiffness, "mass": 0.01}
-        outcome = evaluate(point)
+        outcome = tool_mass.evaluate(point)
         assert outcome["environment"] == verdict
         assert (float(outcome["first_active"]) >= 0) is (verdict == "active")
         assert outcome["slack_share"] == pytest.approx(share, rel=0.02)
 
 
 def test_where_no_mass_is_stable_theory_has_no_limit() -> None:
-    nowhere = predicted_limit("explicit", 40_000.0, is_held=False)
+    nowhere = tool_mass.predicted_limit("explicit", 40_000.0, is_held=False)
     assert (nowhere["stable_if_light"], nowhere["stable_if_heavy"]) == (False, False)
     assert np.isnan(nowhere["limit"])
 
@@ -130,7 +122,7 @@ def is_kept(point: Point) -> bool:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(TOOL_MASS, tmp_path, 16, is_kept)
+    boundary = boundary_of(tool_mass.TOOL_MASS, tmp_path, 16, is_kept)
     methods = boundary["methods"]
     assert methods["implicit"]["unstable_held_still"] == 0
     assert methods["explicit"]["unstable_held_still"] > 0
@@ -138,4 +130,4 @@ def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
 
 def test_a_method_without_theory_is_refused() -> None:
     with pytest.raises(StudyError, match="no theory for method 'weld'"):
-        min_mass("weld", 1000.0, 1.0, 1e-3)
+        tool_mass.min_mass("weld", 1000.0, 1.0, 1e-3)

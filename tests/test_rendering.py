@@ -28,11 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import (
-    default_coupling,
-    required_damping,
-    run_conditions,
-)
+from hapticbridge.certificate import default_coupling, required_damping, run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
@@ -242,8 +238,6 @@ def test_contact_force_of_a_massless_tool_is_its_stiffness_times_penetration() -
     [
         ("direct", 0.98, "passive"),
         ("direct", 1.2, "active"),
-        ("implicit", 0.98, "passive"),
-        ("implicit", 1.2, "passive"),
         ("implicit", 2.0, "passive"),
     ],
 )
@@ -428,8 +422,10 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
     assert abs(binding.state["energy"]["external_work"][0]) > 1e-5
 
 
-@pytest.mark.parametrize("substeps", [2, 4, 8])
-def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) -> None:
+@pytest.mark.parametrize("substeps", [1, 2, 4, 8])
+def test_free_mass_follows_implicit_euler_and_the_mean_wrench_does_the_work_of_all(
+    substeps: int,
+) -> None:
     """So a free mass is strict: Σ E = −Σ ½ m (Δv)², step by step, whatever the substeps."""
     run = rendered("implicit", COUPLING, sway(500), substeps=substeps)
     assert run.ticks["environment_energy"].max() <= 0

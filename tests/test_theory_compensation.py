@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -91,3 +93,21 @@ def test_largest_felt_damping_is_what_device_just_bears(k: float, b: float, sche
         return
     assert needed_for_felt(k, most, T, LAGS[scheme]) == pytest.approx(b)
     assert needed_for_felt(k, 1.01 * most, T, LAGS[scheme]) > b
+
+
+def test_a_device_that_bears_the_larger_damping_bears_any_sequence_of_dampings() -> None:
+    """Σ f_k (d_{k+1} − δx_k) + Σ (b/T) d_k² + ½K d_1² >= 0 from e_0 = 0, for any motions."""
+    random = np.random.default_rng(3)
+    stiffness, low, high = 2400.0, 0.5, 1.7
+    device = 0.5 * stiffness * T + high
+    for trial, count in itertools.product(range(20), (2, 20, 200)):
+        law = random.choice([low, high], count)
+        handle = random.normal(size=count + 1)
+        if trial % 2:  # every other at Nyquist, where it is hardest
+            handle = np.abs(handle) * (-1.0) ** np.arange(count + 1)
+        tool = random.normal(size=count) * random.choice([0.0, 0.1, 1.0])
+        moved = handle[:-1] - tool
+        force = stiffness * np.cumsum(moved) + law / T * moved
+        burnt = device / T * np.sum(handle**2)
+        work = np.sum(force * (handle[1:] - tool)) + 0.5 * stiffness * handle[0] ** 2
+        assert work + burnt >= -1e-9 * burnt

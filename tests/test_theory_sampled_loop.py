@@ -86,12 +86,6 @@ def test_too_light_a_tool_is_unstable_whatever_the_device(
         assert limit == pytest.approx(bound, rel=SHARE)
 
 
-def test_undamped_tool_between_samples_is_no_stable_tool() -> None:
-    loop = SampledLoop(coupling(1000, 0), 1e-3, mass=0.05, integrator="semi_implicit")
-    assert stability_limit(loop) == math.inf
-    assert stability_limit(replace(loop, integrator="implicit")) < 0.5
-
-
 @settings(max_examples=50)
 @given(
     st.floats(0.1, 20),
