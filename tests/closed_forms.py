@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from hapticbridge.theory.rigid_body import exact_mass_response
 
 
 def swing_from_rest(
-    times: NDArray[np.float64], coupling: Coupling, mass: float, frequency: float = 2.0
+    times: NDArray[np.floating[Any]], coupling: Coupling, mass: float, frequency: float = 2.0
 ) -> NDArray[np.float64]:
     """Returns a mass's path behind a handle that begins to swing as sin(2π f t)."""
     omega = 2 * np.pi * frequency

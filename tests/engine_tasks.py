@@ -62,7 +62,7 @@ def driven_error(engine: Engine, timestep: float, mass: float = MASS) -> float:
     """RMS error of the driven mass's position as a share of the handle's amplitude."""
     path = driven_path(engine, timestep, mass) / AMPLITUDE
     times = np.arange(path.size) * timestep
-    return float(np.sqrt(np.mean((path - swing_from_rest(times, COUPLING, MASS)) ** 2)))
+    return float(np.sqrt(np.mean(np.subtract(path, swing_from_rest(times, COUPLING, MASS)) ** 2)))
 
 
 FLOOR = Shape("box", (0.2, 0.2, 0.05), (0.0, 0.0, -0.05))

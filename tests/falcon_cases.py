@@ -31,7 +31,7 @@ class Bench:
         self.told: list[str] = []
 
     def opened(self, **options: Any) -> FalconDevice:
-        return FalconDevice(self.link, tell=self.told.append, **options)
+        return FalconDevice(self.link, notify=self.told.append, **options)
 
     def clock(self, drift: float = 0.0) -> VirtualClock:
         clock = VirtualClock(self.time, drift)

@@ -9,7 +9,7 @@ from emulated.pid_layouts import ODD, USUAL, Report
 from emulated.pid_model import PidStick
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid.device import PidDevice, open_pid
 
 PERIOD = 1e-3

@@ -6,7 +6,7 @@ from emulated.hid_seam import HidSeam
 from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 
 PERIOD = 1e-3

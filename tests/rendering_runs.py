@@ -71,7 +71,7 @@ def rendered(
         coupling,
         substeps=substeps,
         scheme=chosen.scheme,
-        felt=felt,
+        effective=felt,
         contact_stiffness=resolve_contact_stiffness(chosen, coupling, contact_stiffness),
         **changes,
     )
@@ -109,8 +109,8 @@ class Rotor(SimulatedDevice):
         )
         self.info = replace(self.info, is_real=is_real)
 
-    def start(self, period: float) -> NDArray[np.void]:
-        sample = super().start(period)
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        sample = super().start(period, parts)
         self.displace(np.array([0, 0, 0, 0, 1e-6, 0]))
         return sample
 
@@ -119,7 +119,7 @@ COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 
 
 FREE = Limits(
-    force=100.0, torque=10.0, rise=0.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
+    force=100.0, torque=10.0, slew_time=0.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
 )
 
 

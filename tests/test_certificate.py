@@ -14,7 +14,7 @@ from hapticbridge.certificate import (
     default_coupling,
     delay_ticks,
     device_conditions,
-    felt_period,
+    device_period,
     is_certified,
 )
 from hapticbridge.coupling import Coupling
@@ -38,10 +38,10 @@ def test_a_delay_counts_in_whole_ticks_upwards(delay: float | None, ticks: int |
 
 
 def test_a_device_slower_than_the_loop_is_judged_by_its_own_period() -> None:
-    assert felt_period(info(rate=500.0), T) == 2e-3
-    assert felt_period(info(rate=4000.0), T) == T
-    assert felt_period(info(rate=None), T) == T
-    assert felt_period(info(rate=500.0, is_prescribed=True), T) == T
+    assert device_period(info(rate=500.0), T) == 2e-3
+    assert device_period(info(rate=4000.0), T) == T
+    assert device_period(info(rate=None), T) == T
+    assert device_period(info(rate=500.0, is_prescribed=True), T) == T
     (slow,) = device_conditions(info(rate=500.0), SPRING, T, 1.0, 1.0)
     assert slow.needed == pytest.approx(SPRING.stiffness * 2e-3 / 2)
 
@@ -93,7 +93,7 @@ def test_the_default_coupling_meets_the_condition_with_margin(
 ) -> None:
     late = info(delay=delay)
     felt = default_coupling(late, period, *scales, laws)
-    coupling = default_method(laws).used(felt, period / laws)
+    coupling = default_method(laws).law_coupling(felt, period / laws)
     conditions = device_conditions(late, coupling, period, *scales, laws)
     for condition in conditions:
         assert condition.needed <= NEEDED_SHARE * (condition.available or 0.0) * (1 + 1e-6)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid import device as driver
 from hapticbridge.device.pid import device as sheet
 from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import (
-    FAMILY,
+    DRIVER,
     HELD,
     Buttons,
     Deflection,
@@ -216,8 +216,8 @@ CADMOUSE = (0xC650, 0xC651, *range(0xC654, 0xC659), 0xC664, 0xC665, 0xC668)
 
 
 def test_flat_mice_of_the_same_maker_are_not_taken_for_one() -> None:
-    products = {(usb_id.vendor, usb_id.product) for usb_id in FAMILY.ids}
-    assert len(products) == len(FAMILY.ids) == 22
+    products = {(usb_id.vendor, usb_id.product) for usb_id in DRIVER.ids}
+    assert len(products) == len(DRIVER.ids) == 22
     assert not products & {(0x256F, product) for product in CADMOUSE}
     assert {(0x046D, 0xC626), (0x256F, 0xC635), (0x256F, 0xC652)} <= products
 

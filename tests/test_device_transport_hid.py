@@ -15,7 +15,7 @@ from emulated.hid_seam import HidSeam
 from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import StallError
 
-from hapticbridge.device.family import Driver, FoundDevice, UsbId
+from hapticbridge.device.driver import Driver, FoundDevice, UsbId
 from hapticbridge.device.rawhid.device import open_rawhid
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import hid as transport_hid
@@ -31,7 +31,7 @@ ECHO = Driver(
     axes="",
     force="",
     rate="",
-    options=(),
+    options={},
     open=open_rawhid,
 )
 
@@ -303,7 +303,7 @@ def test_without_hidapi_nothing_is_found_or_opened(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(transport_hid, "hid_api", lambda: None)
     assert find(ECHO) == []
     plugged = FoundDevice(
-        family="echo", name="Echo", serial="", path="/x", vendor=1, product=2, transport="hid",
+        driver="echo", name="Echo", serial="", path="/x", vendor=1, product=2, transport="hid",
         problem=None,
     )  # fmt: skip
     with pytest.raises(DeviceError, match="hidapi is not installed"):
@@ -329,7 +329,7 @@ def test_a_read_through_the_real_module_of_a_node_that_is_not_there_is_refused()
     api: HidApi | None = hid_search.hid_api()
     assert api is not None
     plugged = FoundDevice(
-        family="rawhid", name="none", serial="", path="/dev/hidraw99", vendor=1, product=2,
+        driver="rawhid", name="none", serial="", path="/dev/hidraw99", vendor=1, product=2,
         transport="hid", problem=None,
     )  # fmt: skip
     with pytest.raises(DeviceError, match="cannot be opened"):

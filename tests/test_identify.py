@@ -220,7 +220,7 @@ def test_a_position_without_steps_has_none() -> None:
     ],
 )
 def test_an_estimate_tells_no_digits_that_mean_nothing(estimate: Estimate, told: str) -> None:
-    assert estimate.told() == told
+    assert estimate.as_text() == told
 
 
 STILL = Motion([0.0, 100.0], np.zeros((2, 3)))
@@ -371,7 +371,7 @@ def test_a_hand_that_only_damps_is_told_to_be_beyond_what_can_be_seen() -> None:
 
 
 def test_an_interval_that_reaches_farther_down_says_so() -> None:
-    assert Estimate(1.5, 0.01, 0.04).told() == "1.5 +0.01 −0.05"
+    assert Estimate(1.5, 0.01, 0.04).as_text() == "1.5 +0.01 −0.05"
     assert Estimate(1.5, 0.01, 0.04).least == pytest.approx(1.45)
     assert Estimate(1.5, 0.01, 0.04).most == pytest.approx(1.51)
     assert Estimate(0.02, 0.01).is_seen and Estimate(-0.02, 0.01).is_seen

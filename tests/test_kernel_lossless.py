@@ -107,16 +107,18 @@ def test_energy_that_turning_creates_is_given_back() -> None:
 
 def test_damping_used_is_what_the_integration_leaves_and_never_negative() -> None:
     asked = Coupling(1000.0, 5.0, 2.0, 0.0015)
-    used = METHODS["compensated"].used(asked, T)
+    used = METHODS["compensated"].law_coupling(asked, T)
     assert (used.damping, used.rotational_damping) == (4.0, 0.0)
-    used = LOSSLESS.used(asked, T)
+    used = LOSSLESS.law_coupling(asked, T)
     assert used.damping == 4.5
     assert used.rotational_damping == pytest.approx(0.0005)
-    assert LOSSLESS.rendered(used, T) == asked
-    soft = LOSSLESS.used(Coupling(1000.0, 0.1, 2.0, 0.0015), T)
+    assert LOSSLESS.requested_coupling(used, T) == asked
+    soft = LOSSLESS.law_coupling(Coupling(1000.0, 0.1, 2.0, 0.0015), T)
     assert soft.damping == 0.0
-    assert LOSSLESS.rendered(soft, T).damping == 0.5  # the least that this K and T can show
-    assert METHODS["implicit"].used(asked, T) is asked
+    assert (
+        LOSSLESS.requested_coupling(soft, T).damping == 0.5
+    )  # the least that this K and T can show
+    assert METHODS["implicit"].law_coupling(asked, T) is asked
 
 
 FLOOR = """
@@ -151,7 +153,7 @@ def stays(loop: ClosedLoop, asked: Coupling, method: str, hand: WorstHand, axis:
 )
 def test_worst_hand_needs_half_kt_and_the_damping_used(method: str, scene: str, axis: int) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    used = METHODS[method].used(asked, T)
+    used = METHODS[method].law_coupling(asked, T)
     loop = ClosedLoop(load(scene))
     for share in (0.98, 1.02):
         hand = WorstHand(share * (0.5 * used.stiffness * T + used.damping), np.pi / T, T)
@@ -164,7 +166,7 @@ def test_free_tool_needs_what_its_spectrum_says_and_less_than_a_wall(
     method: str, mass: float
 ) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    theory = SampledLoop(METHODS[method].used(asked, T), T, mass)
+    theory = SampledLoop(METHODS[method].law_coupling(asked, T), T, mass)
     worst = theory.worst_frequency()
     needed = float(theory.damping_spectrum(worst))
     assert needed < 0.5 * 1.0 + theory.coupling.damping  # K T/2 + B', which a wall needs
@@ -217,7 +219,7 @@ def test_touch_and_go_errs_by_a_share_of_implicit(
     lossless = error("lossless", felt)
     assert lossless / error("implicit", felt) == pytest.approx(same_felt, rel=0.05)
     # with the same B', so that both need the same device
-    assert lossless / error("implicit", LOSSLESS.used(felt, T)) == pytest.approx(
+    assert lossless / error("implicit", LOSSLESS.law_coupling(felt, T)) == pytest.approx(
         same_device, rel=0.05
     )
 
@@ -259,7 +261,7 @@ ARM = """
 
 def bound(scene: Scene, method: str, asked: Coupling, period: float) -> BoundKernel:
     """Returns a kernel bound to a scene at its start, rendering what is asked for."""
-    used = METHODS[method].used(asked, period)
+    used = METHODS[method].law_coupling(asked, period)
     prepare(scene, asked, period, 1, METHODS[method], warns=False)
     parameters = unlimited(scene, used, period, scheme=METHODS[method].scheme)
     return BoundKernel(scene.model, scene.data, parameters)

@@ -26,7 +26,7 @@ def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
     )
     for mass in (0.005, 0.05):
         other = SampledLoop(coupling, 1e-3, mass=mass, integrator=TWINS[method])
-        mine = tool_mass.felt(method, 1000.0, 2.0, mass, 1e-3, angle)
+        mine = tool_mass.effective_response(method, 1000.0, 2.0, mass, 1e-3, angle)
         np.testing.assert_allclose(mine, other.response(angle / 1e-3), rtol=1e-12)
         needed = environment_minimum_damping(coupling, 1e-3, mass, TWINS[method])
         assert tool_mass.worst_angle(method, 1000.0, 2.0, mass, 1e-3)[1] == pytest.approx(

@@ -164,7 +164,7 @@ def test_an_option_that_cannot_be_is_refused_wherever_it_enters(
         with pytest.raises(CouplingError, match=message):
             required_damping(LIGHT, T, options["substeps"])
         with pytest.raises(CouplingError, match=message):
-            default_coupling(SimulatedDevice().info, T, laws=options["substeps"])
+            default_coupling(SimulatedDevice().info, T, law_evaluations=options["substeps"])
         with pytest.raises(HapticBridgeError, match=message):
             ClosedLoop(load_scene("point_mass")).run(
                 SimulatedDevice(), LIGHT, METHODS["implicit"], **options
@@ -491,7 +491,7 @@ def test_wrench_of_the_weld_is_what_moves_the_tool() -> None:
     scene = load(TURNED_TOOL)
     felt = prepare(scene, COUPLING, T, 1, method)
     run = rendered("weld", COUPLING, samples, TURNED_TOOL)
-    assert felt == run.parameters.felt
+    assert felt == run.parameters.effective
     model, data = scene.model, scene.data
     binding = BoundKernel(model, data, run.parameters)
     jacobian = np.zeros((6, model.nv))
@@ -653,7 +653,7 @@ def test_weld_affords_no_slack_and_is_told_by_its_stiffest_axis() -> None:
     )
     run = rendered("weld", COUPLING, waved(50), flat)
     assert run.ledger.slack == 0
-    felt = run.parameters.felt
+    felt = run.parameters.effective
     assert felt is not None
     largest = 0.1 / 3 * (0.05**2 + 0.005**2)
     assert felt.rotational_stiffness == pytest.approx(largest * 2000 / 0.05, rel=1e-6)

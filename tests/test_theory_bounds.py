@@ -79,6 +79,7 @@ SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")
 INTEGRATORS: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
 WALL = Coupling(1000, 1, 0, 0)
 EYE = np.eye(2)
+RAGGED: Any = [[1, 2], [3]]
 UNKNOWN = SimpleNamespace(damping=1.0, friction=None, resolution=0.0)
 THETA = np.union1d(np.linspace(1e-4, np.pi, 8001), np.geomspace(1e-5, 1, 2001))
 stiffnesses = st.floats(1, 1e5)
@@ -246,7 +247,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: matrix_margin(-EYE, EYE, EYE, T), "stiffness has the eigenvalue -1; all must be >= 0"),
     (lambda: matrix_margin(EYE, [[1, 2], [2, 1]], EYE, T), "damping has the eigenvalue -1"),
     (lambda: matrix_margin([[np.nan, 0], [0, 1]], EYE, EYE, T), "stiffness is nan"),
-    (lambda: matrix_margin(EYE, EYE, [[1, 2], [3]], T), "device damping is .* must be numbers"),
+    (lambda: matrix_margin(EYE, EYE, RAGGED, T), "device damping is .* must be numbers"),
     (lambda: matrix_margin(EYE, EYE, np.zeros((0, 0)), T), "device damping is an empty array"),
     (lambda: matrix_margin(np.ones((2, 1, 1)), np.ones((3, 1, 1)), 1.0, T), "do not broadcast"),
     (lambda: matrix_margin(EYE, EYE, EYE, T, scale=0.0), "scale is 0"),

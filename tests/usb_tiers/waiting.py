@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from hapticbridge.device.discovery import plugged_devices
-from hapticbridge.device.family import FoundDevice
+from hapticbridge.device.driver import FoundDevice
 
 _Found = TypeVar("_Found")
 
