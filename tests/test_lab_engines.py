@@ -40,6 +40,8 @@ from hapticbridge.pose import quaternion_exp
 from hapticbridge.theory.rigid_body import CoupledScheme, drive_mass, integrate_rotation
 
 NOTHING = (0.0, 0.0, 0.0)
+FRAME = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
+START = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
 SINGLE_PRECISION = {"physx", "physx_spring"}
 SPRINGS = {"ode_spring", "physx_spring"}
 """Engines whose coupling is a spring of their own, solved with the contacts."""
@@ -145,17 +147,15 @@ def test_a_spinning_tool_turns_as_euler_says_to_its_engines_order(engine: Engine
 
 
 def test_force_and_torque_act_at_the_centre_of_mass_in_the_world_frame(engine: Engine) -> None:
-    frame = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
-    start = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
     moments, mass = (1e-4, 2e-4, 2.5e-4), 0.2
-    task = Task("push", Body(mass, moments, frame), start=start)
+    task = Task("push", Body(mass, moments, FRAME), start=START)
     force, torque = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3, -3e-3])
     with opened(engine, task, 1e-3) as simulation:
-        assert simulation.pose().position == pytest.approx(start.position, abs=1e-7)
-        assert simulation.pose().quaternion == pytest.approx(start.quaternion, abs=1e-6)
+        assert simulation.pose().position == pytest.approx(START.position, abs=1e-7)
+        assert simulation.pose().quaternion == pytest.approx(START.quaternion, abs=1e-6)
         simulation.advance(tuple(force), tuple(torque))
         velocity = simulation.velocity()
-    axes = (turn(start.quaternion) * turn(frame.quaternion)).as_matrix()
+    axes = (turn(START.quaternion) * turn(FRAME.quaternion)).as_matrix()
     spin = axes @ (axes.T @ torque / moments) * 1e-3
     # single precision, and in MuJoCo the centre's lever that turns within the step
     assert np.array(velocity.linear) == pytest.approx(force / mass * 1e-3, rel=1e-4)
@@ -163,18 +163,16 @@ def test_force_and_torque_act_at_the_centre_of_mass_in_the_world_frame(engine: E
 
 
 def test_a_moving_tool_starts_with_the_velocity_of_its_centre(engine: Engine) -> None:
-    frame = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
-    start = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
     velocity = Velocity((0.1, -0.2, 0.3), (1.0, 2.0, -3.0))
-    task = Task("move", Body(0.2, (2e-4,) * 3, frame), start=start, start_velocity=velocity)
+    task = Task("move", Body(0.2, (2e-4,) * 3, FRAME), start=START, start_velocity=velocity)
     with opened(engine, task, 1e-4) as simulation:
         assert simulation.velocity().linear == pytest.approx(velocity.linear, rel=1e-6)
         assert simulation.velocity().angular == pytest.approx(velocity.angular, rel=1e-6)
         for _ in range(100):
             simulation.advance(NOTHING, NOTHING)
         pose = simulation.pose()
-    before = start.position + turn(start.quaternion).apply(frame.position)
-    after = pose.position + turn(pose.quaternion).apply(frame.position)
+    before = START.position + turn(START.quaternion).apply(FRAME.position)
+    after = pose.position + turn(pose.quaternion).apply(FRAME.position)
     assert after - before == pytest.approx(0.01 * np.array(velocity.linear), abs=2e-6)
 
 
@@ -218,8 +216,7 @@ def test_a_block_slides_beyond_its_friction_and_not_below(engine: Engine) -> Non
 
 def test_the_wrench_is_the_couplings(engine: Engine) -> None:
     grip = Pose((0.01, 0.02, -0.03), quaternion_exp((0.1, 0.2, -0.3)))
-    start = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
-    task = Task("hold", Body(0.2, (2e-4,) * 3), coupling=COUPLING, grip=grip, start=start)
+    task = Task("hold", Body(0.2, (2e-4,) * 3), coupling=COUPLING, grip=grip, start=START)
     handle = Pose((0.12, 0.19, 0.28), quaternion_exp((-0.1, 0.3, 0.5)))
 
     def grip_of(pose: Pose) -> tuple[np.ndarray, Rotation]:
@@ -245,11 +242,10 @@ def test_the_wrench_is_the_couplings(engine: Engine) -> None:
 def test_a_pull_off_the_centre_turns_the_tool(engine: Engine) -> None:
     mass, moment = 0.2, 2e-3
     frame, grip = Pose((0.01, 0.0, 0.0)), Pose((0.0, 0.05, 0.02))
-    start = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
     body = Body(mass, (moment,) * 3, frame)
-    task = Task("pull", body, coupling=COUPLING, grip=grip, start=start)
-    away = tuple(np.add(composed(start, grip).position, (1e-3, 0.0, 2e-3)))
-    handle = away, composed(start, grip).quaternion
+    task = Task("pull", body, coupling=COUPLING, grip=grip, start=START)
+    away = tuple(np.add(composed(START, grip).position, (1e-3, 0.0, 2e-3)))
+    handle = away, composed(START, grip).quaternion
     with opened(engine, task, 1e-4) as simulation:
         simulation.step(*handle)
         wrench = simulation.wrench()

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from map_runs import boundary_of
 
-from hapticbridge.lab.maps.base import Point, run_map
+from hapticbridge.lab.maps.base import Point
 from hapticbridge.lab.maps.restitution import (
     APPROACH,
     INERTIA,
@@ -102,9 +103,7 @@ def test_newtons_law_is_the_nearest_to_what_rebounds() -> None:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-        files = run_map(RESTITUTION, tmp_path, points=630, executor=executor)
-    assert files.failed == 0
-    by_setting = files.finding.boundary["settings"]
+    boundary = boundary_of(RESTITUTION, tmp_path, 630)
+    by_setting = boundary["settings"]
     assert by_setting["scenes"]["largest_energy_change"] < 0
     assert by_setting["hard spring"]["largest_energy_change"] > 0.1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,26 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from map_runs import recorded_and_audited
+from map_runs import boundary_of
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
-from hapticbridge.lab.maps.base import loop_in, run_map, set_tool_mass
-from hapticbridge.lab.maps.contact import CONTACT, method_runs, points
-from hapticbridge.lab.maps.contact_rigs import (
-    PERIOD,
-    SHIPPED,
-    TREATMENTS,
-    Treatment,
-    peg_device,
-    peg_runs,
-    start_in_hole,
-    ticks_of,
-    wall_runs,
-)
+from hapticbridge.lab.maps import contact_rigs as rigs
+from hapticbridge.lab.maps.base import loop_in, set_tool_mass
+from hapticbridge.lab.maps.contact import CONTACT, method_runs
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.scene import load_scene
 from hapticbridge.scene.contacts import SUGGESTED
 
 LIGHT = [(0.03, 0.0, 1)]
@@ -39,15 +26,15 @@ LIGHT = [(0.03, 0.0, 1)]
 LIGHT_AT_MOUTH = (1000.0, *LIGHT[0])
 """The same in and out of the hole, at 1000 N/m."""
 
-DAMPED = Treatment((SUGGESTED[0] * PERIOD, SUGGESTED[1]))
+DAMPED = rigs.Treatment((SUGGESTED[0] * rigs.PERIOD, SUGGESTED[1]))
 
 
 def test_light_frictionless_peg_goes_beyond_the_slack_as_shipped_and_not_damped() -> None:
-    (shipped,) = peg_runs(Treatment(), 1000.0, LIGHT)
+    (shipped,) = rigs.peg_runs(rigs.Treatment(), 1000.0, LIGHT)
     assert shipped.environment == "active"
     assert shipped.created > 1e-3
     assert 50 < shipped.first_active < 500
-    (damped,) = peg_runs(DAMPED, 1000.0, LIGHT)
+    (damped,) = rigs.peg_runs(DAMPED, 1000.0, LIGHT)
     assert damped.environment == "strict"
     assert damped.created <= 0
     assert damped.first_active == -1
@@ -56,95 +43,46 @@ def test_light_frictionless_peg_goes_beyond_the_slack_as_shipped_and_not_damped(
 
 
 def test_strict_contact_need_not_be_softer_than_the_shipped_one() -> None:
-    hard = TREATMENTS["damped hard: 0.00002 100"]
+    hard = rigs.TREATMENTS["damped hard: 0.00002 100"]
     for k in (1000.0, 6000.0):
-        (run,) = peg_runs(hard, k, LIGHT)
-        (shipped,) = peg_runs(Treatment(), k, LIGHT)
+        (run,) = rigs.peg_runs(hard, k, LIGHT)
+        (shipped,) = rigs.peg_runs(rigs.Treatment(), k, LIGHT)
         assert run.environment == "strict"
         assert run.depth < shipped.depth
 
 
 def test_four_substeps_with_the_rule_in_their_own_steps_are_strict_and_stiffer() -> None:
-    (finer,) = peg_runs(TREATMENTS["4 substeps, 0.0005 4"], 1000.0, LIGHT)
-    (whole,) = peg_runs(DAMPED, 1000.0, LIGHT)
+    (finer,) = rigs.peg_runs(rigs.TREATMENTS["4 substeps, 0.0005 4"], 1000.0, LIGHT)
+    (whole,) = rigs.peg_runs(DAMPED, 1000.0, LIGHT)
     assert finer.environment == "strict"
     assert finer.depth < 0.5 * whole.depth
 
 
 def test_pyramidal_cone_is_active_where_friction_is_low_and_the_elliptic_one_is_not() -> None:
     slippery = [(0.03, 0.1, hand) for hand in (0, 1, 2)]
-    soft = Treatment((0.02, 1.0))
-    pyramidal = list(peg_runs(replace(soft, cone="pyramidal"), 1000.0, slippery))
+    soft = rigs.Treatment((0.02, 1.0))
+    pyramidal = list(rigs.peg_runs(replace(soft, cone="pyramidal"), 1000.0, slippery))
     assert max(run.slack_share for run in pyramidal) > 1.5
     assert max(run.first_active for run in pyramidal) > 0
-    assert {run.environment for run in peg_runs(soft, 1000.0, slippery)} == {"strict"}
-
-
-def test_direct_format_is_the_same_contact_in_other_words() -> None:
-    # k = 1/(timeconst dampratio)², b = 2/timeconst
-    (one,) = peg_runs(Treatment((0.002, 1.0)), 1000.0, LIGHT)
-    (other,) = peg_runs(Treatment((-2.5e5, -1000.0)), 1000.0, LIGHT)
-    assert other.created == pytest.approx(one.created, rel=1e-6)
-    assert other.depth == pytest.approx(one.depth, rel=1e-6)
-
-
-def test_a_row_that_the_step_cannot_resolve_is_replaced_unless_refsafe_is_off() -> None:
-    cases = [(0.05, 0)]
-    (resolved,) = wall_runs(Treatment((0.001, 1.0)), 2000.0, cases)
-    (stiffer,) = wall_runs(Treatment((0.00025, 1.0)), 2000.0, cases)
-    (as_written,) = wall_runs(Treatment((0.00025, 1.0), refsafe=False), 2000.0, cases)
-    assert stiffer.depth == pytest.approx(resolved.depth, rel=1e-3)
-    assert as_written.depth < 0.97 * resolved.depth
+    assert {run.environment for run in rigs.peg_runs(soft, 1000.0, slippery)} == {"strict"}
 
 
 @pytest.mark.parametrize("stiffness", [2000.0, 20_000.0])
 def test_implicitfast_creates_energy_on_a_wall_where_implicit_creates_none(
     stiffness: float,
 ) -> None:
-    implicit = list(wall_runs(DAMPED, stiffness))
+    implicit = list(rigs.wall_runs(DAMPED, stiffness))
     assert {run.environment for run in implicit} == {"strict"}
-    fast = wall_runs(replace(DAMPED, method="implicitfast"), stiffness)
+    fast = rigs.wall_runs(replace(DAMPED, method="implicitfast"), stiffness)
     assert max(run.created for run in fast) > 1e-4
 
 
 def test_bouncing_contact_is_active_on_a_wall_and_a_critically_damped_one_is_not() -> None:
-    (bouncing,) = wall_runs(Treatment((0.02, 0.3)), 2000.0, [(0.05, 1)])
+    (bouncing,) = rigs.wall_runs(rigs.Treatment((0.02, 0.3)), 2000.0, [(0.05, 1)])
     assert bouncing.environment == "active"
     assert bouncing.first_active > 0
-    (damped,) = wall_runs(Treatment((0.02, 2.0)), 2000.0, [(0.05, 1)])
+    (damped,) = rigs.wall_runs(rigs.Treatment((0.02, 2.0)), 2000.0, [(0.05, 1)])
     assert damped.environment == "strict"
-
-
-@pytest.mark.parametrize(("ratio", "verdict"), [(3.0, "active"), (5.0, "passive")])
-def test_the_audit_of_a_bridge_names_the_tick_at_which_the_map_sees_a_contact_create(
-    ratio: float, verdict: str, tmp_path: Path
-) -> None:
-    # at timeconst T/2 a light peg is active up to dampratio 4, strict from 6 on
-    treatment = Treatment((0.5 * PERIOD, ratio))
-    (mapped,) = peg_runs(treatment, 1000.0, LIGHT)
-    ((mass, friction, hand),) = LIGHT
-    scene = load_scene("peg_in_hole")
-    start_in_hole(scene.model)
-    treatment.apply(scene.model, friction)
-    set_tool_mass(scene.model, "peg", mass)
-    mujoco.mj_setConst(scene.model, scene.data)
-    scene.reset()
-    device, coupling = peg_device(1000.0, hand)
-    with warnings.catch_warnings(record=True) as concerns:
-        warnings.simplefilter("always")
-        report = recorded_and_audited(
-            scene, device, coupling, "implicit", PERIOD, ticks_of(device), tmp_path
-        )
-    assert bool(concerns) == (verdict == "active")  # the rule for scenes sees it coming
-    assert report.resimulation == "bit for bit"
-    assert report.certified  # the device is not to blame
-    assert report.verdict == verdict
-    assert report.environment == mapped.environment
-    assert report.slack_share == pytest.approx(mapped.slack_share, rel=1e-6)
-    if verdict == "active":
-        assert (report.tick, report.port) == (mapped.first_active, "environment")
-    else:
-        assert mapped.first_active == -1
 
 
 def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() -> None:
@@ -163,34 +101,31 @@ def test_on_the_same_device_a_jamming_peg_uses_the_same_slack_by_every_method() 
 
 
 def test_a_mass_set_before_leaves_no_trace_in_a_run() -> None:
-    (alone,) = peg_runs(Treatment(), 1000.0, LIGHT)
-    list(peg_runs(Treatment(), 1000.0, [(0.1, 0.0, 1), (0.37, 0.0, 1)]))
-    (after,) = peg_runs(Treatment(), 1000.0, LIGHT)
+    (alone,) = rigs.peg_runs(rigs.Treatment(), 1000.0, LIGHT)
+    list(rigs.peg_runs(rigs.Treatment(), 1000.0, [(0.1, 0.0, 1), (0.37, 0.0, 1)]))
+    (after,) = rigs.peg_runs(rigs.Treatment(), 1000.0, LIGHT)
     assert after == alone
 
 
 def test_map_at_reduced_resolution_agrees_with_the_rule(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def few(treatment: Treatment, stiffness: float, *_: Any) -> Any:
-        return peg_runs(treatment, stiffness, LIGHT)
+    def few(treatment: rigs.Treatment, stiffness: float, *_: Any) -> Any:
+        return rigs.peg_runs(treatment, stiffness, LIGHT)
 
     monkeypatch.setattr(contact, "peg_runs", few)
-    names = (SHIPPED, "damped: 0.0005 8")
+    names = (rigs.SHIPPED, "damped: 0.0005 8")
     monkeypatch.setattr(contact, "HANDS", 1)
-    chosen = [
-        p
-        for p in points(1)
-        if p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names)
-    ]
-    files = run_map(
-        replace(CONTACT, points=lambda _: chosen), tmp_path, executor=ThreadPoolExecutor(2)
+    boundary = boundary_of(
+        replace(CONTACT, points=lambda _: CONTACT.points(1)),
+        tmp_path,
+        4,
+        lambda p: p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names),
     )
-    assert files.failed == 0
-    rule = files.finding.boundary["rule"]
+    rule = boundary["rule"]
     assert rule["strict"]["strict"] == rule["strict"]["cells"] > 0
     assert rule["abrupt"]["strict"] < rule["abrupt"]["cells"]
-    shipped, damped = files.finding.boundary["search"]
+    shipped, damped = boundary["search"]
     assert shipped["active"] > 0
     assert damped["strict"] == damped["runs"]
 
@@ -199,7 +134,7 @@ def test_treatments_reach_the_model_whatever_was_set_before() -> None:
     model = loop_in("virtual_wall", "contact").scene.model
     exact = int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
     safe = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
-    for treatment in [*TREATMENTS.values(), Treatment()]:
+    for treatment in [*rigs.TREATMENTS.values(), rigs.Treatment()]:
         treatment.apply(model, 0.3)
         assert set(model.geom_condim.tolist()) == {treatment.condim}
         assert bool(model.opt.enableflags & exact) == treatment.diagexact
@@ -210,7 +145,7 @@ def test_treatments_reach_the_model_whatever_was_set_before() -> None:
         assert model.opt.o_friction[0] == 0.3
 
 
-def wall_depths(treatment: Treatment) -> Any:
+def wall_depths(treatment: rigs.Treatment) -> Any:
     """Returns the depth in m of 50 g that a hand presses hard for 1.5 s and then lightly."""
     loop = loop_in("virtual_wall", "contact")
     treatment.apply(loop.scene.model, 0.0)
@@ -238,7 +173,7 @@ def test_a_damped_contact_comes_back_with_the_relaxation_time_that_the_rule_is_a
 @pytest.mark.parametrize("name", ["damped: 0.0005 8", "MuJoCo's default 0.02 1"])
 def test_steady_depth_is_as_many_times_the_shipped_one_as_said(name: str) -> None:
     # the impedance rises with depth, so that deep contacts are stiffer than d₀ says
-    shipped, other = wall_depths(Treatment()), wall_depths(TREATMENTS[name])
+    shipped, other = wall_depths(rigs.Treatment()), wall_depths(rigs.TREATMENTS[name])
     ratio = float(other[-1] / shipped[-1])
-    said = TREATMENTS[name].static_depth
+    said = rigs.TREATMENTS[name].static_depth
     assert 0.35 * said < ratio < 1.05 * said

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from kernel_runs import Array, unlimited
+from closed_forms import swing_from_rest
+from kernel_runs import Array, T, load, unlimited
 from rendering_runs import FREE_MASS
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.trajectory import pose_at, read_motion
@@ -31,29 +29,17 @@ from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 # --- accuracy -------------------------------------------------------------------------------------
 
 
-def response_from_rest(t: Array, stiffness: float, damping: float, mass: float = 1.0) -> Array:
-    """x(t) of a mass behind K and B when the handle starts as 20 mm sin(2π 2 Hz t); closed form."""
-    w, size = 2 * np.pi * 2.0, 0.02
-    law = stiffness + 1j * w * damping
-    steady = size * law / (law - mass * w * w)
-    roots = np.roots([mass, damping, stiffness])
-    start = np.array([-steady.imag, -(1j * w * steady).imag])
-    own = np.linalg.solve(np.array([[1, 1], roots]), start)
-    moved = (steady * np.exp(1j * w * t)).imag
-    return np.asarray(moved + (np.exp(np.outer(t, roots)) @ own).real)
-
-
-def test_one_mass_is_followed_to_second_order_without_creating_energy(tmp_path: Path) -> None:
-    scene = scene_of(FREE_MASS.format(mass=1.0), tmp_path)
-    errors = {}
+def test_one_mass_is_followed_to_second_order_without_creating_energy() -> None:
+    scene = load(FREE_MASS.format(mass=1.0))
+    errors, asked = {}, Coupling(1000.0, 5.0, 1.0, 0.005)
     for method in ("implicit", "compensated", "lossless"):
         for period in (4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4):
             t: Array = period * np.arange(1, round(2.0 / period) + 1, dtype=np.float64)
             path = np.zeros((t.size, 3))
             path[:, 0] = 0.02 * np.sin(2 * np.pi * 2.0 * t)
-            rows, _ = led(scene, method, Coupling(1000.0, 5.0, 1.0, 0.005), path, period)
+            rows, _ = led(scene, method, asked, path, period)
             assert rows["environment_energy"].max() <= 1e-12
-            error = rows["tool_position"][:, 0] - response_from_rest(t, 1000.0, 5.0)
+            error = rows["tool_position"][:, 0] - 0.02 * swing_from_rest(t, asked, 1.0)
             errors[method, period] = float(np.sqrt(np.mean(error**2)) / 0.02)
     assert errors["implicit", 1e-3] == pytest.approx(0.0133, rel=0.01)  # THEORY's table
     assert errors["compensated", 1e-3] == pytest.approx(0.00114, rel=0.01)
@@ -74,14 +60,14 @@ def test_one_mass_is_followed_to_second_order_without_creating_energy(tmp_path: 
     ],
 )
 def test_turning_tool_and_arm_are_followed_to_second_order(
-    name: str, away: float, turned: float, lost: float, tmp_path: Path
+    name: str, away: float, turned: float, lost: float
 ) -> None:
     # in m and rad; how many times less energy is lost at half the step
     asked = Coupling(1000.0, 5.0, 0.0, 0.0)
     xml = ARM.format(gravity=0, spring=0) if name == "arm" else ARM.format(gravity=-9.81, spring=2)
     if name == "spun":
         asked, xml = Coupling(1000.0, 5.0, 5.0, 0.02), SPUN
-    scene = scene_of(xml, tmp_path)
+    scene = load(xml)
 
     def run(method: str, period: float) -> np.ndarray:
         path = circling(period, 3.0 if name == "spun" else 4.0)
@@ -103,23 +89,9 @@ def test_turning_tool_and_arm_are_followed_to_second_order(
     assert loss / less == pytest.approx(lost, abs=0.15)
 
 
-def test_default_couplings_are_rendered_ten_times_better_than_by_implicit(tmp_path: Path) -> None:
-    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
-    t: Array = T * np.arange(1, 2001, dtype=np.float64)
-    path = np.zeros((t.size, 3))
-    path[:, 0] = 0.02 * np.sin(2 * np.pi * 2.0 * t)
-    errors = {}
-    for method in ("implicit", "lossless"):
-        asked = default_coupling(SimulatedDevice().info, T, method=METHODS[method])
-        rows, _ = led(scene, method, asked, path, T)
-        felt = response_from_rest(t, asked.stiffness, asked.damping, 0.1)
-        errors[method] = float(np.sqrt(np.mean((rows["tool_position"][:, 0] - felt) ** 2)))
-    assert 10 * errors["lossless"] < errors["implicit"]
-
-
-def test_energy_that_turning_creates_is_given_back(tmp_path: Path) -> None:
+def test_energy_that_turning_creates_is_given_back() -> None:
     # without a rotational coupling nothing damps the spin: without giving back, Σ E_k is +1e-4 J
-    scene = scene_of(SPUN, tmp_path)
+    scene = load(SPUN)
     asked = Coupling(1000.0, 5.0, 0.0, 0.0)
     rows, ledger = led(scene, "lossless", asked, circling(T, 3.0), T)
     assert ledger.environment == "strict"
@@ -149,27 +121,6 @@ def test_damping_used_is_what_the_integration_leaves_and_never_negative() -> Non
     assert METHODS["implicit"].law_coupling(asked, T) is asked
 
 
-@pytest.mark.parametrize(
-    ("method", "mass"),
-    # an implicit tool yields at Nyquist: there only the wall has this hand as its worst
-    [("lossless", 0.01), ("lossless", 0.1), ("lossless", 1e9), ("compensated", 1e9)],
-)
-@pytest.mark.parametrize("share", [0.97, 1.03])
-def test_worst_hand_needs_half_kt_and_the_damping_used(
-    method: str, mass: float, share: float, tmp_path: Path
-) -> None:
-    # at Nyquist a tool of any mass stands still under the midpoint rule; 1e9 kg is a wall
-    asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    used = METHODS[method].law_coupling(asked, T)
-    needed = share * (0.5 * used.stiffness * T + used.damping)
-    hand = WorstHand(needed, np.pi / T, T)
-    device = SimulatedDevice(damping=needed, hand=hand)
-    loop = ClosedLoop(scene_of(FREE_MASS.format(mass=mass), tmp_path))
-    knock = np.array([1e-3, 0, 0, 0, 0, 0])
-    outcome = loop.run(device, asked, METHODS[method], ticks=2000, knock=knock)
-    assert outcome.is_stable == (share > 1)
-
-
 FLOOR = """
 <mujoco>
   <option cone="elliptic" gravity="0 0 -9.81"/>
@@ -190,29 +141,39 @@ def stays(loop: ClosedLoop, asked: Coupling, method: str, hand: WorstHand, axis:
     return loop.run(device, asked, METHODS[method], ticks=2000, knock=knock).is_stable
 
 
-@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
-def test_tool_on_a_floor_needs_half_kt_and_the_damping_used(method: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("method", "scene", "axis"),
+    [
+        # at Nyquist a tool of any mass stands still under the midpoint rule; 1e9 kg is a wall
+        *(("lossless", FREE_MASS.format(mass=mass), 0) for mass in (0.01, 0.1, 1e9)),
+        # an implicit tool yields at Nyquist: there only the wall has this hand as its worst
+        ("compensated", FREE_MASS.format(mass=1e9), 0),
+        *((method, FLOOR, 2) for method in ("implicit", "compensated", "lossless")),
+    ],
+)
+def test_worst_hand_needs_half_kt_and_the_damping_used(method: str, scene: str, axis: int) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
     used = METHODS[method].law_coupling(asked, T)
-    loop = ClosedLoop(scene_of(FLOOR, tmp_path))
-    for share in (0.98, 1.01):
+    loop = ClosedLoop(load(scene))
+    for share in (0.98, 1.02):
         hand = WorstHand(share * (0.5 * used.stiffness * T + used.damping), np.pi / T, T)
-        assert stays(loop, asked, method, hand, 2) == (share > 1)
+        assert stays(loop, asked, method, hand, axis) == (share > 1)
 
 
 @pytest.mark.parametrize("mass", [0.01, 0.1])
-def test_free_tool_behind_the_compensated_coupling_needs_what_its_spectrum_says(
-    mass: float, tmp_path: Path
+@pytest.mark.parametrize("method", ["implicit", "compensated"])
+def test_free_tool_needs_what_its_spectrum_says_and_less_than_a_wall(
+    method: str, mass: float
 ) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    theory = SampledLoop(METHODS["compensated"].law_coupling(asked, T), T, mass)
+    theory = SampledLoop(METHODS[method].law_coupling(asked, T), T, mass)
     worst = theory.worst_frequency()
     needed = float(theory.damping_spectrum(worst))
-    assert needed < 0.5 * 1.0 + 1.0  # K T/2 + B', which a wall needs
-    loop = ClosedLoop(scene_of(FREE_MASS.format(mass=mass), tmp_path))
-    for share in (0.97, 1.03):
+    assert needed < 0.5 * 1.0 + theory.coupling.damping  # K T/2 + B', which a wall needs
+    loop = ClosedLoop(load(FREE_MASS.format(mass=mass)))
+    for share in (0.98, 1.02):
         hand = WorstHand(share * needed, worst, T, complex(theory.response(worst)))
-        assert stays(loop, asked, "compensated", hand, 0) == (share > 1)
+        assert stays(loop, asked, method, hand, 0) == (share > 1)
 
 
 # --- contact --------------------------------------------------------------------------------------
@@ -267,7 +228,6 @@ def test_touch_and_go_errs_by_a_share_of_implicit(
 
 
 LOSSLESS = METHODS["lossless"]
-T = 1e-3
 
 SPUN = """
 <mujoco>
@@ -297,12 +257,6 @@ ARM = """
   </worldbody>
   <keyframe><key name="home" qpos="0.1 -0.5 1"/></keyframe>
 </mujoco>"""
-
-
-def scene_of(xml: str, folder: Path) -> Scene:
-    path = folder / "scene.xml"
-    path.write_text(xml, encoding="utf-8")
-    return load_scene(path)
 
 
 def bound(scene: Scene, method: str, asked: Coupling, period: float) -> BoundKernel:
@@ -373,42 +327,32 @@ def stepped(
 
 
 @pytest.mark.parametrize("on", ["joint", "body"])
-def test_work_of_an_applied_force_is_metered_and_balanced(on: str, tmp_path: Path) -> None:
-    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
+@pytest.mark.parametrize("is_random", [False, True])
+def test_work_of_an_applied_force_is_metered_and_creates_nothing(on: str, is_random: bool) -> None:
+    scene = load(FREE_MASS.format(mass=0.1))
     binding = bound(scene, "lossless", Coupling(1000.0, 5.0, 1.0, 0.005), T)
-    data = scene.data
+    data, random = scene.data, np.random.default_rng(0)
     force = data.qfrc_applied if on == "joint" else data.xfrc_applied[data.body("tool").id]
 
     def push(k: int) -> None:
-        if k in (50, 200):  # set, and set again to another value, as a user's input would
+        if is_random:  # taken whole, as MuJoCo does, this one creates more than the slack allows
+            force[:3] = random.normal(size=3) * 5 * (k > 0)
+        elif k in (50, 200):  # set, and set again to another value, as a user's input would
             force[0] = 2.0 if k == 50 else -1.0
 
     rows = stepped(binding, scene, 1000, push)
+    assert np.abs(np.diff(rows["environment_energy"])).max() < 1e-12
+    if is_random:
+        assert np.abs(np.diff(rows["external_work"])).max() > 1e-5
+        return
     assert np.abs(rows["environment_energy"]).max() < 1e-12
     # at rest the spring holds the force: 1 N at 1000 N/m
     assert rows["tool_position"][-1, 0] == pytest.approx(-1e-3, rel=1e-3)
     assert rows["external_work"][-1] == pytest.approx(2 * 2e-3 + 1.0 * 3e-3, rel=2e-2)
 
 
-@pytest.mark.parametrize("on", ["joint", "body"])
-def test_a_force_that_varies_at_every_tick_creates_nothing(on: str, tmp_path: Path) -> None:
-    # taken whole, as MuJoCo does, this one creates more than the slack allows
-    scene = scene_of(FREE_MASS.format(mass=0.1), tmp_path)
-    binding = bound(scene, "lossless", ASKED, T)
-    data, random = scene.data, np.random.default_rng(0)
-    force = data.qfrc_applied if on == "joint" else data.xfrc_applied[data.body("tool").id]
-
-    def push(k: int) -> None:
-        if k > 0:
-            force[:3] = random.normal(size=3) * 5
-
-    rows = stepped(binding, scene, 1000, push)
-    assert np.abs(np.diff(rows["environment_energy"])).max() < 1e-12
-    assert np.abs(np.diff(rows["external_work"])).max() > 1e-5
-
-
 @pytest.mark.parametrize("joint", ["shoulder", "elsewhere"])
-def test_a_tool_with_a_motor_of_its_own_stays_implicit(joint: str, tmp_path: Path) -> None:
+def test_a_tool_with_a_motor_of_its_own_stays_implicit(joint: str) -> None:
     # lossless, this servo creates 8 mJ in 1 s
     extra = (
         '<body pos="0 0 1"><joint name="elsewhere"/><geom type="sphere" size="0.01"/></body>'
@@ -417,13 +361,13 @@ def test_a_tool_with_a_motor_of_its_own_stays_implicit(joint: str, tmp_path: Pat
     )
     xml = ARM.format(gravity=-9.81, spring=0).replace("</worldbody>", extra)
     xml = xml.replace("<joint axis", '<joint name="shoulder" axis', 1)
-    rows, ledger = led(scene_of(xml, tmp_path), "lossless", ASKED, circling(T, 4.0), T)
+    rows, ledger = led(load(xml), "lossless", ASKED, circling(T, 4.0), T)
     assert ledger.environment == "strict"
     is_free = (rows["flags"] & int(TickFlag.MIDPOINT)) != 0
     assert is_free.any() == (joint == "elsewhere")
 
 
-# --- without it -----------------------------------------------------------------------------------
+# --- changing over --------------------------------------------------------------------------------
 
 
 def samples_for(name: str) -> np.ndarray:
@@ -441,63 +385,20 @@ def samples_for(name: str) -> np.ndarray:
     return samples
 
 
-def created(name: str, method: str, *, is_seen: bool = True) -> tuple[float, str]:
-    """Returns the largest Σ E_k in J of a scene without friction, and the ledger's verdict."""
+@pytest.mark.parametrize("name", ["virtual_wall", "planar_peg", "peg_in_hole"])
+def test_changing_over_creates_no_more_energy_than_the_implicit_contact_does(name: str) -> None:
     scene = load_scene(name)
     scene.model.geom_condim[:] = 1  # jamming bifurcates: with friction nothing can be ranked
-    samples = samples_for(name)
-    binding = bound(scene, method, Coupling(6000.0, 3.5, 6.0, 0.0017), T)
-    if not is_seen:  # nothing of the scene belongs to the tool's tree, so nothing is near it
-        binding._owned["geom_in_tree"][:] = 0
-    rows = np.zeros(len(samples), TICK_DTYPE)
-    assert simulate(binding.state, samples, binding.row, rows) == len(samples)
-    return float(rows["environment_energy"].max()), Ledger.of(binding.state).environment
-
-
-@pytest.mark.parametrize("name", ["virtual_wall", "planar_peg"])
-def test_without_the_change_over_a_strict_contact_creates_energy(name: str) -> None:
-    most, verdict = created(name, "lossless")
-    assert verdict == "strict"
-    assert most < 1e-12
-    most, verdict = created(name, "lossless", is_seen=False)
-    assert verdict == "within slack"
-    assert most > 2e-5  # 43 µJ on the peg, 0.4 mJ on the wall
-
-
-def test_without_the_change_over_a_jamming_peg_creates_more_than_implicit() -> None:
-    # several contacts create energy in the implicit form already, 7.0 mJ; 5.1 and 8.4 mJ
-    implicit, _ = created("peg_in_hole", "implicit")
-    assert created("peg_in_hole", "lossless")[0] < implicit
-    assert created("peg_in_hole", "lossless", is_seen=False)[0] > 1.1 * implicit
-
-
-def struck(method: str) -> tuple[Array, float, Array]:
-    """Lets 30 g strike the wall with the B' of ``lossless``, so stiffly held that energy is made.
-
-    Returns:
-        Σ E_k before the first contact, J, its largest rise from there, and the tool's position, m.
-    """
-    scene = load_scene("virtual_wall")
-    scene.model.body_mass[scene.model.body("tool").id] = 0.03
-    mujoco.mj_setConst(scene.model, scene.data)
-    law = METHODS["lossless"].law_coupling(Coupling(6000.0, 7.5, 1.0, 0.002), T)
-    path = tapping(T, 5.0)[:100]
-    rows, _ = led(scene, method, METHODS[method].requested_coupling(law, T), path, T)
-    first = int(np.argmax(rows["contacts"] > 0))
-    energy: Array = rows["environment_energy"]
-    return energy[:first], float(energy.max() - energy[first - 1]), rows["tool_position"][:, 0]
-
-
-def test_a_strike_makes_what_implicit_makes_but_implicit_has_burned_some_before() -> None:
-    # so of the slack lossless uses 4.9 %, implicit 4.7 %
-    (before, made, place), (burned, by_implicit, other) = struck("lossless"), struck("implicit")
-    assert place.max() == pytest.approx(other.max(), rel=1e-2)
-    assert made > 5e-4
-    assert made == pytest.approx(by_implicit, rel=0.01)
-    assert burned[-1] < -2e-5
-    assert np.abs(before).max() < -0.01 * burned[-1]
-    # what is made beyond (14) differs by no more than that
-    assert 0 < made + before[-1] - by_implicit - burned[-1] < -burned[-1]
+    created = {}
+    for method in ("implicit", "lossless"):
+        binding = bound(scene, method, Coupling(6000.0, 3.5, 6.0, 0.0017), T)
+        samples = samples_for(name)
+        rows = np.zeros(len(samples), TICK_DTYPE)
+        assert simulate(binding.state, samples, binding.row, rows) == len(samples)
+        created[method] = float(rows["environment_energy"].max())
+        assert name == "peg_in_hole" or Ledger.of(binding.state).environment == "strict"
+    # the jamming peg creates energy in the implicit form already: 7.0 mJ, and 5.1 mJ
+    assert created["lossless"] < max(created["implicit"], 1e-12)
 
 
 # --- equal damping on both sides ------------------------------------------------------------------
@@ -562,52 +463,6 @@ def test_unequal_damping_makes_a_limit_cycle_that_equal_damping_does_not() -> No
     assert verdict == "strict"
 
 
-@pytest.mark.parametrize("more", [-0.4, 0.3, HALF])
-def test_unequal_damping_comes_to_rest_where_the_device_bears_both_sides(more: float) -> None:
-    force, _, verdict = pressed(more, 1.03 * (HALF + FREE + max(more, 0.0)))
-    assert force[-500:] == pytest.approx(PUSH, abs=1e-9)
-    assert verdict == "strict"
-
-
-def balance(law: Array, handle: Array, tool: Array, device: float) -> float:
-    """Σ f_k (d_{k+1} − δx_k) + Σ (b/T) d_{k+1}² + what the spring held, for B' by tick; in J.
-
-    Args:
-        law: B'_k in N s/m, k = 1 … N.
-        handle: d_k in m, k = 1 … N + 1.
-        tool: δx_k in m, k = 1 … N.
-        device: b in N s/m.
-    """
-    moved = handle[:-1] - tool
-    stretch = np.cumsum(moved)
-    force = K * stretch + law / T * moved
-    work = float(np.sum(force * (handle[1:] - tool)))
-    return work + device / T * float(np.sum(handle**2)) + 0.5 * K * float(handle[0] ** 2)
-
-
-def test_a_device_that_bears_the_larger_damping_bears_any_sequence_of_them() -> None:
-    # the inequality in the docstring of ``passivity.compensation``, against random motions
-    random = np.random.default_rng(3)
-    low, high = FREE, FREE + HALF
-    device = HALF + high
-    for trial, count in itertools.product(range(20), (2, 20, 200)):
-        law = random.choice([low, high], count)
-        handle = random.normal(size=count + 1)
-        if trial % 2:  # every other at Nyquist, where it is hardest
-            handle = np.abs(handle) * (-1.0) ** np.arange(count + 1)
-        tool = random.normal(size=count) * random.choice([0.0, 0.1, 1.0])
-        scale = device / T * float(np.sum(handle**2))
-        assert balance(law, handle, tool, device) >= -1e-9 * scale
-    # and it needs that much: the larger all the time, or on average what two ticks on end have
-    nyquist: Array = (-1.0) ** np.arange(2001, dtype=np.float64)
-    wall = np.zeros(2000)
-    assert balance(np.full(2000, high), nyquist, wall, 0.99 * device) < 0
-    taking_turns = np.where(np.arange(2000) % 2, low, high)
-    mean = HALF + 0.5 * (low + high)
-    assert balance(taking_turns, nyquist, wall, 0.99 * mean) < 0
-    assert balance(taking_turns, nyquist, wall, mean) >= 0
-
-
 OUT_AND_BACK: Array = np.concatenate([np.linspace(0, 0.02, 300), np.linspace(0.02, 0, 300)])
 """In m along x, a tick each: at ``STOP`` after 150 ticks, and until 450."""
 STOP = 0.01
@@ -650,37 +505,31 @@ LETS_GO = {
 }
 
 
-def lossless_ticks(scene: tuple[str, str], folder: Path) -> Array:
+def lossless_ticks(scene: tuple[str, str]) -> Array:
     """Leads the slider out and back; returns per tick whether it was lossless."""
     joint, more = scene
     path = np.zeros((OUT_AND_BACK.size, 3))
     path[:, 0] = OUT_AND_BACK
-    rows, _ = led(
-        scene_of(SLIDER.format(joint=joint, more=more), folder), "lossless", ASKED, path, T
-    )
+    rows, _ = led(load(SLIDER.format(joint=joint, more=more)), "lossless", ASKED, path, T)
     return np.asarray((rows["flags"] & int(TickFlag.MIDPOINT)) != 0)
 
 
 @pytest.mark.parametrize("stop", sorted(STOPS))
-def test_a_tool_at_a_limit_is_implicit_and_lossless_before_and_after(
-    stop: str, tmp_path: Path
-) -> None:
-    is_free = lossless_ticks(STOPS[stop], tmp_path)
+def test_a_tool_at_a_limit_is_implicit_and_lossless_before_and_after(stop: str) -> None:
+    is_free = lossless_ticks(STOPS[stop])
     assert is_free[5:140].all()
     assert not is_free[165:440].any()
     assert is_free[480:].all()
 
 
 @pytest.mark.parametrize("hold", sorted(HOLDS))
-def test_a_tool_that_is_always_held_is_never_lossless(hold: str, tmp_path: Path) -> None:
-    assert not lossless_ticks(HOLDS[hold], tmp_path).any()
+def test_a_tool_that_is_always_held_is_never_lossless(hold: str) -> None:
+    assert not lossless_ticks(HOLDS[hold]).any()
 
 
 @pytest.mark.parametrize("other", sorted(LETS_GO))
-def test_a_tool_that_nothing_holds_is_lossless_from_the_second_tick_on(
-    other: str, tmp_path: Path
-) -> None:
-    assert lossless_ticks(LETS_GO[other], tmp_path)[1:].all()
+def test_a_tool_that_nothing_holds_is_lossless_from_the_second_tick_on(other: str) -> None:
+    assert lossless_ticks(LETS_GO[other])[1:].all()
 
 
 CLOTH = """
@@ -697,11 +546,11 @@ CLOTH = """
 </mujoco>"""
 
 
-def test_a_tool_on_a_cloth_is_held_by_it(tmp_path: Path) -> None:
+def test_a_tool_on_a_cloth_is_held_by_it() -> None:
     # a contact with a flex names no geom on that side, and has a gap of its own
     path = np.zeros((400, 3))
     path[:, 2] = -np.linspace(0.0, 0.025, 400)
-    rows, _ = led(scene_of(CLOTH, tmp_path), "lossless", ASKED, path, T)
+    rows, _ = led(load(CLOTH), "lossless", ASKED, path, T)
     touches = (rows["flags"] & int(TickFlag.CONTACT)) != 0
     is_free = (rows["flags"] & int(TickFlag.MIDPOINT)) != 0
     assert touches.any() and is_free.any()

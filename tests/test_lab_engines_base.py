@@ -1,7 +1,9 @@
-"""Tasks for any engine: what they refuse, and what a MuJoCo scene becomes."""
+"""Tasks for any engine: what they refuse, what a scene becomes, what an engine prints."""
 
 from __future__ import annotations
 
+import ctypes
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from hapticbridge.lab.engines.base import (
     Task,
     Velocity,
     available_engines,
+    caught_prints,
     composed,
     open_engine,
 )
@@ -147,17 +150,12 @@ def test_mujoco_as_a_peer_moves_a_scene_as_mujoco_does(scene: Scene, tmp_path: P
     assert abs(quaternion @ data.qpos[3:]) == pytest.approx(1, abs=1e-12)
 
 
+TENDON = '<tendon><spatial><site site="grip"/><site site="o"/></spatial></tendon>'
 REFUSED = {
     "joints": ({"child": '<body><joint/><geom size="0.01"/></body>'}, "2 joint"),
     "bodies": ({"child": '<body><geom size="0.01"/></body>'}, "several bodies"),
     "mocap": ({"world": '<body mocap="true"><geom size="0.01"/></body>'}, "mocap"),
-    "tendon": (
-        {
-            "top": '<tendon><spatial><site site="grip"/><site site="o"/></spatial></tendon>',
-            "world": '<site name="o"/>',
-        },
-        "tendons",
-    ),
+    "tendon": ({"top": TENDON, "world": '<site name="o"/>'}, "tendons"),
     "equality": ({"top": '<equality><weld body1="tool"/></equality>'}, "constraints"),
     "actuator": ({"top": '<actuator><motor joint="tool"/></actuator>'}, "actuators"),
     "pair": ({"top": '<contact><pair geom1="handle" geom2="floor"/></contact>'}, "pairs"),
@@ -254,3 +252,36 @@ def test_an_engine_that_is_not_there_names_what_to_install(monkeypatch: pytest.M
         open_engine("drake_point")
     with pytest.raises(StudyError, match=r"no engine 'havok'; engines: 'drake_hydroelastic'"):
         open_engine("havok")
+
+
+BUFFER = ctypes.create_string_buffer(4096)
+"""C's stdout keeps it as long as the process lives."""
+
+
+def test_prints_of_c_are_told_once_and_kept_from_stdout(capfd: pytest.CaptureFixture[str]) -> None:
+    told: list[str] = []
+    libc = ctypes.CDLL(None)
+    # as where stdout is a pipe: C writes when its memory is full (_IOFBF), or when it is told to
+    libc.setvbuf(ctypes.c_void_p.in_dll(libc, "stdout"), BUFFER, 0, len(BUFFER))
+    with caught_prints(told.append):
+        ctypes.CDLL(None).puts(b"switched solver")
+        ctypes.CDLL(None).puts(b"switched solver")
+        os.write(1, b"\xff raw\n\n")
+    ctypes.CDLL(None).puts(b"after")
+    ctypes.CDLL(None).fflush(None)
+    assert sorted(told) == ["switched solver", "\ufffd raw"]
+    assert capfd.readouterr().out == "after\n"
+
+
+def test_stdout_is_itself_again_after_an_error_and_what_was_printed_is_told(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    told: list[str] = []
+    descriptors = len(list(Path("/dev/fd").iterdir()))
+    with pytest.raises(ZeroDivisionError), caught_prints(told.append):
+        os.write(1, b"last words\n")
+        raise ZeroDivisionError
+    os.write(1, b"after\n")
+    assert told == ["last words"]
+    assert capfd.readouterr().out == "after\n"
+    assert len(list(Path("/dev/fd").iterdir())) == descriptors

@@ -1,7 +1,8 @@
-"""Clutch, dead-man, slew, start: the handle follows the device only when it should."""
+"""Clutch, dead-man, slew, start, rising force: the handle follows only when it should."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -16,24 +17,33 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, verdict_of
+from audit_cases import ScriptedDevice, rewritten, verdict_of, without_model
 from bridge_runs import fast
 from faults.catalogue import FAULTS, PUSHER
 from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
+from report_runs import ANVIL
 
 from hapticbridge import guard as start_module
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
-from hapticbridge.commands import Switch
+from hapticbridge.commands import Couple, Switch
+from hapticbridge.coupling import Coupling
 from hapticbridge.device.watchdog import ForceOffGuardian
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import UNLIMITED, Limits, guard_parameters_for, wait_until_still
+from hapticbridge.guard import (
+    RAMP_ENERGY,
+    UNLIMITED,
+    USUAL_ENERGY,
+    Limits,
+    guard_parameters_for,
+    wait_until_still,
+)
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters
 from hapticbridge.options import BridgeOptions, Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.recording import read_recording
+from hapticbridge.recording import Recording, read_recording
 
 LIMIT = 10.0
 CLUTCH, REANCHORED = int(TickFlag.CLUTCH), int(TickFlag.REANCHORED)
@@ -204,18 +214,8 @@ def test_the_wrench_changes_no_faster_than_it_may(
 
 
 def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretched() -> None:
-    away = [0.0] + [0.05] * 20
-    device = ScriptedDevice(lambda k: (away[min(k, 20)], 0, 0, 1, 0, 0, 0))
-    device.start(1e-3)
-    device.tick = 5
-    start = device.start
-
-    def started(period: float) -> NDArray[np.void]:
-        sample = start(period)
-        device.tick = 1  # by the first tick it is 50 mm away
-        return sample
-
-    device.start = started  # type: ignore[method-assign]
+    reports = itertools.count()  # by the first tick it is 50 mm from where it started
+    device = ScriptedDevice(lambda _k: (0.05 * (next(reports) > 0), 0, 0, 1, 0, 0, 0))
     with fast("point_mass", device) as bridge:
         bridge.run(0.01)
         rows = bridge.latest_records(10)
@@ -267,21 +267,21 @@ def test_a_run_that_is_told_to_end_does_not_wait_for_rest(
     monkeypatch: pytest.MonkeyPatch, is_stopped: bool
 ) -> None:
     monkeypatch.setattr(start_module, "PATIENCE", 0.2)
-    device = ScriptedDevice(lambda tick: (2e-3 * tick, 0, 0, 1, 0, 0, 0))
-    device.info = replace(device.info, is_real=True)
-    plain = device.read
+    seen: list[int] = []
 
-    def read(sample: NDArray[np.void]) -> int:
-        if is_stopped and device.tick == 20:
+    def moving(tick: int) -> tuple[float, ...]:
+        seen.append(tick)
+        if is_stopped and tick == 20:
             os.kill(os.getpid(), signal.SIGINT)
-        return plain(sample)
+        return (2e-3 * tick, 0, 0, 1, 0, 0, 0)
 
-    device.read = read  # type: ignore[method-assign]
+    device = ScriptedDevice(moving)
+    device.info = replace(device.info, is_real=True)
     with Bridge("point_mass", device, realtime=False) as bridge:
         if is_stopped:
             summary = bridge.run(0.01)
             assert (summary.stopped_by, summary.ticks) == ("signal", 0)
-            assert device.tick < 100
+            assert max(seen) < 100
         else:
             with pytest.raises(SafetyTrip, match="hold it still"):
                 bridge.run(0.01)
@@ -306,32 +306,22 @@ def test_an_absolute_device_that_strayed_while_rest_was_waited_for_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("call", "message"),
     [
-        ({"controller": "magic"}, "choices: 'damper', 'environment', 'off'"),
-        ({"clutch": -1}, "clutch button is -1"),
-        ({"dead_man": 99}, "dead-man button is 99"),
-        ({"clutch": 1, "dead_man": 1}, "exclude each other"),
+        (lambda: BridgeOptions(controller="magic"), "choices: 'damper', 'environment', 'off'"),
+        (lambda: BridgeOptions(clutch=-1), "clutch button is -1"),
+        (lambda: BridgeOptions(dead_man=99), "dead-man button is 99"),
+        (lambda: BridgeOptions(clutch=1, dead_man=1), "exclude each other"),
+        (lambda: Limits(force=1.0, torque=1.0, slew_time=-1.0), "it must be"),
+        (lambda: Limits(force=1.0, torque=1.0, stretch=0.0), "it must be"),
+        (lambda: Limits(force=1.0, torque=1.0, angle=4.0), "it must be"),
+        (lambda: Limits(force=1.0, torque=1.0, energy=math.nan), "it must be"),
+        (lambda: Limits(force=1.0, torque=1.0, reach=0.0), "it must be"),
     ],
 )
-def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str) -> None:
+def test_what_the_guard_is_not_is_refused(call: Callable[[], object], message: str) -> None:
     with pytest.raises(DeviceError, match=message):
-        BridgeOptions(**options)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"slew_time": -1.0},
-        {"stretch": 0.0},
-        {"angle": 4.0},
-        {"energy": float("nan")},
-        {"reach": 0.0},
-    ],
-)
-def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
-    with pytest.raises(DeviceError, match="it must be"):
-        Limits(force=1.0, torque=1.0, **change)
+        call()
 
 
 def test_a_guard_reads_back_as_it_was_written() -> None:
@@ -389,3 +379,139 @@ def test_a_killed_process_still_says_zero_and_one_that_closed_does_not(
     word.close()
     word.close()
     assert quiet.read_bytes() == b""
+
+
+T, RAMP = 1e-3, 500
+K, B_DEVICE = 2000.0, 2.0
+COUPLING = Coupling(K, 0.9, 2.0, 5e-4)
+LIMITS = Limits(force=10.0, torque=0.5)
+
+Pose = Callable[[int], tuple[float, ...]]
+
+
+def rubbed(amplitude: float, speed: float = 10.0) -> Pose:
+    """To and fro against a tool that stays: a hand that begins before the force is there."""
+    return lambda k: (amplitude * math.sin(speed * T * k), 0, 0, 1, 0, 0, 0)
+
+
+def ramped(
+    folder: Path, pose: Pose, *, energy: float, is_slowed: bool = True, **options: Any
+) -> tuple[Recording, float, str]:
+    """Runs it; returns the recording, what the hand was given beyond what it put in, the trip."""
+    scene, path, reason = folder / "anvil.xml", folder / "run.mcap", ""
+    scene.write_text(ANVIL)
+    device = ScriptedDevice(pose, damping=B_DEVICE)
+    limits = replace(LIMITS, energy=energy)
+    act = options.pop("act", None)
+    bridge = fast(scene, device, coupling=COUPLING, limits=limits, recording=path, **options)
+    if not is_slowed:
+        guard = replace(bridge.setup.guard, ramp_energy=math.inf)
+        bridge.setup = replace(bridge.setup, guard=guard)
+    with bridge:
+        try:
+            bridge.run(1.5, act and (lambda k: act(bridge, k)))
+        except SafetyTrip as trip:
+            reason = str(trip)
+    recording = read_recording(path)
+    # by itself: work of what was sent until the next sample, less what the damper burns meanwhile
+    moved = np.diff(recording.ticks["device_position"], axis=0)
+    sent = recording.ticks["wrench_on_device"][:-1, :3]
+    given = np.cumsum(np.sum((sent - B_DEVICE / T * moved) * moved, axis=1))
+    return recording, float(given.max()), reason
+
+
+@pytest.mark.parametrize(("amplitude", "speed"), [(0.04, 5.0), (0.04, 10.0), (0.02, 5.0)])
+def test_rubbing_while_the_force_rises_is_given_little_and_stops_nothing(
+    tmp_path: Path, amplitude: float, speed: float
+) -> None:
+    pose = rubbed(amplitude, speed)
+    recording, given, trip = ramped(tmp_path, pose, energy=USUAL_ENERGY)
+    assert not trip
+    assert given < 1.5 / (RAMP * T) * RAMP_ENERGY  # the time of three ramps
+    report = audit(recording.path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    # from the records alone too: the second computation knows how the force rises
+    assert audit(rewritten(without_model(recording), tmp_path / "b.mcap")).verdict == "passive"
+
+
+def test_a_force_that_rises_whatever_it_holds_gives_a_rubbing_hand_what_the_limit_forbids(
+    tmp_path: Path,
+) -> None:
+    """The energy is there, so the trip is right; the pace of the ramp is what was wrong."""
+    pose = rubbed(0.04)
+    _, given, _ = ramped(tmp_path, pose, energy=math.inf, is_slowed=False)
+    assert given > 0.12
+    _, given, trip = ramped(tmp_path, pose, energy=USUAL_ENERGY, is_slowed=False)
+    assert "more energy beyond what the hand put in" in trip
+    assert USUAL_ENERGY < given < 0.05
+
+
+def pushed_in(depth: float) -> Pose:
+    """Into the coupling within 20 ms, and held there."""
+    return lambda k: (depth * min(k / 20, 1.0), 0, 0, 1, 0, 0, 0)
+
+
+@pytest.mark.parametrize("newtons", [4.0, 6.0, 9.0, 30.0])
+def test_the_force_rises_slower_by_what_the_coupling_holds_beyond_the_allowance(
+    tmp_path: Path, newtons: float
+) -> None:
+    depth = newtons / K
+    recording, *_ = ramped(tmp_path, pushed_in(depth), energy=math.inf)
+    ticks = recording.ticks
+    ramping = (ticks["flags"] & int(TickFlag.RAMPING)) != 0
+    # a spring whose force stops growing at 10 N
+    held = 0.5 * K * min(depth, 10.0 / K) ** 2 + 10.0 * max(depth - 10.0 / K, 0.0)
+    slower = max(held / RAMP_ENERGY, 1.0)
+    took = int(np.argmin(ramping)) if not ramping.all() else None
+    if slower * RAMP > len(ticks):
+        assert took is None
+    else:
+        assert took == pytest.approx(
+            slower * (RAMP - 20) + 20, rel=0.04, abs=1
+        )  # the anvil gives way
+        assert (took == RAMP) == (newtons < 6.3)  # sqrt(2 K 0.01 J)
+    steps = np.diff(np.linalg.norm(ticks["wrench_on_device"][30:300, :3], axis=1))
+    full = min(float(np.linalg.norm(ticks["wrench_on_tool"][200, :3])), 10.0)
+    assert np.median(steps) == pytest.approx(full / (RAMP + 1) / slower, rel=0.02)
+    rises = np.diff(ticks["share"][30:300])
+    assert np.median(rises) == pytest.approx(1 / (RAMP + 1) / slower, rel=0.02)
+
+
+def test_about_an_axis_too(tmp_path: Path) -> None:
+    def twisted(tick: int) -> tuple[float, ...]:
+        half = 0.5 * min(tick / 100, 1.0)  # 1 rad: 0.0625 J below 0.5 N m, 0.375 J beyond
+        return (0, 0, 0, math.cos(half), math.sin(half), 0, 0)
+
+    for is_slowed in (True, False):
+        recording, *_ = ramped(tmp_path, twisted, energy=math.inf, is_slowed=is_slowed)
+        ramping = (recording.ticks["flags"] & int(TickFlag.RAMPING)) != 0
+        assert (np.count_nonzero(ramping) > RAMP) == is_slowed
+
+
+def test_a_coupling_that_is_changed_meanwhile_counts_as_it_is(tmp_path: Path) -> None:
+    def act(bridge: Bridge, tick: int) -> None:
+        if tick == 100:
+            bridge.command(Couple(1000.0, 0.9))
+
+    recording, *_ = ramped(tmp_path, pushed_in(9.0 / K), energy=math.inf, act=act)
+    plain = rewritten(without_model(recording), tmp_path / "plain.mcap")
+    assert audit(plain).verdict == "passive"
+    assert audit(recording.path).resimulation == "bit for bit"
+
+
+def test_a_recording_that_claims_another_pace_is_found(tmp_path: Path) -> None:
+    recording, *_ = ramped(tmp_path, rubbed(0.02), energy=math.inf)
+    slow = recording.meta["guard"]
+    for claim in ('"ramp_energy": null', '"ramp_energy": 0.02'):
+        told = {"guard": slow.replace('"ramp_energy": 0.01', claim)}
+        for file in (recording, without_model(recording)):
+            changed = rewritten(file, tmp_path / "changed.mcap", meta=told)
+            assert audit(changed).verdict == "invalid"
+
+
+def test_what_was_recorded_before_the_pace_was_known_is_judged_as_it_was(tmp_path: Path) -> None:
+    recording, *_ = ramped(tmp_path, rubbed(0.02), energy=math.inf, is_slowed=False)
+    assert '"ramp_energy": null' in recording.meta["guard"]
+    older = {"guard": recording.meta["guard"].replace(', "ramp_energy": null', "")}
+    report = audit(rewritten(recording, tmp_path / "older.mcap", meta=older))
+    assert report.resimulation == "bit for bit"
