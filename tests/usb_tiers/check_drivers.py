@@ -18,21 +18,7 @@ from hapticbridge.device import Device
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.record import SAMPLE_DTYPE
-from usb_tiers.benches import (
-    DAMPING,
-    FALCON,
-    MASS,
-    NEWTONS,
-    PROGRAM,
-    STICK,
-    falcon,
-    free_falcon,
-    free_rawhid,
-    free_stick,
-    rawhid,
-    stick,
-    unloaded_falcon,
-)
+from usb_tiers import benches
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
 from usb_tiers.waiting import usable_devices, wait_for
 
@@ -67,8 +53,8 @@ def _held(device: Device, seconds: float, force: tuple[float, float, float]) -> 
 def _require_pushed(device: Device) -> None:
     """Pushes mass and damping along x by a constant force; asserts that they move, only there."""
     start = _held(device, 0.01, (0.0, 0.0, 0.0))
-    rate = DAMPING / MASS
-    expected = FORCE / DAMPING * (PUSHED - (1.0 - math.exp(-rate * PUSHED)) / rate)
+    rate = benches.DAMPING / benches.MASS
+    expected = FORCE / benches.DAMPING * (PUSHED - (1.0 - math.exp(-rate * PUSHED)) / rate)
     moved = _held(device, PUSHED, (FORCE, 0.0, 0.0)) - start
     if IS_TIME_VIRTUAL:
         # steps of encoders and motors, and some ms on the way
@@ -90,14 +76,14 @@ def _refuses_to_go_on(device: Device) -> str:
 
 
 def test_a_written_force_moves_a_falcon_as_its_mass_and_damping_say(plug_usb: Plug) -> None:
-    plug_usb(free_falcon)
+    plug_usb(benches.free_falcon)
     device = _opened("falcon")
     _require_pushed(device)
     device.close()
 
 
 def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> None:
-    plug_hid(free_rawhid)
+    plug_hid(benches.free_rawhid)
     device = _opened("rawhid")
     _require_pushed(device)
     device.close()
@@ -107,17 +93,17 @@ def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> No
 def test_a_written_force_moves_a_force_feedback_stick_likewise(
     plug_hid: Plug, is_odd: bool
 ) -> None:
-    model = plug_hid(lambda: free_stick(is_odd=is_odd))
-    device = _opened(STICK)
+    model = plug_hid(lambda: benches.free_stick(is_odd=is_odd))
+    device = _opened(benches.STICK)
     _require_pushed(device)
-    assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * NEWTONS)
+    assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * benches.NEWTONS)
     device.close()
     assert model.call("force") == (0.0, 0.0)
 
 
 def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) -> None:
-    model = plug_hid(free_stick)
-    device = _opened(STICK)
+    model = plug_hid(benches.free_stick)
+    device = _opened(benches.STICK)
     _held(device, 0.05, (0.5, 0.0, 0.0))
     assert model.call("force") != (0.0, 0.0)
     life = max(effect.duration for effect in model.get("effects").values())
@@ -128,26 +114,26 @@ def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) ->
 
 
 def test_a_falcon_takes_its_program_and_then_speaks(plug_usb: Plug, tmp_path: Path) -> None:
-    model = plug_usb(unloaded_falcon)
+    model = plug_usb(benches.unloaded_falcon)
     file = tmp_path / "program.bin"
-    file.write_bytes(PROGRAM)
+    file.write_bytes(benches.PROGRAM)
     with pytest.raises(DeviceError, match="firmware"):
         _opened("falcon")
     device = _opened(f"falcon:firmware={file}")
     device.close()
-    assert model.get("uploaded") == PROGRAM
+    assert model.get("uploaded") == benches.PROGRAM
 
 
 def test_a_falcon_with_the_wrong_program_is_refused(plug_usb: Plug, tmp_path: Path) -> None:
-    plug_usb(unloaded_falcon)
+    plug_usb(benches.unloaded_falcon)
     file = tmp_path / "wrong.bin"
-    file.write_bytes(PROGRAM[::-1])
+    file.write_bytes(benches.PROGRAM[::-1])
     with pytest.raises(DeviceError, match="with its firmware"):
         _opened(f"falcon:firmware={file}")
 
 
 def test_garbage_between_a_falcons_packets_changes_no_pose(plug_usb: Plug) -> None:
-    model = plug_usb(free_falcon)
+    model = plug_usb(benches.free_falcon)
     device = _opened("falcon")
     clean = _held(device, 0.02, (0.0, 0.0, 0.0))
     model.set("faults", Faults(noise=b"\x00<AAAAAA>\xff<<"))
@@ -157,7 +143,7 @@ def test_garbage_between_a_falcons_packets_changes_no_pose(plug_usb: Plug) -> No
 
 
 def test_damaged_frames_of_a_home_made_device_change_no_pose(plug_hid: Plug) -> None:
-    model = plug_hid(free_rawhid)
+    model = plug_hid(benches.free_rawhid)
     device = _opened("rawhid")
     frames = model.get("frames")
     model.set("damage", set(range(frames, frames + 10_000, 2)))
@@ -168,7 +154,7 @@ def test_damaged_frames_of_a_home_made_device_change_no_pose(plug_hid: Plug) -> 
 
 
 def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
-    model = plug_usb(falcon)
+    model = plug_usb(benches.falcon)
     device = _opened("falcon")
     model.set("halted", {0x81})
     assert "halted" in _refuses_to_go_on(device)
@@ -176,7 +162,7 @@ def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
 
 def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
     for serial in ("left", "right"):
-        plug_hid(lambda serial=serial: free_rawhid(serial))  # type: ignore[misc]
+        plug_hid(lambda serial=serial: benches.free_rawhid(serial))  # type: ignore[misc]
     wait_for(lambda: len(usable_devices()) == 2)
     with pytest.raises(DeviceError, match=r"left.*right|right.*left"):
         hb.open_device("rawhid")
@@ -232,9 +218,9 @@ def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path)
 def test_a_falcon_pulled_out_of_a_run_loses_no_row_and_can_come_back(
     plug_usb: Plug, tmp_path: Path, no_spin: None
 ) -> None:
-    _pulled_out_of_a_run(plug_usb(falcon), FALCON, tmp_path / "run.mcap")
+    _pulled_out_of_a_run(plug_usb(benches.falcon), benches.FALCON, tmp_path / "run.mcap")
     wait_for(lambda: not plugged_devices())
-    plug_usb(falcon)
+    plug_usb(benches.falcon)
     again = _opened("falcon")
     again.close()
 
@@ -242,9 +228,9 @@ def test_a_falcon_pulled_out_of_a_run_loses_no_row_and_can_come_back(
 def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
     plug_hid: Plug, tmp_path: Path, no_spin: None
 ) -> None:
-    _pulled_out_of_a_run(plug_hid(rawhid), "rawhid", tmp_path / "run.mcap")
+    _pulled_out_of_a_run(plug_hid(benches.rawhid), "rawhid", tmp_path / "run.mcap")
     wait_for(lambda: not plugged_devices())
-    plug_hid(rawhid)
+    plug_hid(benches.rawhid)
     again = _opened("rawhid")
     again.close()
 
@@ -252,8 +238,8 @@ def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
 def test_a_stick_pulled_out_of_a_run_loses_no_row_and_can_come_back(
     plug_hid: Plug, tmp_path: Path, no_spin: None
 ) -> None:
-    _pulled_out_of_a_run(plug_hid(stick), STICK, tmp_path / "run.mcap")
+    _pulled_out_of_a_run(plug_hid(benches.stick), benches.STICK, tmp_path / "run.mcap")
     wait_for(lambda: not plugged_devices())
-    plug_hid(stick)
-    again = _opened(STICK)
+    plug_hid(benches.stick)
+    again = _opened(benches.STICK)
     again.close()
