@@ -118,34 +118,27 @@ SLIDE = '{ kind = "joint", name = "slide", field = "stiffness", index = 0'
     [({}, 20.0), ({"gap": 0.1}, 90.0), ({"less": 0.01}, 40.0), ({"gap": 0.1, "less": 0.01}, 110.0)],
 )
 def test_numbers_add_up(tmp_path: Path, values: dict[str, float], stiffness: float) -> None:
-    path = scene_with(
-        tmp_path,
-        table(SLIDE + ", factor = 1000.0 }", default="0.03")
-        + table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03"),
-    )
+    more = table(SLIDE + ", factor = 1000.0 }", default="0.03")
+    less = table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03")
+    path = scene_with(tmp_path, more + less)
     scene = load_scene(path, "grip", **values)
     assert scene.model.joint("slide").stiffness[0] == pytest.approx(stiffness, rel=1e-12)
     assert scene.parameters == {"gap": 0.03, "less": 0.03} | values
+
+
+FIELDS = (
+    "geom_pos", "geom_size", "geom_friction", "body_pos", "body_mass", "body_inertia", "mesh_vert",
+    "dof_frictionloss", "jnt_stiffness",
+)  # fmt: skip
 
 
 @each_parameter
 def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Parameter) -> None:
     plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
     assert plain.parameters == asked.parameters
-    for field in (
-        "geom_pos",
-        "geom_size",
-        "geom_friction",
-        "body_pos",
-        "body_mass",
-        "body_inertia",
-        "mesh_vert",
-        "dof_frictionloss",
-        "jnt_stiffness",
-    ):
-        assert getattr(asked.model, field) == pytest.approx(
-            getattr(plain.model, field), rel=1e-9, abs=1e-12
-        )
+    for field in FIELDS:
+        expected = pytest.approx(getattr(plain.model, field), rel=1e-9, abs=1e-12)
+        assert getattr(asked.model, field) == expected
 
 
 @each_parameter
@@ -215,10 +208,7 @@ def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
     assert "no parameter 'clearence'" in message
     assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
     path = scene_with(tmp_path, "")
-    assert refusal(path, mass=1.0) == (
-        "scene 'bench' has no parameters, so 'mass' cannot be set; define parameters in "
-        "'bench.toml' beside it"
-    )
+    assert refusal(path, mass=1.0).startswith("scene 'bench' has no parameters, so 'mass' cannot")
 
 
 @pytest.mark.parametrize(
