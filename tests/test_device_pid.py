@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, read
+from device_benches import opened_stick as opened
 from emulated.hid_seam import HidSeam
 from emulated.pid_layouts import USUAL
 from emulated.pid_model import PidStick
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.family import ignore_message
-from hapticbridge.device.pid import device as driver
 from hapticbridge.device.pid import device as sheet
 from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
+from hapticbridge.device.transport.hid import HidLink, find
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
@@ -34,12 +35,6 @@ def started(model: PidStick, **options: object) -> tuple[PidDevice, PidStick, Hi
     device, model, seam = opened(model, **options)
     device.start(PERIOD)
     return device, model, seam
-
-
-def read(device: PidDevice, seam: HidSeam, seconds: float = PERIOD) -> tuple[int, np.void]:
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    seam.advance(seam.now + seconds)
-    return device.read(sample), sample[0]
 
 
 @pytest.fixture(autouse=True)
@@ -69,8 +64,7 @@ def test_a_reversed_axis_pushes_the_other_way() -> None:
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_the_pose_is_the_deflection_times_the_travel(name: str) -> None:
     device, model, seam = started(PidStick(layout=LAYOUTS[name], buttons=0b10011))
-    step = device.info.resolution
-    assert step is not None
+    step = device.info.resolution or 0.0
     for place in ((0.0, 0.0), (0.5, -0.25), (1.0, 1.0), (-1.0, -1.0), (3.0, 0.1)):
         model.place = place
         flag, sample = read(device, seam)
@@ -133,11 +127,12 @@ def test_a_host_that_dies_lets_go_of_the_stick(name: str) -> None:
 
 def test_the_faster_the_bus_the_shorter_the_life() -> None:
     for interval, restart in ((1e-3, RESTART), (2e-3, RESTART), (8e-3, 0.08)):
-        device, model, _seam = opened()
-        device = PidDevice(
-            device._link, "fast", scale=sheet.Scale(NEWTONS, TRAVEL, np.ones(2)),
-            intervals=(1e-3, interval),
-        )  # fmt: skip
+        model = PidStick()
+        seam, scale = HidSeam(model), sheet.Scale(NEWTONS, TRAVEL, np.ones(2))
+        seam.advance(0.0)
+        (plugged,) = find(sheet.FAMILY, seam)
+        link = HidLink.open(plugged, seam, is_overlapped=False, slots=sheet.SLOTS)
+        device = PidDevice(link, "fast", scale=scale, intervals=(1e-3, interval))
         device.start(PERIOD)
         assert [e.duration for e in model.effects.values()] == pytest.approx([LIFE * restart] * 2)
         assert device.info.rate == pytest.approx(1.0 / (2 * interval))
@@ -174,7 +169,7 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
 
 def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
     held: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(driver, "guard_device_node", lambda *given: held.append(given))
+    monkeypatch.setattr(sheet, "guard_device_node", lambda *given: held.append(given))
     device, model, seam = started(PidStick())
     device.leave_last_word("/dev/hidraw7")
     device.write(wrench(1.0, 1.0))

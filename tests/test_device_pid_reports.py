@@ -7,11 +7,12 @@ import re
 from collections.abc import Mapping
 
 import pytest
+from device_benches import LAYOUTS, MOUSE
+from device_benches import opened_stick as opened
 from emulated.pid_layouts import OUT, PID, Part, Report, descriptor
 from emulated.pid_model import PidStick
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, MOUSE, opened
 
 from hapticbridge.device.pid import reports as wire
 from hapticbridge.device.pid.device import Stick

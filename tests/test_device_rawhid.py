@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from device_benches import PERIOD, paddle, read
+from device_benches import opened_rawhid as opened
 from emulated.hid_seam import HidSeam
 from emulated.rawhid_model import NAN, Claims, RawHid, crc
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
-from rawhid_cases import PERIOD, opened, paddle
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device import SimulatedDevice
@@ -32,12 +32,6 @@ def still(claims: Claims | None = None, **options: object) -> tuple[RawHidDevice
     device, model, seam = opened(RawHid(None, claims), **options)
     device.start(PERIOD)
     return device, model, seam
-
-
-def read(device: RawHidDevice, seam: HidSeam, seconds: float = PERIOD) -> tuple[int, np.void]:
-    sample: NDArray[np.void] = np.zeros(1, SAMPLE_DTYPE)
-    seam.advance(seam.now + seconds)
-    return device.read(sample), sample[0]
 
 
 def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
@@ -141,7 +135,7 @@ def test_lost_frames_are_counted_and_the_newest_pose_is_used() -> None:
 def test_losses_are_counted_across_the_sequences_wrap(lost: int) -> None:
     device, model, seam = still()
     read(device, seam)
-    model._sequence = 65533
+    model.sequence = 65533
     read(device, seam)  # 65534
     before = device.states.lost
     model.lose = set(range(model.frames + 2, model.frames + 2 + lost))  # 0, 1
@@ -210,7 +204,7 @@ def test_a_fault_and_a_restart_end_the_run_and_a_wrapping_clock_does_not() -> No
         read(device, seam)
     device, model, seam = still()
     read(device, seam)
-    model._clock_start_us -= round(1e6 * seam.now)
+    model.clock_start_us -= round(1e6 * seam.now)
     with pytest.raises(DeviceError, match="has restarted during the run"):
         read(device, seam)
 

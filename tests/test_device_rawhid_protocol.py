@@ -31,17 +31,12 @@ states = st.builds(
     protocol.State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16
 )
 
+MOTION = (0.01, -0.02, 0.03, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0)
+
 WRITTEN = {
     "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
     "State 258": protocol.state_frame(
-        protocol.State(
-            protocol.Status.ENABLED,
-            258,
-            1,
-            1_000_000,
-            (0.01, -0.02, 0.03, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0),
-            7,
-        )
+        protocol.State(protocol.Status.ENABLED, 258, 1, 1_000_000, MOTION, 7)
     ),
     "Ask 1": protocol.ask_frame(1, 0),
     "Sheet, page 0": protocol.sheet_frames(
@@ -105,9 +100,8 @@ def test_the_worked_state_holds_its_numbers_where_the_document_says() -> None:
         12: (0.01, -0.02, 0.03), 24: (0, 0, 0.5), 36: (0.1, 0, 0), 48: (0, 0, -1), 60: (7,),
     }  # fmt: skip
     for first, values in expected.items():
-        np.testing.assert_allclose(
-            struct.unpack_from(layout[first][1], frame, first), values, rtol=1e-7
-        )
+        found = struct.unpack_from(layout[first][1], frame, first)
+        np.testing.assert_allclose(found, values, rtol=1e-7)
 
 
 def test_the_worked_sheet_holds_its_numbers_where_the_document_says() -> None:
@@ -125,16 +119,13 @@ def test_any_state_survives_a_frame(state: protocol.State) -> None:
     assert protocol.decoded(protocol.state_frame(state)) == state
 
 
-@given(
-    st.integers(0, 63),
-    st.lists(any_single, min_size=11, max_size=11),
-    st.text("a-é日🙂 7", max_size=80).map(str.strip),
-)
+titles = st.text("a-é日🙂 7", max_size=80).map(str.strip)
+
+
+@given(st.integers(0, 63), st.lists(any_single, min_size=11, max_size=11), titles)
 def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str) -> None:
-    numbers, title = (
-        protocol.decoded(frame)
-        for frame in protocol.sheet_frames(9, protocol.Numbers(axes, *values), name)
-    )
+    frames = protocol.sheet_frames(9, protocol.Numbers(axes, *values), name)
+    numbers, title = map(protocol.decoded, frames)
     assert isinstance(numbers, protocol.Numbers)
     assert isinstance(title, str)
     known = numbers.known()
@@ -319,19 +310,8 @@ def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL
     numbers = protocol.decoded(frame.raw)
     assert isinstance(numbers, protocol.Numbers)
     assert numbers.axis_names == ("x", "rz")
-    assert numbers.known() == {
-        "rate": 990.0,
-        "mass": None,
-        "damping": 0.4,
-        "rotational_inertia": None,
-        "rotational_damping": 0.01,
-        "friction": 0.05,
-        "resolution": 1.5e-5,
-        "force_limit": 4.0,
-        "torque_limit": 0.1,
-        "speed_limit": 2.0,
-        "delay": 5e-4,
-    }
+    sheet = (990.0, None, 0.4, None, 0.01, 0.05, 1.5e-5, 4.0, 0.1, 2.0, 5e-4)
+    assert tuple(numbers.known().values()) == sheet
     shim.shim_receive(protocol.ask_frame(2, 1), 0)
     assert shim.shim_answer(frame)
     assert protocol.decoded(frame.raw) == "shim"

@@ -3,11 +3,11 @@ from __future__ import annotations
 import re
 
 import pytest
+from device_benches import LAYOUTS, MOUSE
 from emulated.pid_layouts import FEATURE as MODEL_FEATURE
 from emulated.pid_layouts import IN, OUT, Report, descriptor
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, MOUSE
 
 from hapticbridge.device.transport.hid_descriptor import (
     FEATURE,

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from emulated.falcon_model import FalconModel
-from emulated.handle import Handle
+from emulated.handle import Handle, planar_hand
 from emulated.pid_layouts import ODD, USUAL
 from emulated.pid_model import PidStick
-from emulated.planar_hand import planar_hand
 from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
