@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hapticbridge as hb
 from emulated.compile_ahead import compile_ahead, snapshot_of_compiled_code
@@ -132,14 +133,9 @@ def _under_umockdev(folder: Path) -> list[Claim]:
         "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
     }
     try:
-        ended = subprocess.run(
-            [*_pytest(str(report)), f"--basetemp={folder / 'files'}"],
-            env=os.environ | variables,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT,
-            check=False,
-        )
+        command = [*_pytest(str(report)), f"--basetemp={folder / 'files'}"]
+        how: Any = {"capture_output": True, "text": True, "timeout": LIMIT}
+        ended = subprocess.run(command, env=os.environ | variables, check=False, **how)
     except subprocess.TimeoutExpired:
         return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
     return claims_of(report, ended.stdout + ended.stderr)
@@ -159,15 +155,9 @@ def _in_the_guest(
         variables["HAPTICBRIDGE_TIME"] = "virtual"
     if not has_pidff():
         variables["HAPTICBRIDGE_NO_PIDFF"] = "1"
-    return run_in_guest(
-        command,
-        folder,
-        environment=variables,
-        is_virtual=is_virtual,
-        timeout=LIMIT,
-        patience=patience,
-        compiled=compiled,
-    )
+    limits = {"timeout": LIMIT, "patience": patience}
+    how = {"environment": variables, "is_virtual": is_virtual, "compiled": compiled}
+    return run_in_guest(command, folder, **limits, **how)  # type: ignore[arg-type]
 
 
 _compiling = threading.Lock()

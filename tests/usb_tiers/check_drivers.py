@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from emulated.emulator_process import EmulatorProcess
 from emulated.falcon_model import Faults
 from emulated.spacemouse_model import SpaceMouse
+from emulated.usb_device import UsbDevice
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -77,27 +79,22 @@ def _refuses_to_go_on(device: Device) -> str:
 
 def test_a_written_force_moves_a_falcon_as_its_mass_and_damping_say(plug_usb: Plug) -> None:
     plug_usb(benches.free_falcon)
-    device = _opened("falcon")
-    _require_pushed(device)
-    device.close()
+    with closing(_opened("falcon")) as device:
+        _require_pushed(device)
 
 
-def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> None:
+def test_a_written_force_moves_a_home_made_device_alike(plug_hid: Plug) -> None:
     plug_hid(benches.free_rawhid)
-    device = _opened("rawhid")
-    _require_pushed(device)
-    device.close()
+    with closing(_opened("rawhid")) as device:
+        _require_pushed(device)
 
 
 @pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
-def test_a_written_force_moves_a_force_feedback_stick_likewise(
-    plug_hid: Plug, is_odd: bool
-) -> None:
+def test_a_written_force_moves_a_force_feedback_stick_alike(plug_hid: Plug, is_odd: bool) -> None:
     model = plug_hid(lambda: benches.free_stick(is_odd=is_odd))
-    device = _opened(benches.STICK)
-    _require_pushed(device)
-    assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * benches.NEWTONS)
-    device.close()
+    with closing(_opened(benches.STICK)) as device:
+        _require_pushed(device)
+        assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * benches.NEWTONS)
     assert model.call("force") == (0.0, 0.0)
 
 
@@ -189,8 +186,14 @@ def _deflected(now: float) -> tuple[float, ...]:
     return (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path) -> None:
-    """Pulls a device out half a second after its run's start; no row may be lost before that."""
+def _pulled_out_of_a_run(
+    plug: Plug, make: Callable[[], UsbDevice], specification: str, folder: Path
+) -> None:
+    """Pulls a device out half a second after its run's start, and plugs it in again.
+
+    No row may be lost before that.
+    """
+    model, file = plug(make), folder / "run.mcap"
     wait_for(usable_devices)
     times: list[float] = []
 
@@ -213,33 +216,21 @@ def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path)
     if IS_TIME_VIRTUAL:
         # times are those of the ticks' beginnings, one period before the next
         assert 0.5 - PERIOD <= times[-1] - times[0] <= 0.502
-
-
-def test_a_falcon_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_usb: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_usb(benches.falcon), benches.FALCON, tmp_path / "run.mcap")
     wait_for(lambda: not plugged_devices())
-    plug_usb(benches.falcon)
-    again = _opened("falcon")
-    again.close()
+    plug(make)
+    _opened(specification).close()
 
 
-def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_hid: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_hid(benches.rawhid), "rawhid", tmp_path / "run.mcap")
-    wait_for(lambda: not plugged_devices())
-    plug_hid(benches.rawhid)
-    again = _opened("rawhid")
-    again.close()
+@pytest.mark.usefixtures("no_spin")
+def test_a_falcon_pulled_out_of_a_run_comes_back(plug_usb: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_usb, benches.falcon, benches.FALCON, tmp_path)
 
 
-def test_a_stick_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_hid: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_hid(benches.stick), benches.STICK, tmp_path / "run.mcap")
-    wait_for(lambda: not plugged_devices())
-    plug_hid(benches.stick)
-    again = _opened(benches.STICK)
-    again.close()
+@pytest.mark.usefixtures("no_spin")
+def test_a_home_made_device_pulled_out_of_a_run_comes_back(plug_hid: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_hid, benches.rawhid, "rawhid", tmp_path)
+
+
+@pytest.mark.usefixtures("no_spin")
+def test_a_stick_pulled_out_of_a_run_comes_back(plug_hid: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_hid, benches.stick, benches.STICK, tmp_path)
