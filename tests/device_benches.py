@@ -111,9 +111,10 @@ NEWTONS, TRAVEL = 4.0, 0.08
 SCALE: dict[str, object] = {"newtons": NEWTONS, "travel": TRAVEL}
 
 
-def opened_stick(
-    model: PidStick | None = None, **options: object
-) -> tuple[PidDevice, PidStick, HidSeam]:
+Stick = tuple[PidDevice, PidStick, HidSeam]
+
+
+def opened_stick(model: PidStick | None = None, **options: object) -> Stick:
     """Returns the driver, opened; the device; and what it is plugged into."""
     model = model or PidStick(SimulatedDevice())
     seam = HidSeam(model)
@@ -121,9 +122,10 @@ def opened_stick(
     return open_pid({**SCALE, **options}, ignore_message, seam), model, seam
 
 
-def opened_rawhid(
-    model: RawHid | None = None, **options: object
-) -> tuple[RawHidDevice, RawHid, HidSeam]:
+HomeMade = tuple[RawHidDevice, RawHid, HidSeam]
+
+
+def opened_rawhid(model: RawHid | None = None, **options: object) -> HomeMade:
     """Returns the driver, opened; the device; and what it is plugged into."""
     model = model or RawHid(SimulatedDevice())
     seam = HidSeam(model)

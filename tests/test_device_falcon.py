@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from device_benches import PERIOD, FalconBench
+from emulated.falcon_model import Faults
 from numpy.typing import NDArray
 
 from hapticbridge.device import SimulatedDevice
@@ -69,10 +70,9 @@ def test_a_force_beyond_the_motors_keeps_its_direction() -> None:
     looped(bench, device, 5, (40.0, 10.0, -20.0))
     assert max(abs(units) for units in bench.model.motors) == 4096
     got = bench.model.handle.force[:3]
-    np.testing.assert_allclose(
-        got / np.linalg.norm(got), np.array([4, 1, -2]) / np.sqrt(21), atol=2e-3
-    )
-    assert 3.0 < np.linalg.norm(got) < 20.0
+    size = np.linalg.norm(got)
+    np.testing.assert_allclose(got / size, np.array([4, 1, -2]) / np.sqrt(21), atol=2e-3)
+    assert 3.0 < size < 20.0
 
 
 def test_a_force_that_is_not_finite_is_no_force() -> None:
@@ -274,12 +274,9 @@ ECHO = rf"sent back 0x{PROGRAM[1234] ^ 0x40:02x} for byte 1234 \(0x{PROGRAM[1234
         ({"is_deaf": True}, PROGRAM, "its loader does not answer; switch its power off"),
     ],
 )
-def test_a_program_that_does_not_arrive_or_run_is_told(
-    program: str, fault: dict[str, Any], valid: bytes, words: str
-) -> None:
+def test_bad_program_is_told(program: str, fault: Any, valid: bytes, words: str) -> None:
     bench = FalconBench(program=None, valid=valid)
-    for name, value in fault.items():
-        setattr(bench.model.faults, name, value)
+    bench.model.faults = Faults(**fault)
     with pytest.raises(DeviceError, match=words):
         bench.opened(firmware=program)
     assert bench.time.now < 15.0
@@ -303,16 +300,14 @@ def test_an_unhomed_falcon_waits_until_the_grip_has_passed_its_zeros(tmp_path: P
     path.write_text(IN_AND_OUT)
     bench = FalconBench(SimulatedDevice(mass=0.4, damping=2.0, path=path), is_homed=False)
     device = bench.opened()
-    assert [words.partition(": ")[2] for words in bench.told] == [
-        "pull the grip all the way out and push it back in, slowly",
-        "homed",
-    ]
+    asked, done = (words.partition(": ")[2] for words in bench.told)
+    assert asked == "pull the grip all the way out and push it back in, slowly"
+    assert done == "homed"
     sample = device.start(1e-3)
     bench.time.until(bench.time.now)
     # an encoder that kept its offset would be hundreds of counts, some 10 mm, off
-    np.testing.assert_allclose(
-        sample["position"][0], bench.model.handle.pose()[0], rtol=0, atol=2e-4
-    )
+    place = bench.model.handle.pose()[0]
+    np.testing.assert_allclose(sample["position"][0], place, rtol=0, atol=2e-4)
 
 
 def test_a_grip_that_nobody_moves_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

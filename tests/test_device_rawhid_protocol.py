@@ -168,15 +168,6 @@ def test_a_frame_of_another_version_is_told_from_noise() -> None:
     assert protocol.version_of(frame[:-1] + bytes([frame[-1] ^ 1])) is None
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_state_that_is_not_finite_says_so(value: float) -> None:
-    for place in range(12):
-        numbers = tuple(value if i == place else 0.0 for i in range(12))
-        state = protocol.decoded(protocol.state_frame(protocol.State(0, 0, 0, 0, numbers, 0)))
-        assert isinstance(state, protocol.State)
-        assert not state.is_finite
-
-
 FIRMWARE = Path(driver.__file__).with_name("firmware")
 SHIM = Path(__file__).with_name("rawhid_firmware_shim.cpp")
 COMPILER = shutil.which("g++") or shutil.which("clang++")

@@ -28,7 +28,7 @@ from hapticbridge.device.spacemouse import (
     open_spacemouse,
     share,
 )
-from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
@@ -105,9 +105,7 @@ Three = tuple[int, int, int]
 
 @pytest.mark.parametrize("is_long", [False, True])
 @pytest.mark.parametrize(("push", "way", "turn"), AXES)
-def test_deflection_sets_speed(
-    push: tuple[int, ...], way: Three, turn: Three, is_long: bool
-) -> None:
+def test_deflection_is_speed(push: Any, way: Three, turn: Three, is_long: bool) -> None:
     device, model, seam = opened(SpaceMouse(has_long_reports=is_long), speed=0.1, turn=0.5)
     device.start(PERIOD)
     model.deflect(*push)
@@ -186,16 +184,6 @@ def test_starting_again_goes_back_to_the_origin() -> None:
         assert (start["position"].any(), start["quaternion"][0]) == (False, 1.0)
         model.deflect(350, 350, 350, 350, 350, 350)
         assert run(device, seam, 50)["position"].all()
-
-
-def test_unplugging_is_seen_by_the_next_read() -> None:
-    device, model, seam = opened()
-    device.start(PERIOD)
-    run(device, seam, 2)
-    seam.unplug(model)
-    with pytest.raises(DeviceLost, match="is gone: unplugged"):
-        run(device, seam, 1)
-    device.close()
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,11 @@ def test_a_device_that_is_gone_is_lost_for_reads_waits_and_writes() -> None:
     for call in (HidLink.take, lambda link: link.wait(1), lambda link: link.write(b"\0")):
         link, device, seam = linked()
         seam.unplug(device)
-        with pytest.raises(DeviceLost, match="report echo"):
+        with pytest.raises(
+            DeviceLost, match=r"report echo.* (is gone: unplugged|did not accept a)"
+        ):
             call(link)
+        link.close()
         link.close()
 
 
@@ -85,9 +88,7 @@ def test_what_cannot_be_opened_says_why() -> None:
     seam = HidSeam(EchoHid())
     (plugged,) = find(ECHO, seam)
     seam.plugged.clear()
-    with pytest.raises(
-        DeviceError, match="cannot be opened; it may be in use by another program or"
-    ):
+    with pytest.raises(DeviceError, match="cannot be opened; it may be in use by another program"):
         HidLink.open(plugged, seam)
 
 

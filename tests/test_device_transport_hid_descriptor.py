@@ -40,11 +40,8 @@ def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:
 def test_a_state_that_is_kept_comes_back_and_a_long_item_means_nothing() -> None:
     # 8 bits, kept; 16 bits; back to 8; a long item of three bytes between
     text = "0501 0930 1500 25ff 7508 9501 8102 a4 7510 0931 8102 b4 fe0301 aabbcc 0932 8102"
-    assert [(one.offset, one.size) for one in fields_of(bytes.fromhex(text))] == [
-        (0, 8),
-        (8, 16),
-        (24, 8),
-    ]
+    places = [(one.offset, one.size) for one in fields_of(bytes.fromhex(text))]
+    assert places == [(0, 8), (8, 16), (24, 8)]
 
 
 @pytest.mark.parametrize(
@@ -82,10 +79,8 @@ def test_every_value_is_found_where_the_table_that_made_the_descriptor_has_it(na
             high = report.packed(**{part.name: part.high})
             assert place.bits(part.high) | report.number == int.from_bytes(high, "little")
             low = int.from_bytes(report.packed(**{part.name: part.low}), "little")
-            assert (place.read(low), place.read(int.from_bytes(high, "little"))) == (
-                part.low,
-                part.high,
-            )
+            read = place.read(low), place.read(int.from_bytes(high, "little"))
+            assert read == (part.low, part.high)
 
 
 @given(st.data())
@@ -97,11 +92,8 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
         return
     part = data.draw(st.sampled_from(parts))
     layout = Layout(descriptor(reports))
-    fields = [
-        field
-        for field in layout.fields
-        if (field.kind, field.report) == (KINDS[report.kind], report.number)
-    ]
+    key = (KINDS[report.kind], report.number)
+    fields = [field for field in layout.fields if (field.kind, field.report) == key]
     place = place_of(fields, part.usage)
     assert place is not None
     value = data.draw(st.integers(part.low, part.high))

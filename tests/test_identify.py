@@ -361,14 +361,15 @@ def test_an_interval_may_reach_farther_down_and_tells_what_is_seen() -> None:
     assert not Estimate(0.02, 0.03).is_seen and not Estimate(-0.02, 0.03).is_seen
 
 
+OnRead = Callable[[NDArray[np.void], int], int]
+OnWrite = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
 class Wrapped:
     """A simulated device whose samples or wrenches something changes on the way."""
 
     def __init__(
-        self,
-        device: SimulatedDevice,
-        on_read: Callable[[NDArray[np.void], int], int] = lambda _sample, _tick: 0,
-        on_write: Callable[[NDArray[np.float64]], NDArray[np.float64]] = lambda wrench: wrench,
+        self, device: SimulatedDevice, on_read: OnRead = lambda *_: 0, on_write: OnWrite = np.copy
     ) -> None:
         self.info, self._device = device.info, device
         self._on_read, self._on_write, self._tick = on_read, on_write, 0
@@ -448,9 +449,7 @@ def test_what_goes_wrong_is_said_and_gets_no_more_force(spoil: Any, words: str) 
     if spoil is None:
         device = Wrapped(free(), on_write=lambda wrench: -wrench)
     else:
-        device = Wrapped(
-            free(), on_read=lambda sample, tick: spoil(sample) or 0 if tick == 900 else 0
-        )
+        device = Wrapped(free(), lambda sample, tick: (tick == 900 and spoil(sample)) or 0)
     with pytest.raises((IdentificationError, DeviceError), match=words):
         identify(device, SimulatedClock(), period=PERIOD, axes=("x",), duration=6.0)
     assert (device.last == 0.0).all()

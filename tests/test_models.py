@@ -103,9 +103,7 @@ def test_the_script_makes_the_hand_paths_that_are_here(tmp_path: Path) -> None:
 def meshes_of(folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Returns the corners of every mesh of the scenes in a folder, shape (n, 3), in m."""
     return {
-        (file.stem, mesh.attrib["name"]): np.array(mesh.attrib["vertex"].split(), float).reshape(
-            -1, 3
-        )
+        (file.stem, mesh.attrib["name"]): np.loadtxt([mesh.attrib["vertex"]]).reshape(-1, 3)
         for file in sorted(folder.glob("*/*.xml"))
         for mesh in ET.parse(file).getroot().iter("mesh")
     }
@@ -198,9 +196,7 @@ def test_single_contact_gives_by_twelve_micrometres_under_three_newtons() -> Non
 @pytest.mark.parametrize(
     ("edit", "least", "most"), [(None, 5e-6, 25e-6), (with_default_contact, 300e-6, 1e-3)]
 )
-def test_peg_sinks_in_only_by_default_contact(
-    edit: runs.Edit | None, least: float, most: float
-) -> None:
+def test_peg_sinks_in_by_default(edit: runs.Edit | None, least: float, most: float) -> None:
     model, data = runs.scene_with_handle("peg_in_hole", edit)
     stops = (0.8, 0.0), (0.4, 0.0015), (0.6, 0.0015)
     run = runs.moved_through(model, data, [(s, (x, 0, -0.04), (0, 0, 0)) for s, x in stops])
@@ -224,9 +220,8 @@ def rigid_optimum(handle: runs.Array, vector: runs.Array) -> tuple[runs.Array, R
     def energy(p: runs.Array) -> float:
         x, rotation = pose(p)
         angle = (Rotation.from_rotvec(vector) * rotation.inv()).as_rotvec()
-        return float(
-            1e3 * (0.5 * runs.K * ((handle - x) ** 2).sum() + 0.5 * runs.K_R * (angle**2).sum())
-        )
+        springs = runs.K * ((handle - x) ** 2).sum() + runs.K_R * (angle**2).sum()
+        return float(0.5e3 * springs)
 
     def room(p: runs.Array) -> runs.Array:
         x, rotation = pose(p)

@@ -152,10 +152,8 @@ def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
 
 
 def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> None:
-    option = (
-        "<option integrator='Euler' solver='CG' timestep='0.01'><flag energy='disable' "
-        "diagexact='disable' autoreset='enable' fwdinv='enable' midphase='disable'/></option>"
-    )
+    option = """<option integrator='Euler' solver='CG' timestep='0.01'><flag energy='disable'
+      diagexact='disable' autoreset='enable' fwdinv='enable' midphase='disable'/></option>"""
     scene = load_scene(scene_file(tmp_path, mjcf(option)))
     opt = scene.model.opt
     enable, disable = mujoco.mjtEnableBit, mujoco.mjtDisableBit

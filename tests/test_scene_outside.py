@@ -43,9 +43,8 @@ def outcome(folder: Path, text: str, grip: str, stops: Stops) -> Outcome:
     path, hand = scene_file(folder, text), hand_file(folder, stops)
     scene = hb.load_scene(path, grip=grip)
     recording, qpos = folder / "run.mcap", []
-    with hb.Bridge(
-        scene, f"trajectory:{hand}", clock=hb.SimulatedClock(), recording=recording
-    ) as bridge:
+    clock, device = hb.SimulatedClock(), f"trajectory:{hand}"
+    with hb.Bridge(scene, device, clock=clock, recording=recording) as bridge:
         summary = bridge.run(on_tick=lambda _tick: qpos.append(scene.data.qpos.copy()))
     assert summary.ticks == round(sum(seconds for seconds, _ in stops) * 1000) + 1
     report = hb.audit(recording)
@@ -58,39 +57,23 @@ def outcome(folder: Path, text: str, grip: str, stops: Stops) -> Outcome:
 
 @pytest.fixture(scope="module")
 def pointer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    stops: Stops = [
-        (0.5, (-0.05, 0.03, 0.02)),
-        (0.5, (-0.05, 0.03, 0.02)),
-        (0.5, (-0.02, -0.05, 0.05)),
-        (0.5, (-0.02, -0.05, 0.05)),
-        (0.8, (0.0, 0.0, 0.0)),
-        (0.2, (0.0, 0.0, 0.0)),
-    ]
+    one, other, home = (-0.05, 0.03, 0.02), (-0.02, -0.05, 0.05), (0.0, 0.0, 0.0)
+    stops = [*[(0.5, one)] * 2, *[(0.5, other)] * 2, (0.8, home), (0.2, home)]
     return outcome(tmp_path_factory.mktemp("pointer"), outside.BALL_JOINT_TOOL, "tip", stops)
 
 
 @pytest.fixture(scope="module")
 def pin(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    depth = -(outside.PIN_GAP + 0.005)
-    stops: Stops = [
-        (0.8, (0.0, 0.0, depth)),
-        (0.6, (0.0, 0.0, depth)),
-        (0.8, (0.0, 0.0, 0.0)),
-        (0.8, (0.0, 0.0, -(outside.PIN_GAP + outside.PIN_DEPTH + 0.003))),
-        (0.4, (0.0, 0.0, -(outside.PIN_GAP + outside.PIN_DEPTH + 0.003))),
-    ]
+    depth, beyond = -(outside.PIN_GAP + 0.005), -(outside.PIN_GAP + outside.PIN_DEPTH + 0.003)
+    heights = (0.8, depth), (0.6, depth), (0.8, 0.0), (0.8, beyond), (0.4, beyond)
+    stops = [(seconds, (0.0, 0.0, height)) for seconds, height in heights]
     return outcome(tmp_path_factory.mktemp("pin"), outside.SPRING_PIN, "stylus", stops)
 
 
 @pytest.fixture(scope="module")
 def drawer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    stops: Stops = [
-        (1.0, (0.1, 0.0, 0.0)),
-        (0.4, (0.1, 0.0, 0.0)),
-        (0.8, (0.125, 0.004, -0.002)),
-        (0.4, (0.125, 0.004, -0.002)),
-        (0.8, (-0.005, 0.0, 0.0)),
-    ]
+    half, wide, shut = (0.1, 0.0, 0.0), (0.125, 0.004, -0.002), (-0.005, 0.0, 0.0)
+    stops = [(1.0, half), (0.4, half), (0.8, wide), (0.4, wide), (0.8, shut)]
     return outcome(tmp_path_factory.mktemp("drawer"), outside.DRAWER, "knob", stops)
 
 
@@ -101,10 +84,8 @@ def test_tool_on_ball_joint_is_strict_and_its_moments_about_joint_balance(pointe
         row = pointer.ticks[tick]
         data.qpos[:] = pointer.qpos[tick]
         mujoco.mj_forward(pointer.model, data)
-        weight = sum(
-            np.cross(data.xipos[i] - outside.SHOULDER, [0, 0, -9.81 * pointer.model.body_mass[i]])
-            for i in (1, 2)
-        )
+        weights = -9.81 * np.outer(pointer.model.body_mass[1:3], [0, 0, 1])
+        weight = np.cross(data.xipos[1:3] - outside.SHOULDER, weights).sum(axis=0)
         wrench = row["wrench_on_tool"]
         hand = np.cross(row["tool_position"] - outside.SHOULDER, wrench[:3]) + wrench[3:]
         # all but at rest after 0.4 s of damping; the moments themselves are 0.1 N m
@@ -139,9 +120,8 @@ def test_pin_gives_way_by_what_its_spring_says_and_comes_back(pin: Outcome) -> N
     pressed = 1390
     force = -pin.ticks["wrench_on_tool"][pressed, 2]
     # spring at rest: preload + k · travel, and the coupling's own stretch of force / K
-    assert force == pytest.approx(
-        outside.PIN_PRELOAD - outside.PIN_STIFFNESS * travel[pressed], rel=1e-4
-    )
+    spring = outside.PIN_PRELOAD - outside.PIN_STIFFNESS * travel[pressed]
+    assert force == pytest.approx(spring, rel=1e-4)
     # beyond that, the contact of so light a pin gives way by 36 µm
     assert -travel[pressed] == pytest.approx(0.005 - force / K, abs=60e-6)
     assert travel[2100] == pytest.approx(0.0, abs=60e-6)
@@ -173,9 +153,8 @@ def test_drawer_opens_against_its_friction_and_ends_at_its_stops(drawer: Outcome
     # in mid-motion, without acceleration; frictionloss is soft by a few per cent
     assert force[500, 0] == pytest.approx(outside.DRAWER_FRICTION, rel=0.05)
     assert opening[2590] == pytest.approx(outside.DRAWER_LENGTH, abs=50e-6)
-    assert force[2590] == pytest.approx(
-        [0.005 * K, 0.004 * K, -0.002 * K, 0, 0, 0], rel=0.01, abs=1e-9
-    )
+    stretched = [0.005 * K, 0.004 * K, -0.002 * K, 0, 0, 0]
+    assert force[2590] == pytest.approx(stretched, rel=0.01, abs=1e-9)
     assert opening[-1] == pytest.approx(0.0, abs=3e-3)
     assert opening.max() < outside.DRAWER_LENGTH + 50e-6
 
@@ -183,11 +162,9 @@ def test_drawer_opens_against_its_friction_and_ends_at_its_stops(drawer: Outcome
 def test_work_on_the_drawer_is_its_friction_times_its_way(drawer: Outcome) -> None:
     way = np.abs(np.diff(drawer.qpos[:, 0])).sum()
     assert way > 0.22
-    assert drawer.ticks["coupling_work"][-1] == pytest.approx(
-        outside.DRAWER_FRICTION * way, rel=0.03
-    )
-    assert drawer.ticks["external_work"][-1] == 0
-    assert drawer.ticks["actuator_work"][-1] == 0
+    last = drawer.ticks[-1]
+    assert last["coupling_work"] == pytest.approx(outside.DRAWER_FRICTION * way, rel=0.03)
+    assert last["external_work"] == last["actuator_work"] == 0
 
 
 def test_handle_starts_in_the_frame_of_a_turned_grip(pointer: Outcome, drawer: Outcome) -> None:

@@ -160,12 +160,11 @@ def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_pa
     assert killed.status == 137
     assert "memory is full" in killed.output
     endless = ["sh", "-c", "while :; do i=0; while [ $i -lt 999 ]; do i=$((i+1)); done; echo; done"]
-    stopped = run_in_guest(
-        endless, tmp_path, environment={}, is_virtual=True, timeout=4.0, patience=3.0
-    )
+    limits: Any = {"environment": {}, "is_virtual": True, "patience": 3.0}
+    stopped = run_in_guest(endless, tmp_path, timeout=4.0, **limits)
     assert stopped.status is None
     assert stopped.output.endswith("\nthe guest was stopped after 4 s")
     endless[-1] = "echo begun; while :; do :; done"
-    silent = run_in_guest(endless, tmp_path, environment={}, is_virtual=True, patience=3.0)
+    silent = run_in_guest(endless, tmp_path, **limits)
     assert silent.status is None
     assert silent.output == "begun\nthe guest was stopped: it had printed nothing for 3 s"

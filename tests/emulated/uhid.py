@@ -6,7 +6,7 @@ import errno
 import os
 import struct
 
-from emulated.front_end import FrontEnd
+from emulated.emulator_process import FrontEnd
 from emulated.hid_device import FEATURE_REPORT, INPUT_REPORT, OUTPUT_REPORT, HidDevice
 from emulated.usb_device import StallError
 
@@ -32,13 +32,10 @@ class Uhid(FrontEnd):
         # without report numbers the kernel puts a zero in their place, which no device ever sees
         self._blank = b"" if device.has_numbered_reports else b"\0"
         self._file = os.open("/dev/uhid", os.O_RDWR | os.O_CLOEXEC)
-        name, serial = (
-            f"{device.manufacturer} {device.product_name}".encode(),
-            device.serial.encode(),
-        )
+        name, serial = f"{device.manufacturer} {device.product_name}", device.serial.encode()
         descriptor = device.report_descriptor
         words = (_BUS_USB, device.vendor, device.product, device.release, 0)
-        form, texts = f"<I128s64s64s2H4I{_DATA_MAX}s", (name, b"emulated", serial)
+        form, texts = f"<I128s64s64s2H4I{_DATA_MAX}s", (name.encode(), b"emulated", serial)
         event = struct.pack(form, _CREATE, *texts, len(descriptor), *words, descriptor)
         os.write(self._file, event)
 

@@ -15,8 +15,8 @@ from emulated.echo import VENDOR, EchoHid, EchoUsb
 from emulated.emulator_process import EmulatorProcess
 
 from hapticbridge.device.transport.usb import libusb
+from usb_tiers.benches import wait_for
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import wait_for
 
 Echo = tuple[EmulatorProcess, Any]
 

@@ -21,8 +21,8 @@ from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.record import SAMPLE_DTYPE
 from usb_tiers import benches
+from usb_tiers.benches import usable_devices, wait_for
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import usable_devices, wait_for
 
 PERIOD = 1e-3
 

@@ -18,9 +18,8 @@ from emulated.pid_model import PidStick
 
 import hapticbridge as hb
 from hapticbridge.device.discovery import plugged_devices
-from usb_tiers.benches import NEWTONS, STICK, free_stick
+from usb_tiers.benches import NEWTONS, STICK, free_stick, wait_for
 from usb_tiers.conftest import Plug
-from usb_tiers.waiting import wait_for
 
 _EV_FF, _FF_CONSTANT = 0x15, 0x52
 _GET_EFFECT_BITS, _UPLOAD, _ERASE = 0x80104535, 0x40304580, 0x40044581
