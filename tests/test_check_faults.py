@@ -94,7 +94,7 @@ def test_shipped_scene_has_no_fault(name: str) -> None:
 
 def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path) -> None:
     case = case_of(peg_with(tmp_path, "0.02 1"))
-    assert case.observation is not None
+    assert case.observation
     fault = one_of("default contact", find_faults(case))
     assert "into a clearance of 200 µm" in fault.sentence
     assert 'solref="0.002 1"' in fault.change

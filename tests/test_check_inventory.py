@@ -10,16 +10,8 @@ import pytest
 from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
 from outside_scenes import mjcf
 
-from hapticbridge.check.inventory import (
-    FIXED,
-    MEETS_OTHER,
-    MEETS_TOOL,
-    MOVING,
-    TOOL,
-    VISUAL,
-    Inventory,
-    take_inventory,
-)
+from hapticbridge.check import inventory
+from hapticbridge.check.inventory import Inventory, take_inventory
 from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
 from hapticbridge.scene.contacts import meeting_pairs
@@ -38,7 +30,7 @@ def test_counts_are_those_of_the_model_without_the_bridge(name: str) -> None:
     assert (sum(counted.geoms.values()), counted.actuators) == (plain.ngeom, plain.nactuator)
     assert (counted.equalities, counted.tendons) == (plain.neq, plain.ntendon)
     is_visual = (plain.geom_contype | plain.geom_conaffinity) == 0
-    assert counted.geoms[VISUAL] == np.count_nonzero(is_visual)
+    assert counted.geoms[inventory.VISUAL] == np.count_nonzero(is_visual)
 
 
 def heap(seed: int) -> str:
@@ -131,9 +123,14 @@ def test_stiffness_seen_is_force_over_depth_at_rest(tmp_path: Path, cone: str, c
 def test_geoms_are_sorted_by_what_they_met(tmp_path: Path) -> None:
     counted = inventory_of(bench(tmp_path / "scene"))
     # shaft; floor and button; block; slider; stop; cap
-    assert counted.geoms == {
-        TOOL: 1, MEETS_TOOL: 2, MEETS_OTHER: 1, MOVING: 1, FIXED: 1, VISUAL: 1,
-    }  # fmt: skip
+    once = (
+        inventory.TOOL,
+        inventory.MEETS_OTHER,
+        inventory.MOVING,
+        inventory.FIXED,
+        inventory.VISUAL,
+    )
+    assert counted.geoms == {**dict.fromkeys(once, 1), inventory.MEETS_TOOL: 2}
     assert counted.met_pairs == 3
     # of five things four move: all meet all but themselves, the cap nothing
     assert counted.possible_pairs == 4 * 2 + 6
@@ -148,7 +145,7 @@ def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
     idle = {each.place.element: each for each in inventory_of(scene).idle}
     assert set(idle) == {"body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'"}
     assert "never meets the tool" in idle["body 'block'"].reason
-    assert idle["geom 'cap'"].reason == VISUAL
+    assert idle["geom 'cap'"].reason == inventory.VISUAL
     assert idle["geom 'stop'"].reason == "fixed and never met in the motion"
     assert idle["body 'block'"].place.file == "parts.xml"
 

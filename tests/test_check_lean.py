@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,10 +82,8 @@ def written(found: Lean, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_over_modelled_peg_is_three_times_cheaper_within_one_jnd(found: Lean) -> None:
-    assert found.result.cost is not None
-    assert found.result.felt is not None
-    assert found.result.cost < 1 / 3
-    assert found.result.felt.felt <= 1.0
+    assert found.result.cost and found.result.cost < 1 / 3
+    assert found.result.felt and found.result.felt.felt <= 1.0
     assert found.result.environment == "strict"
     taken = {trial.name for trial in found.together}
     assert {"primitives", "nothing only seen", "usual tolerance", "condim 3"} <= taken
@@ -246,7 +244,7 @@ def test_joint_that_something_refers_to_stays(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def with_files(tmp_path: Path) -> Iterator[Path]:
+def with_files(tmp_path: Path) -> Path:
     """A scene of two files and a mesh, whose folders the compiler names."""
     scene_file(tmp_path / "meshes", obj_bytes(), "tool.obj")
     mesh = '<mujoco><asset><mesh name="m" file="tool.obj"/></asset></mujoco>'
@@ -257,7 +255,7 @@ def with_files(tmp_path: Path) -> Iterator[Path]:
       <site name="tip"/></body><geom name="floor" type="plane" size="1 1 1" pos="0 0 -0.011"
       condim="6" solref="0.002 1"/>"""
     head = '<compiler meshdir="meshes"/><option gravity="0 0 0" iterations="50"/>'
-    yield scene_file(tmp_path, mjcf(head, '<include file="a.xml"/>', body=tool))
+    return scene_file(tmp_path, mjcf(head, '<include file="a.xml"/>', body=tool))
 
 
 def lean_of(path: Path) -> Lean:
@@ -277,8 +275,7 @@ def test_scene_with_includes_and_meshes_is_written_elsewhere(with_files: Path) -
     target.parent.mkdir(parents=True)
     trial = write_lean(replace(lean, draft=kept), target)
     asked = lean.judge.judge("", "", kept)
-    assert trial.felt is not None
-    assert asked.felt is not None
+    assert trial.felt and asked.felt
     assert trial.felt.felt == pytest.approx(asked.felt.felt, abs=1e-3)
     text = target.read_text(encoding="utf-8")
     assert 'file="../../meshes/tool.obj"' in text

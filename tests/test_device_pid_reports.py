@@ -117,15 +117,8 @@ def test_block_load_is_read_back(layout: Mapping[str, Report], usage: int, is_th
 def test_flags_do_for_choices_where_a_device_has_flags() -> None:
     layout = dict(LAYOUTS["usual"])
     usages = (0x97, 0x98, 0x99, 0x9A)
-    layout["control"] = Report(
-        kind=OUT,
-        number=12,
-        usage=PID | 0x95,
-        parts=tuple(
-            Part(name=f"u{usage:x}", usage=PID | usage, bits=1, high=1, within=PID | 0x96)
-            for usage in usages
-        ),
-    )
+    flags = tuple(Part(f"u{usage:x}", PID | usage, 1, 0, 1, PID | 0x96) for usage in usages)
+    layout["control"] = Report(kind=OUT, number=12, usage=PID | 0x95, parts=flags)
     reports = PidReports(Layout(descriptor(layout.values())))
     for usage in usages:
         values = said(layout, "control", reports.control(PID | usage))

@@ -33,18 +33,16 @@ states = st.builds(
 
 MOTION = (0.01, -0.02, 0.03, 0.0, 0.0, 0.5, 0.1, 0.0, 0.0, 0.0, 0.0, -1.0)
 
+STATE = protocol.State(protocol.Status.ENABLED, 258, 1, 1_000_000, MOTION, 7)
+SHEET = (1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4)
+UNKNOWN = protocol.Numbers(1, *[NAN] * 11)
+
 WRITTEN = {
     "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
-    "State 258": protocol.state_frame(
-        protocol.State(protocol.Status.ENABLED, 258, 1, 1_000_000, MOTION, 7)
-    ),
+    "State 258": protocol.state_frame(STATE),
     "Ask 1": protocol.ask_frame(1, 0),
-    "Sheet, page 0": protocol.sheet_frames(
-        1, protocol.Numbers(1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4), ""
-    )[0],
-    "Sheet, page 1": protocol.sheet_frames(
-        2, protocol.Numbers(1, *[NAN] * 11), "one-axis capstan paddle"
-    )[1],
+    "Sheet, page 0": protocol.sheet_frames(1, protocol.Numbers(*SHEET), "")[0],
+    "Sheet, page 1": protocol.sheet_frames(2, UNKNOWN, "one-axis capstan paddle")[1],
 }
 
 
@@ -106,10 +104,8 @@ def test_the_worked_state_holds_its_numbers_where_the_document_says() -> None:
 
 def test_the_worked_sheet_holds_its_numbers_where_the_document_says() -> None:
     frame = documented()["Sheet, page 0"]
-    expected = (1, 990, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4, NAN, 2, 5e-4)
     layout = fields("Sheet")
-    assert len(layout) == len(expected)
-    for first, value in zip(sorted(layout), expected, strict=True):
+    for first, value in zip(sorted(layout), SHEET, strict=True):
         (stored,) = struct.unpack_from(layout[first][1], frame, first)
         assert stored == pytest.approx(value, rel=1e-7, nan_ok=True)
 

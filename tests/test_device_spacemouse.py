@@ -17,17 +17,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.device import spacemouse as driver
 from hapticbridge.device.family import ignore_message
-from hapticbridge.device.spacemouse import (
-    FAMILY,
-    HELD,
-    Buttons,
-    Deflection,
-    SpaceMouseDevice,
-    decoded,
-    open_spacemouse,
-    share,
-)
+from hapticbridge.device.spacemouse import SpaceMouseDevice, decoded, open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -53,18 +45,18 @@ def run(device: SpaceMouseDevice, seam: HidSeam, ticks: int) -> Any:
 
 @given(st.tuples(*[counts] * 6))
 def test_length_tells_the_layouts_apart(values: tuple[int, ...]) -> None:
-    assert decoded(struct.pack("<B6h", 1, *values)) == Deflection(0, values)
-    assert decoded(struct.pack("<B3h", 1, *values[:3])) == Deflection(0, values[:3])
-    assert decoded(struct.pack("<B3h", 2, *values[3:])) == Deflection(3, values[3:])
+    assert decoded(struct.pack("<B6h", 1, *values)) == driver.Deflection(0, values)
+    assert decoded(struct.pack("<B3h", 1, *values[:3])) == driver.Deflection(0, values[:3])
+    assert decoded(struct.pack("<B3h", 2, *values[3:])) == driver.Deflection(3, values[3:])
 
 
 @given(st.binary(max_size=80))
 def test_arbitrary_bytes_are_read_without_a_crash(data: bytes) -> None:
     news = decoded(data)
     assert news is None or data[0] in (1, 2, 3)
-    if isinstance(news, Deflection):
-        assert all(abs(share(count, 0.05)) <= 1.0 for count in news.counts)
-    elif isinstance(news, Buttons):
+    if isinstance(news, driver.Deflection):
+        assert all(abs(driver.share(count, 0.05)) <= 1.0 for count in news.counts)
+    elif isinstance(news, driver.Buttons):
         assert 0 <= news.bits < 2**48
 
 
@@ -73,13 +65,13 @@ def test_arbitrary_bytes_are_read_without_a_crash(data: bytes) -> None:
     [("0302", 2), ("030200", 2), ("0300004001", 0x01400000), ("03" + "ff" * 9, 2**48 - 1)],
 )
 def test_buttons_are_a_little_endian_bitmap_of_any_length(report: str, bits: int) -> None:
-    assert decoded(bytes.fromhex(report)) == Buttons(bits)
+    assert decoded(bytes.fromhex(report)) == driver.Buttons(bits)
 
 
 @given(st.integers(-40000, 40000), st.floats(0.0, 0.9))
 def test_deflection_beyond_the_dead_band_is_linear_odd_and_clamped(count: int, band: float) -> None:
-    value = share(count, band)
-    assert share(-count, band) == -value
+    value = driver.share(count, band)
+    assert driver.share(-count, band) == -value
     assert value * count >= 0.0
     if abs(count) >= 350:
         assert abs(value) == 1.0
@@ -149,7 +141,7 @@ def test_a_puck_that_falls_silent_while_deflected_stops_the_handle() -> None:
     device.start(PERIOD)
     model.deflect(350, 0, 0, 0, 0, 0)
     sample = run(device, seam, 3000)
-    assert sample["position"][0] == pytest.approx(0.1 * HELD, abs=2e-4)
+    assert sample["position"][0] == pytest.approx(0.1 * driver.HELD, abs=2e-4)
 
 
 def test_buttons_and_light() -> None:
@@ -205,8 +197,8 @@ CADMOUSE = (0xC650, 0xC651, *range(0xC654, 0xC659), 0xC664, 0xC665, 0xC668)
 
 
 def test_flat_mice_of_the_same_maker_are_not_taken_for_one() -> None:
-    products = {(usb_id.vendor, usb_id.product) for usb_id in FAMILY.ids}
-    assert len(products) == len(FAMILY.ids) == 22
+    products = {(usb_id.vendor, usb_id.product) for usb_id in driver.FAMILY.ids}
+    assert len(products) == len(driver.FAMILY.ids) == 22
     assert not products & {(0x256F, product) for product in CADMOUSE}
     assert {(0x046D, 0xC626), (0x256F, 0xC635), (0x256F, 0xC652)} <= products
 

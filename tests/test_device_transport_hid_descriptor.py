@@ -4,24 +4,16 @@ import re
 
 import pytest
 from device_benches import LAYOUTS, MOUSE
-from emulated.pid_layouts import FEATURE as MODEL_FEATURE
-from emulated.pid_layouts import IN, OUT, Report, descriptor
+from emulated import pid_layouts as model
+from emulated.pid_layouts import Report, descriptor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device.transport.hid_descriptor import (
-    FEATURE,
-    INPUT,
-    LONGEST_DESCRIPTOR,
-    OUTPUT,
-    Layout,
-    element,
-    fields_of,
-    place_of,
-)
+from hapticbridge.device.transport import hid_descriptor as hid
+from hapticbridge.device.transport.hid_descriptor import Layout, element, fields_of, place_of
 from hapticbridge.errors import DeviceError
 
-KINDS = {IN: INPUT, OUT: OUTPUT, MODEL_FEATURE: FEATURE}
+KINDS = {model.IN: hid.INPUT, model.OUT: hid.OUTPUT, model.FEATURE: hid.FEATURE}
 
 
 def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:
@@ -34,7 +26,7 @@ def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:
     assert axes.collections == (0x10002, 0x10001)
     assert {field.report for field in (buttons, axes)} == {0}
     assert not Layout(MOUSE).is_numbered
-    assert Layout(MOUSE).length(INPUT, 0) == 1 + 3
+    assert Layout(MOUSE).length(hid.INPUT, 0) == 1 + 3
 
 
 def test_a_state_that_is_kept_comes_back_and_a_long_item_means_nothing() -> None:
@@ -109,7 +101,7 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
     ("raw", "words"),
     [
         (b"", "a report descriptor has 0 bytes; it must have 1 to 4096"),
-        (bytes(LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
+        (bytes(hid.LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
         (b"\x05", "ends within the item at byte 0"),
         (b"\x05\x01\x27\x01\x02", "ends within the item at byte 2"),
         (b"\xfe\x05", "ends within the item at byte 0"),

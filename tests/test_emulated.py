@@ -20,16 +20,11 @@ def _echo(backend: PyusbBackend) -> usb.core.Device:
     return usb.core.find(idVendor=VENDOR, idProduct=EchoUsb.product, backend=backend)
 
 
-def test_pyusb_reads_an_emulated_devices_descriptors_and_strings() -> None:
+def test_pyusb_reads_an_emulated_devices_descriptors_and_what_was_written_to_it() -> None:
     device = _echo(PyusbBackend(EchoUsb(), EchoHid()))
     texts = (device.manufacturer, device.product, device.serial_number)
     assert texts == ("hapticbridge", "bulk echo", "E1")
-    addresses = [one.bEndpointAddress for one in device[0][(0, 0)]]
-    assert addresses == [0x81, 0x02]
-
-
-def test_what_is_written_to_the_echo_comes_back() -> None:
-    device = _echo(PyusbBackend(EchoUsb()))
+    assert [one.bEndpointAddress for one in device[0][(0, 0)]] == [0x81, 0x02]
     device.set_configuration()
     assert device.write(0x02, b"there and back") == 14
     assert bytes(device.read(0x81, 64, 100)) == b"there and back"

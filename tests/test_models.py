@@ -89,17 +89,6 @@ def test_hand_path_starts_at_zero_and_ends_there_at_rest(name: str) -> None:
     assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() / 0.01 < acceleration
 
 
-def test_the_script_makes_the_hand_paths_that_are_here(tmp_path: Path) -> None:
-    for name in SCENES:
-        (tmp_path / name).mkdir()
-    script = runs.ROOT / "scripts" / "make_hand_paths.py"
-    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
-    for name in SCENES:
-        made = np.loadtxt(tmp_path / name / f"{name}.csv", delimiter=",", skiprows=1)
-        # one unit of the last written digit: processors differ in the last bit of a sine
-        np.testing.assert_allclose(made, runs.path_of(name), rtol=0, atol=1.1e-8)
-
-
 def meshes_of(folder: Path) -> dict[tuple[str, str], np.ndarray]:
     """Returns the corners of every mesh of the scenes in a folder, shape (n, 3), in m."""
     return {
@@ -109,20 +98,24 @@ def meshes_of(folder: Path) -> dict[tuple[str, str], np.ndarray]:
     }
 
 
-def test_the_script_makes_the_meshes_that_are_here(tmp_path: Path) -> None:
+def test_the_scripts_make_the_hand_paths_and_the_meshes_that_are_here(tmp_path: Path) -> None:
     for name in SCENES:
         text = (runs.MODELS / name / f"{name}.xml").read_text(encoding="utf-8")
         (tmp_path / name).mkdir()
         blank = re.sub('vertex="[^"]*"', 'vertex=""', text)
         (tmp_path / name / f"{name}.xml").write_text(blank, encoding="utf-8")
-    script = runs.ROOT / "scripts" / "make_meshes.py"
-    subprocess.run([sys.executable, str(script), str(tmp_path)], check=True)
-    made, here = meshes_of(tmp_path), meshes_of(runs.MODELS)
-    assert made.keys() == here.keys()
+    for script in ("make_hand_paths.py", "make_meshes.py"):
+        command = [sys.executable, str(runs.ROOT / "scripts" / script), str(tmp_path)]
+        subprocess.run(command, check=True)
+    # one unit of the last written digit: processors differ in the last bit of a sine
+    for name in SCENES:
+        made = np.loadtxt(tmp_path / name / f"{name}.csv", delimiter=",", skiprows=1)
+        np.testing.assert_allclose(made, runs.path_of(name), rtol=0, atol=1.1e-8)
+    meshes, here = meshes_of(tmp_path), meshes_of(runs.MODELS)
+    assert meshes.keys() == here.keys()
     assert len(here) == 6
     for key, corners in here.items():
-        # one unit of the last written digit: processors differ in the last bit of a sine
-        np.testing.assert_allclose(made[key], corners, rtol=0, atol=1.1e-8)
+        np.testing.assert_allclose(meshes[key], corners, rtol=0, atol=1.1e-8)
 
 
 def test_meshes_are_small_and_convex() -> None:

@@ -13,18 +13,12 @@ from model_runs import BOTTOMED_HEIGHT, HOME_HEIGHT, MODELS, Array
 from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
+from hapticbridge import scene as scenes
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice, device_for, scene_hand
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.record import TickFlag
-from hapticbridge.scene import (
-    Parameter,
-    plain_model,
-    read_scene,
-    scene_names,
-    scene_parameters,
-    scene_path,
-)
+from hapticbridge.scene import scene_names, scene_path
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device
 
@@ -69,7 +63,7 @@ STRONG = Hand(stiffness=1000.0, damping=20.0, rotational_stiffness=3.0)
 PARAMETERS = [
     (name, parameter)
     for name in sorted({hand[0] for hand in HANDS})
-    for parameter in scene_parameters(scene_path(name))
+    for parameter in scenes.scene_parameters(scene_path(name))
 ]
 
 
@@ -136,7 +130,9 @@ def within_limits(name: str, values: Values, motion: Motion) -> tuple[np.ndarray
 @pytest.mark.parametrize(
     ("name", "parameter"), PARAMETERS, ids=[f"{name} {p.name}" for name, p in PARAMETERS]
 )
-def test_both_ends_of_a_parameter_are_passive_in_any_hand(name: str, parameter: Parameter) -> None:
+def test_both_ends_of_a_parameter_are_passive_in_any_hand(
+    name: str, parameter: scenes.Parameter
+) -> None:
     used = 0
     for value in (parameter.minimum, parameter.maximum):
         loop = ClosedLoop(hb.load_scene(name, "grip", **{parameter.name: value}))
@@ -282,7 +278,7 @@ def test_numbers_that_are_no_hand_are_refused(numbers: str, says: str, tmp_path:
 
 
 def own_hand(name: str) -> Hand:
-    return scene_hand(plain_model(read_scene(name)), scene_path(name))
+    return scene_hand(scenes.plain_model(scenes.read_scene(name)), scene_path(name))
 
 
 @pytest.mark.parametrize("name", [n for n in scene_names() if own_hand(n) != DEFAULT_HAND])

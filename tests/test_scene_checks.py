@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from outside_scenes import FREE_TOOL, mjcf, scene_file
-from scene_cases import HINGE_TOOL, refusal, refusal_of
+from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb

@@ -16,15 +16,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.rendering import prepare
-from hapticbridge.scene import load_scene, scene_names
-from hapticbridge.scene.contacts import (
-    SUGGESTED,
-    check_contacts,
-    contact_concerns,
-    contact_numbers,
-    contact_settings,
-    suggested_solref,
-)
+from hapticbridge.scene import contacts, load_scene, scene_names
+from hapticbridge.scene.contacts import check_contacts, contact_concerns, contact_numbers
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)
@@ -84,10 +77,10 @@ def test_softer_is_never_worse(timeconst: float, ratio: float, longer: float, mo
 
 @given(st.floats(1e-5, 1e-1))
 def test_suggestion_is_strict_and_silent_at_every_time_step(timestep: float) -> None:
-    first, second = SUGGESTED[0] * timestep, SUGGESTED[1]
+    first, second = contacts.SUGGESTED[0] * timestep, contacts.SUGGESTED[1]
     assert contact_numbers((first, second), SOLIMP, timestep).grade == "strict"
     assert contact_concerns((first, second), SOLIMP, timestep, diagexact=False) == []
-    words = suggested_solref(timestep).split('"')[1].split()
+    words = contacts.suggested_solref(timestep).split('"')[1].split()
     assert [float(word) for word in words] == pytest.approx([first, second], rel=1e-5)
 
 
@@ -356,7 +349,7 @@ def test_settings_are_mujocos(geoms: list[dict[str, object]], flag: str, more: s
     }
     found = {
         frozenset((first, second)): (*one.solref, *one.solimp, one.condim, one.friction)
-        for first, second, one in contact_settings(model, "grip")
+        for first, second, one in contacts.contact_settings(model, "grip")
     }
     assert found.keys() == expected.keys()
     for key, values in expected.items():

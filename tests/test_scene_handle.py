@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from outside_scenes import FREE_TOOL, hand_file, mjcf, scene_file
-from scene_cases import GRIPPED, RICH, ticks
+from outside_scenes import FREE_TOOL, GRIPPED, RICH, hand_file, mjcf, scene_file, ticks
 
 import hapticbridge as hb
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS

@@ -14,18 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hapticbridge as hb
+from hapticbridge import scene as scenes
 from hapticbridge.cli import main
 from hapticbridge.run_description import compiled_model
-from hapticbridge.scene import (
-    Parameter,
-    load_scene,
-    scene_names,
-    scene_parameters,
-    scene_path,
-    settings_from,
-)
+from hapticbridge.scene import load_scene, scene_path
 
-PARAMETERS = [(name, p) for name in scene_names() for p in scene_parameters(scene_path(name))]
+PARAMETERS = [
+    (name, p) for name in scenes.scene_names() for p in scenes.scene_parameters(scene_path(name))
+]
 each_parameter = pytest.mark.parametrize(
     ("name", "parameter"), PARAMETERS, ids=[f"{name} {p.name}" for name, p in PARAMETERS]
 )
@@ -133,7 +129,9 @@ FIELDS = (
 
 
 @each_parameter
-def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Parameter) -> None:
+def test_a_shipped_default_gives_the_scene_of_the_file(
+    name: str, parameter: scenes.Parameter
+) -> None:
     plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
     assert plain.parameters == asked.parameters
     for field in FIELDS:
@@ -142,7 +140,9 @@ def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Par
 
 
 @each_parameter
-def test_both_ends_of_a_shipped_range_load_and_differ(name: str, parameter: Parameter) -> None:
+def test_both_ends_of_a_shipped_range_load_and_differ(
+    name: str, parameter: scenes.Parameter
+) -> None:
     low = load_scene(name, "grip", **{parameter.name: parameter.minimum})
     high = load_scene(name, "grip", **{parameter.name: parameter.maximum})
     assert low.parameters[parameter.name] == parameter.minimum
@@ -254,12 +254,12 @@ def test_a_toml_file_of_somebody_else_is_passed_over(tmp_path: Path) -> None:
 
 
 def test_words_become_values_and_a_name_comes_once() -> None:
-    assert settings_from(["a=1e-4", "b=-2"]) == {"a": 1e-4, "b": -2.0}
+    assert scenes.settings_from(["a=1e-4", "b=-2"]) == {"a": 1e-4, "b": -2.0}
     with pytest.raises(hb.SceneError, match="twice"):
-        settings_from(["a=1", "a=1"])
+        scenes.settings_from(["a=1", "a=1"])
     for word in ("", "gap", "gap=", "=1", "gap=wide", "grip=1", "gap=1=2"):
         with pytest.raises(hb.SceneError, match="a parameter of the scene and a number"):
-            settings_from([word])
+            scenes.settings_from([word])
 
 
 def test_values_are_recorded_and_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

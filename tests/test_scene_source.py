@@ -10,8 +10,7 @@ import pytest
 from audit_cases import recorded
 from hypothesis import given
 from hypothesis import strategies as st
-from outside_scenes import mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
-from scene_cases import RICH
+from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError

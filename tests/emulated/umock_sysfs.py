@@ -110,14 +110,12 @@ def _add_hidraw(root: Path, interface: Path, device: HidDevice, number: int) -> 
     minor = number - 1
     name = f"hidraw{minor}"
     hid = interface / f"0003:{device.vendor:04X}:{device.product:04X}.{number:04X}"
-    _write(
-        hid,
-        {
-            "uevent": f"DRIVER=hid-generic\nHID_ID=0003:{device.vendor:08X}:{device.product:08X}\n"
-            f"HID_NAME={device.manufacturer} {device.product_name}\n"
-            f"HID_PHYS=usb-0000:00:14.0-{number}/input0\nHID_UNIQ={device.serial}"
-        },
+    event = (
+        f"DRIVER=hid-generic\nHID_ID=0003:{device.vendor:08X}:{device.product:08X}\n"
+        f"HID_NAME={device.manufacturer} {device.product_name}\n"
+        f"HID_PHYS=usb-0000:00:14.0-{number}/input0\nHID_UNIQ={device.serial}"
     )
+    _write(hid, {"uevent": event})
     (hid / "report_descriptor").write_bytes(device.report_descriptor)
     _link(hid / "subsystem", root / "sys/bus/hid")
     _link(root / "sys/bus/hid/devices" / hid.name, hid)
