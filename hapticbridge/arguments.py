@@ -61,13 +61,13 @@ class Arguments:
                 message names the first such value and the range.
         """
         try:
-            given = np.asarray(value)
+            raw = np.asarray(value)
         except (TypeError, ValueError, OverflowError):  # as rows of different lengths
-            given = np.empty(0, dtype=object)
-        if given.dtype.kind not in "iuf":
+            raw = np.empty(0, dtype=object)
+        if raw.dtype.kind not in "iuf":
             raise self.error(f"{name} is {shown(value)}; it must be numbers{_of(unit)}")
         with np.errstate(over="ignore"):  # longer floats become inf, which is refused
-            array = given.astype(np.float64)
+            array = raw.astype(np.float64)
         if array.size == 0:
             raise self.error(f"{name} is an empty array; it must hold at least one number")
         is_valid = np.isfinite(array) & (array <= most)

@@ -209,7 +209,7 @@ class Bridge:
             if skipped or stream.lost:
                 flags |= session.count_losses(skipped)
             code = finish(state, row, rows, cursors, deadline, wake, read, write, flags, is_ahead)
-            while code == RING_FULL and stream.makes_room(may_wait=not stops):
+            while code == RING_FULL and stream.makes_room(is_stopping=bool(stops)):
                 code = kernel.publish_again(deadline, wake, read, write, flags)
             if code == BAD_RESULT:
                 return trip_reason(code, session.tick)

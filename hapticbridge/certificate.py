@@ -22,7 +22,7 @@ _WHOLE = 1e-9
 """Excess over a whole number of ticks that counts as rounding, in ticks."""
 
 
-def felt_period(info: DeviceInfo, period: float) -> float:
+def device_period(info: DeviceInfo, period: float) -> float:
     """Returns the time in s for which a wrench acts: the loop's period, or the device's if longer.
 
     For a prescribed motion it is the loop's period.
@@ -37,7 +37,7 @@ def delay_ticks(info: DeviceInfo, period: float) -> int | None:
     """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
     if info.delay is None:
         return None
-    return max(0, math.ceil(info.delay / felt_period(info, period) - _WHOLE))
+    return max(0, math.ceil(info.delay / device_period(info, period) - _WHOLE))
 
 
 def damping_for_delay(
@@ -50,7 +50,7 @@ def damping_for_delay(
 
         Δb = max(0, sup_θ [(K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)] − (K T/2 + B))
 
-    d is the delay in ticks, T the result of ``felt_period``; for B = 0, Δb = K d T. With it the
+    d is the delay in ticks, T the result of ``device_period``; for B = 0, Δb = K d T. With it the
     device is passive against a wall, which is necessary. For a general scene no finite damping
     suffices, so a device with a delay cannot be certified. An unknown delay adds nothing and cannot
     be certified either.
@@ -64,9 +64,9 @@ def damping_for_delay(
     ticks = delay_ticks(info, period)
     if not ticks:
         return 0.0
-    felt = felt_period(info, period)
-    late = minimum_damping(coupling, felt, delay=ticks, axis=axis)
-    return max(0.0, late - minimum_damping(coupling, felt, axis=axis))
+    own_period = device_period(info, period)
+    late = minimum_damping(coupling, own_period, delay=ticks, axis=axis)
+    return max(0.0, late - minimum_damping(coupling, own_period, axis=axis))
 
 
 # Device damping required by a coupling
@@ -81,22 +81,23 @@ rest, which 3e-3 approximates to 1e-5."""
 def required_damping(
     coupling: Coupling,
     period: float,
-    laws: int = 1,
+    law_evaluations: int = 1,
     axis: Literal["translation", "rotation"] = "translation",
 ) -> float:
     """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
 
-    K and B are those of the law (``Method.used``), not the effective ones. With one law per tick b
-    = K T/2 + B. With n laws per tick the handle moves by an n-th of its step for each, and the mean
-    wrench is sent. There is no closed form; b is the smallest value for which
+    K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
+    evaluation of the law per tick b = K T/2 + B. With n evaluations of the law per tick the handle
+    moves by an n-th of its step for each, and the mean wrench is sent. There is no closed form; b
+    is the smallest value for which
 
         Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
         f_i = K e_i + (nB/T) δe_i,   e = h − x
 
-    for every motion. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one law it is
-    the whole slack. The search finds b frequency by frequency as the smallest value of a quadratic
-    form over the n deflections e_i. For B = 0, b grows with n (for strict environments it is K T
-    n/2, because the mean comes late); for B > K T it falls towards B.
+    for every motion. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one
+    evaluation it is the whole slack. The search finds b frequency by frequency as the smallest
+    value of a quadratic form over the n deflections e_i. For B = 0, b grows with n (for strict
+    environments it is K T n/2, because the mean comes late); for B > K T it falls towards B.
 
     The form is sufficient for any environment within its share of the slack; strict environments
     need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at n = 2, 4, 8. The
@@ -106,7 +107,7 @@ def required_damping(
     Args:
         coupling: K and B of the law.
         period: T of the device in s.
-        laws: n, 1 to ``MAX_SUBSTEPS``.
+        law_evaluations: n, 1 to ``MAX_SUBSTEPS``.
         axis: Kind of axis.
 
     Raises:
@@ -115,25 +116,25 @@ def required_damping(
     References:
         Brown & Colgate 1997, eq. (6), for n = 1.
     """
-    if checked_substeps(laws, CouplingError) == 1:
+    if checked_substeps(law_evaluations, CouplingError) == 1:
         return float(minimum_damping(coupling, period, axis=axis))
     is_linear = axis == "translation"
     k = coupling.stiffness if is_linear else coupling.rotational_stiffness
-    b = (coupling.damping if is_linear else coupling.rotational_damping) * laws / period
+    b = (coupling.damping if is_linear else coupling.rotational_damping) * law_evaluations / period
     if k == 0.0:
-        return float(b * period / laws)
-    identity, ones = np.eye(laws), np.full(laws, 1.0 / laws)
+        return float(b * period / law_evaluations)
+    identity, ones = np.eye(law_evaluations), np.full(law_evaluations, 1.0 / law_evaluations)
     most = 0.0
     for theta in np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES):
         z = np.exp(1j * theta)
-        difference = identity - np.eye(laws, k=-1) + 0j
+        difference = identity - np.eye(law_evaluations, k=-1) + 0j
         difference[0, -1] -= 1 / z  # last deflection of the previous tick
         law = k * identity + b * difference
         form = law.conj().T @ difference
         slack = 0.5 * SLACK_SHARE * (k + b)
         form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
         linear = 0.5 * law.conj().T @ ((z - 1) * ones) + slack * difference.conj().T @ ones
-        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / laws
+        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / law_evaluations
         most = max(most, float(gained))
     return most * period
 
@@ -142,11 +143,11 @@ def required_damping_with_delay(
     info: DeviceInfo,
     coupling: Coupling,
     period: float,
-    laws: int,
+    law_evaluations: int,
     axis: Literal["translation", "rotation"] = "translation",
 ) -> float:
     """Returns the damping needed by a device with its own rate and delay."""
-    needed = required_damping(coupling, felt_period(info, period), laws, axis)
+    needed = required_damping(coupling, device_period(info, period), law_evaluations, axis)
     return needed + damping_for_delay(info, coupling, period, axis)
 
 
@@ -186,26 +187,26 @@ def default_coupling(
     period: float,
     scale: float = 1.0,
     force_scale: float = 1.0,
-    laws: int = 1,
+    law_evaluations: int = 1,
     method: Method | None = None,
 ) -> Coupling:
     """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
     The result is the requested coupling: K and B = B' + the method's own damping, so that the law
-    uses B' without clipping. It needs 85 % of b. If several laws per tick or a delay need more, K
-    and B' are lowered together to meet it, separately for each kind of axis; ``required_damping``
-    is linear in both.
+    uses B' without clipping. It needs 85 % of b. If several evaluations per tick or a delay need
+    more, K and B' are lowered together to meet it, separately for each kind of axis;
+    ``required_damping`` is linear in both.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
-        laws: Evaluations of the wrench per tick (substeps).
+        law_evaluations: Evaluations of the wrench per tick (substeps).
         method: Rendering method; None takes ``rendering.default_method``.
 
     Raises:
-        CouplingError: The number of laws, a scale or the period is out of range.
+        CouplingError: The number of evaluations, a scale or the period is out of range.
     """
     for name, value in (("scale", scale), ("force_scale", force_scale)):
         if not math.isfinite(value) or value <= 0:
@@ -213,17 +214,20 @@ def default_coupling(
     damping, rotational = assumed_damping(info)
     damping /= scale * force_scale
     rotational *= scale / force_scale
-    coupling = stiffest_coupling(damping, rotational, felt_period(info, period))
-    checked_substeps(laws, CouplingError)
-    method = default_method(laws) if method is None else method
-    if laws == 1 and not delay_ticks(info, period):
-        return method.rendered(coupling, period)
+    coupling = stiffest_coupling(damping, rotational, device_period(info, period))
+    checked_substeps(law_evaluations, CouplingError)
+    method = default_method(law_evaluations) if method is None else method
+    if law_evaluations == 1 and not delay_ticks(info, period):
+        return method.requested_coupling(coupling, period)
     shrink = min(
-        1.0, NEEDED_SHARE * damping / required_damping_with_delay(info, coupling, period, laws)
+        1.0,
+        NEEDED_SHARE
+        * damping
+        / required_damping_with_delay(info, coupling, period, law_evaluations),
     )
-    needed = required_damping(coupling, period, laws, "rotation")
+    needed = required_damping(coupling, period, law_evaluations, "rotation")
     if info.turns:
-        needed = required_damping_with_delay(info, coupling, period, laws, "rotation")
+        needed = required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
     shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
     shrunk = Coupling(
         stiffness=shrink * coupling.stiffness,
@@ -231,7 +235,7 @@ def default_coupling(
         rotational_stiffness=shrink_rotation * coupling.rotational_stiffness,
         rotational_damping=shrink_rotation * coupling.rotational_damping,
     )
-    return method.rendered(shrunk, period / laws)
+    return method.requested_coupling(shrunk, period / law_evaluations)
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +285,7 @@ def device_conditions(
     period: float,
     scale: float,
     force_scale: float,
-    laws: int = 1,
+    law_evaluations: int = 1,
     method: Method | None = None,
 ) -> tuple[DampingCondition, ...]:
     """Returns the condition for each kind of axis of a device with known translational damping.
@@ -296,7 +300,7 @@ def device_conditions(
         period: T in s.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
-        laws: Evaluations of the wrench per tick (substeps).
+        law_evaluations: Evaluations of the wrench per tick (substeps).
         method: Rendering method, which decides the remedy; None for one that uses the damping as
             requested.
 
@@ -306,14 +310,18 @@ def device_conditions(
     conditions = []
     if info.damping is not None:
         delay = delay_ticks(info, period)
-        needed = scale * force_scale * required_damping_with_delay(info, coupling, period, laws)
+        needed = (
+            scale
+            * force_scale
+            * required_damping_with_delay(info, coupling, period, law_evaluations)
+        )
         remedy = _remedy(method, coupling.damping)
         conditions.append(DampingCondition("translation", needed, info.damping, remedy, delay))
         if info.turns:
             needed = (
                 force_scale
                 / scale
-                * required_damping_with_delay(info, coupling, period, laws, "rotation")
+                * required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
             )
             remedy = _remedy(method, coupling.rotational_damping)
             conditions.append(
@@ -328,7 +336,7 @@ def required_axis_damping(
     period: float,
     scale: float,
     force_scale: float,
-    laws: int,
+    law_evaluations: int,
     method: Method,
 ) -> tuple[float, float]:
     """Returns the damping that a coupling needs, in N s/m and N m s/rad; 0 without a condition.
@@ -337,7 +345,9 @@ def required_axis_damping(
     """
     if not method.has_coupling:
         return 0.0, 0.0
-    conditions = device_conditions(info, coupling, period, scale, force_scale, laws, method)
+    conditions = device_conditions(
+        info, coupling, period, scale, force_scale, law_evaluations, method
+    )
     needed = {condition.axis: condition.needed for condition in conditions}
     return needed.get("translation", 0.0), needed.get("rotation", 0.0)
 
@@ -348,7 +358,7 @@ def _remedy(method: Method | None, used: float) -> str:
     For a method that subtracts its own damping, a softer spring or a shorter period raises B' by as
     much as it saves, or more. While B' > 0, only a lower B helps.
     """
-    if method is None or method.lag == 0.0:
+    if method is None or method.compensated_share == 0.0:
         return "lower stiffness or damping, or raise the rate"
     return "lower the damping" if used > 0 else "lower the stiffness, or raise the rate"
 
@@ -364,7 +374,7 @@ def run_conditions(
         return ()
     return device_conditions(
         info,
-        parameters.felt or parameters.coupling,
+        parameters.effective or parameters.coupling,
         parameters.period,
         parameters.scale,
         parameters.force_scale,

@@ -45,11 +45,11 @@ class Clock(Protocol):
 
     Attributes:
         name: "real" or "simulated", as in the recording's metadata.
-        is_lossless: True if the loop may wait for the recorder instead of dropping records.
+        may_wait: True if the loop may wait for the recorder instead of dropping records.
     """
 
     name: str
-    is_lossless: bool
+    may_wait: bool
 
     def start(self, period_ns: int) -> None:
         """Starts or resumes time with the period in ns; the first deadline is one period away."""
@@ -95,7 +95,7 @@ class RealClock:
     """
 
     name = "real"
-    is_lossless = False
+    may_wait = False
 
     def __init__(self) -> None:
         self._period = self._spin = self._origin = self._deadline = 0
@@ -131,7 +131,7 @@ class SimulatedClock:
     """Time that advances only by ticks, as fast as the loop runs; equal in every run."""
 
     name = "simulated"
-    is_lossless = True
+    may_wait = True
 
     def __init__(self) -> None:
         self._period = self._now = 0

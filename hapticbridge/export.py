@@ -17,7 +17,7 @@ from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra
 from hapticbridge.record import Column, columns_of
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.recording.format import Timeline, due_times
+from hapticbridge.recording.timeline import Timeline, due_times
 from hapticbridge.run_description import meta_float
 
 # Interface of table writers.

@@ -145,12 +145,12 @@ def draw(
 
 def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
     """Draws with the renderer of MUJOCO_GL, or the first that works; returns its name."""
-    asked = os.environ.get("MUJOCO_GL")
-    for renderer in [asked] if asked else RENDERERS:
+    requested = os.environ.get("MUJOCO_GL")
+    for renderer in [requested] if requested else RENDERERS:
         if _draw_with(renderer, job, progress):
             return renderer
-    if asked:
-        raise HapticBridgeError(f"MUJOCO_GL={asked} does not work here; try egl or osmesa")
+    if requested:
+        raise HapticBridgeError(f"MUJOCO_GL={requested} does not work here; try egl or osmesa")
     raise HapticBridgeError(_NONE_WORKS)
 
 

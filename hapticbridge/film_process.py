@@ -20,7 +20,8 @@ from PIL import Image
 from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.recording import RecordingFile, Timeline, open_recording
+from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.timeline import Timeline
 from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4

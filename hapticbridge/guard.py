@@ -25,7 +25,7 @@ from hapticbridge.record import SAMPLE_DTYPE
 LONGEST_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""
 
-USUAL_RISE = 2e-3
+USUAL_SLEW_TIME = 2e-3
 """Shortest time in s from zero wrench to its limit. A coupling of 2400 N/m produces 10 N in 2 ms at
 2 m/s, faster than a hand taps. A longer time delays true contacts, and delay creates energy; a
 shorter one passes a jump of the scene as a blow."""
@@ -51,9 +51,9 @@ class Limits:
     Attributes:
         force: Largest norm of the force in N, > 0; a larger force keeps its direction.
         torque: Largest norm of the torque in N m, > 0.
-        rise: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
+        slew_time: Shortest time in s from zero to the limits, >= 0; 0 allows steps.
         ramp: Time in s of the linear rise at the start, 0 to 60. It takes longer if the coupling
-            stores much energy meanwhile (``kernel.guard``).
+            stores much energy meanwhile (``kernel.tick_guard``).
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
@@ -68,7 +68,7 @@ class Limits:
 
     force: float
     torque: float
-    rise: float = USUAL_RISE
+    slew_time: float = USUAL_SLEW_TIME
     ramp: float = 0.5
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
@@ -82,8 +82,10 @@ class Limits:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
         if not 0 <= self.ramp <= LONGEST_RAMP:
             raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
-        if not 0 <= self.rise <= LONGEST_RAMP:
-            raise DeviceError(f"rise is {self.rise!r} s; it must be 0 to {LONGEST_RAMP:g}")
+        if not 0 <= self.slew_time <= LONGEST_RAMP:
+            raise DeviceError(
+                f"slew time is {self.slew_time!r} s; it must be 0 to {LONGEST_RAMP:g}"
+            )
         for name, unit in (("stretch", "m"), ("energy", "J"), ("reach", "m")):
             value = getattr(self, name)
             if value is not None and not value > 0:
@@ -102,15 +104,21 @@ class Limits:
         """Returns the length of the ramp in ticks of ``period`` seconds."""
         return round(self.ramp / period)
 
-    def rises(self, period: float) -> tuple[float, float]:
+    def slew_limits(self, period: float) -> tuple[float, float]:
         """Returns the largest change of force (N) and torque (N m) per tick."""
-        if self.rise == 0:
+        if self.slew_time == 0:
             return math.inf, math.inf
-        return self.force * period / self.rise, self.torque * period / self.rise
+        return self.force * period / self.slew_time, self.torque * period / self.slew_time
 
 
 UNLIMITED = Limits(
-    force=1e30, torque=1e30, rise=0.0, ramp=0.0, stretch=math.inf, angle=math.inf, energy=math.inf
+    force=1e30,
+    torque=1e30,
+    slew_time=0.0,
+    ramp=0.0,
+    stretch=math.inf,
+    angle=math.inf,
+    energy=math.inf,
 )
 """No limits, for simulations without a device; no finite force comes near."""
 
@@ -286,7 +294,7 @@ def with_remedy(reason: str) -> str:
 CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}
 """Passivity controllers by name."""
 
-SURPLUS = 0.05
+ENERGY_CREDIT = 0.05
 """Energy credit in J that earlier dissipation may provide. A default coupling stores 0.021 J at 10
 N and contacts behind it about as much; their release must not count as activity. A larger credit
 lets a larger kick pass before the controller acts."""
@@ -346,13 +354,10 @@ def guard_parameters_for(
     needed: tuple[float, float] = (0.0, 0.0),
     scale: float = 1.0,
     controller: str | None = None,
-    clutch: int = 0,
-    dead_man: int = 0,
-    is_absolute: bool = False,
 ) -> GuardParameters:
-    """Returns the guard's parameters for a run.
+    """Returns the guard's parameters for a run without buttons and with relative poses.
 
-    A device with prescribed motion has no hand; it gets limits, slew and buttons only.
+    A device with prescribed motion has no hand; it gets limits and slew only.
 
     Args:
         info: The device. Unknown damping is replaced by ``certificate.assumed_damping``; with
@@ -367,18 +372,12 @@ def guard_parameters_for(
             than the coupling needs, else ``environment``. With enough damping the device port needs
             no controller. A spring turned far beyond the torque limit returns more than the credit
             covers, and an account of both ports would then blame a passive run.
-        clutch: Bit of the button that lets the device move without the handle; 0 without one.
-        dead_man: Bit of the button that must be held for any force; 0 without one.
-        is_absolute: True if the device's pose is a pose in the scene; it is then not re-anchored
-            before the first tick.
     """
-    force_rise, torque_rise = limits.rises(period)
+    force_slew, torque_slew = limits.slew_limits(period)
     common = GuardParameters(
-        force_rise=force_rise,
-        torque_rise=torque_rise,
+        force_slew=force_slew,
+        torque_slew=torque_slew,
         fade_ticks=max(round(FADE / period), 1),
-        clutch=clutch,
-        dead_man=dead_man,
         stretch=limits.stretch * scale,
         angle=limits.angle,
         reach=limits.reach_of(info),
@@ -395,17 +394,17 @@ def guard_parameters_for(
     return replace(
         common,
         controller=CONTROLLERS[controller or ("environment" if is_borne else "damper")],
-        credit=credit[0],
-        rotational_credit=credit[1],
-        most_damping=min(linear, math.inf if info.mass is None else info.mass / period),
-        most_rotational_damping=min(
+        assumed_damping=credit[0],
+        assumed_rotational_damping=credit[1],
+        max_damping=min(linear, math.inf if info.mass is None else info.mass / period),
+        max_rotational_damping=min(
             angular,
             math.inf if info.rotational_inertia is None else info.rotational_inertia / period,
         ),
-        surplus=SURPLUS,
+        energy_credit_limit=ENERGY_CREDIT,
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         longest_stall=max(LONGEST_STALL, STALL_PERIODS * period),
-        reseats=not is_absolute,
+        reanchors_at_start=True,
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict, cast
 
 import numpy as np
@@ -289,26 +289,29 @@ class RunSetup:
             period_of(options.rate),
             options.substeps,
         )
-        scales, laws = options.workspace.scales, method.law_evaluations(substeps)
+        scales, law_evaluations = options.workspace.scales, method.law_evaluations(substeps)
         if options.mark is not None and not is_recorded:
             raise RecordingError(
                 f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
                 " name a file to record to"
             )
         refuse_simulated_time(info, clock)
-        requested = coupling or default_coupling(info, period, *scales, laws, method)
-        law = method.used(requested, period / substeps)
+        requested = coupling or default_coupling(info, period, *scales, law_evaluations, method)
+        law = method.law_coupling(requested, period / substeps)
         limits = limits_for(info, options.limits)
         guard = guard_parameters_for(
             info,
             limits,
             period,
-            needed=required_axis_damping(info, law, period, *scales, laws, method),
+            needed=required_axis_damping(info, law, period, *scales, law_evaluations, method),
             scale=scales[0],
             controller=options.controller,
+        )
+        guard = replace(
+            guard,
             clutch=button_mask(options.clutch, "clutch"),
             dead_man=button_mask(options.dead_man, "dead-man"),
-            is_absolute=options.workspace.absolute,
+            reanchors_at_start=guard.reanchors_at_start and not options.workspace.absolute,
         )
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
         is_real_clock = clock.name == RealClock.name
@@ -333,12 +336,12 @@ class RunSetup:
     @property
     def law(self) -> Coupling:
         """Coupling of the law: K and B', for which the device needs b >= s (K T/2 + B')."""
-        return self.method.used(self.coupling, self.period / self.substeps)
+        return self.method.law_coupling(self.coupling, self.period / self.substeps)
 
     @property
     def attainable(self) -> Coupling:
         """Requested coupling, with damping raised to the least that the method can render."""
-        return self.method.rendered(self.law, self.period / self.substeps)
+        return self.method.requested_coupling(self.law, self.period / self.substeps)
 
     @property
     def law_evaluations(self) -> int:
@@ -371,7 +374,7 @@ class RunSetup:
             HapticBridgeError: A value is out of range.
         """
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
-        damping, rotational_damping = self.info.burning_damping
+        damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
         is_absolute = self.workspace.absolute
         return RunParameters(
@@ -389,7 +392,7 @@ class RunSetup:
             handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,
             scheme=self.method.scheme,
-            felt=effective,
+            effective=effective,
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,
             device_rotational_damping=rotational_damping,

@@ -29,7 +29,7 @@ class TickFlag(IntFlag):
         STALE_SAMPLE: The device had no new sample since the previous tick.
         TRIP: The guard stopped the run in this tick and sent zero wrench. A tick that is not finite
             is not recorded; the event ``trip`` names it.
-        RESEATED: The coupling was re-anchored before this tick: the handle was set to the tool at
+        REANCHORED: The coupling was re-anchored before this tick: the handle was set to the tool at
             the device's present pose, and the wrench rises from zero again.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
@@ -45,7 +45,7 @@ class TickFlag(IntFlag):
     STALE_SAMPLE = 256
     TRIP = 512
     MIDPOINT = 1024
-    RESEATED = 2048
+    REANCHORED = 2048
 
 
 TICK_DTYPE = np.dtype(

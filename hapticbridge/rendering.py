@@ -14,7 +14,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
 from hapticbridge.kernel.codes import WELD_NAME, Scheme, has_law, law_evaluations
-from hapticbridge.kernel.coupling import Gains
+from hapticbridge.kernel.law import Gains
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.scene import Scene
@@ -22,8 +22,8 @@ from hapticbridge.scene.checks import check_massless_tool, check_metered
 from hapticbridge.scene.contacts import warn_of_contacts
 from hapticbridge.scene.handle import check_weldable, measured_weld
 from hapticbridge.theory.compensation import (
-    IMPLICIT_LAG,
-    MIDPOINT_LAG,
+    IMPLICIT_SHARE,
+    MIDPOINT_SHARE,
     effective_damping,
     law_damping,
 )
@@ -42,12 +42,12 @@ class Method:
         integrator: MuJoCo's integrator by its MJCF name.
         discretization: Discretisation of the coupling's damper in the bounds; ``none`` without a
             law.
-        compensated: True if the actuators get K h of extra damping, h the time step. It turns the
-            implicit integration of velocity into one of position too.
-        lag: Share of K h that is subtracted from the requested damping because the integration adds
-            it; no unit.
-        adds: Share of K h that the integration adds to the damping, subtracted or not; None if it
-            adds another amount or removes some.
+        has_extra_damping: True if the actuators get K h of extra damping, h the time step. It turns
+            the implicit integration of velocity into one of position too.
+        compensated_share: Share of K h that is subtracted from the requested damping because the
+            integration adds it; no unit.
+        added_share: Share of K h that the integration adds to the damping, subtracted or not; None
+            if it adds another amount or removes some.
     """
 
     name: str
@@ -56,9 +56,9 @@ class Method:
     scheme: Scheme
     integrator: str
     discretization: str = "backward"
-    compensated: bool = False
-    lag: float = 0.0
-    adds: float | None = None
+    has_extra_damping: bool = False
+    compensated_share: float = 0.0
+    added_share: float | None = None
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
@@ -96,16 +96,17 @@ class Method:
             return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
         if self.scheme not in (Scheme.IMPLICIT, Scheme.MIDPOINT):
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        more = timestep if self.compensated else 0.0
+        more = timestep if self.has_extra_damping else 0.0
         k, b = coupling.stiffness, coupling.damping
         kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return (b, k, b + k * more), (br, kr, br + kr * more)
 
-    def used(self, coupling: Coupling, timestep: float) -> Coupling:
-        """Returns the law's coupling for a requested one: B' = max(B − lag K h, 0).
+    def law_coupling(self, coupling: Coupling, timestep: float) -> Coupling:
+        """Returns the law's coupling for a requested one: B' = max(B − compensated_share K h, 0).
 
-        The integration adds lag K h again; rotation follows the same rule. The device needs b >= K
-        T/2 + B', so the subtracted damping allows more stiffness. ``timestep`` is MuJoCo's h in s.
+        The integration adds compensated_share K h again; rotation follows the same rule. The device
+        needs b >= K T/2 + B', so the subtracted damping allows more stiffness. ``timestep`` is
+        MuJoCo's h in s.
 
         Raises:
             CouplingError: The time step is not finite and > 0.
@@ -115,25 +116,25 @@ class Method:
         """
         return self._with_damping(coupling, timestep, law_damping)
 
-    def rendered(self, used: Coupling, timestep: float) -> Coupling:
-        """Returns the requested coupling for the law's one: B = B' + lag K h.
+    def requested_coupling(self, law: Coupling, timestep: float) -> Coupling:
+        """Returns the requested coupling for the law's one: B = B' + compensated_share K h.
 
         It is also the effective coupling, except for methods that do not subtract their own damping
-        (``adds``).
+        (``added_share``).
         """
-        return self._with_damping(used, timestep, effective_damping)
+        return self._with_damping(law, timestep, effective_damping)
 
     def _with_damping(
         self, coupling: Coupling, timestep: float, damping: Callable[..., float]
     ) -> Coupling:
-        if self.lag == 0.0:
+        if self.compensated_share == 0.0:
             return coupling
         k, b = coupling.stiffness, coupling.damping
         kr, br = coupling.rotational_stiffness, coupling.rotational_damping
         return replace(
             coupling,
-            damping=damping(k, b, timestep, self.lag),
-            rotational_damping=damping(kr, br, timestep, self.lag),
+            damping=damping(k, b, timestep, self.compensated_share),
+            rotational_damping=damping(kr, br, timestep, self.compensated_share),
         )
 
 
@@ -159,14 +160,14 @@ IMPLICIT = Method(
     hazard="",
     scheme=Scheme.IMPLICIT,
     integrator="discrete",
-    adds=IMPLICIT_LAG,
+    added_share=IMPLICIT_SHARE,
 )
 
 COMPENSATED = replace(
     IMPLICIT,
     name="compensated",
     about="implicit, with the damping K T that its integration adds taken off the coupling's",
-    lag=IMPLICIT_LAG,
+    compensated_share=IMPLICIT_SHARE,
 )
 
 LOSSLESS_COUPLING = Method(
@@ -176,8 +177,8 @@ LOSSLESS_COUPLING = Method(
     hazard="",
     scheme=Scheme.MIDPOINT,
     integrator="discrete",
-    lag=MIDPOINT_LAG,
-    adds=MIDPOINT_LAG,
+    compensated_share=MIDPOINT_SHARE,
+    added_share=MIDPOINT_SHARE,
 )
 
 METHODS = {method.name: method for method in (IMPLICIT, COMPENSATED, LOSSLESS_COUPLING)}
@@ -290,7 +291,7 @@ def prepare(
         warns: True to warn of contacts that may create energy at this time step.
 
     Returns:
-        The measured effective coupling of a weld, for ``RunParameters.felt``; None for other
+        The measured effective coupling of a weld, for ``RunParameters.effective``; None for other
         methods.
 
     Raises:
@@ -308,10 +309,10 @@ def prepare(
     if warns and method.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT):
         warn_of_contacts(scene.model, scene.grip, scene.path)
     step = period / substeps
-    scene.set_gains(*method.gains(method.used(coupling, step), step))
-    felt = measured_weld(scene.model, scene.grip) if method.scheme == Scheme.WELD else None
+    scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
+    effective = measured_weld(scene.model, scene.grip) if method.scheme == Scheme.WELD else None
     scene.reset()
-    return felt
+    return effective
 
 
 def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Method) -> None:
@@ -337,9 +338,12 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
                 f"the weld has K = {gains[0]!r}, B = {gains[1]!r}, the metadata say "
                 f"{coupling.stiffness!r}, {coupling.damping!r}"
             )
-        felt, measured = parameters.felt or coupling, measured_weld(model, parameters.grip)
+        effective, measured = (
+            parameters.effective or coupling,
+            measured_weld(model, parameters.grip),
+        )
         for item in fields(Coupling):
-            claimed, true = getattr(felt, item.name), getattr(measured, item.name)
+            claimed, true = getattr(effective, item.name), getattr(measured, item.name)
             if not math.isclose(claimed, true, rel_tol=MEASURED_AGAIN):
                 raise SceneError(
                     f"{item.name.replace('_', ' ')} of the weld is {true:.6g} in SI units, the "

@@ -212,7 +212,7 @@ def describe_run(
 ) -> dict[str, str]:
     """Returns the recording's metadata; ``parameters_of`` is the inverse."""
     coupling = parameters.coupling
-    felt = parameters.felt
+    effective = parameters.effective
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
     meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
     meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
@@ -225,7 +225,7 @@ def describe_run(
         "ramp_ticks": str(parameters.ramp_ticks),
         "guard": parameters.guarding.to_json(),
         "method": method,
-        "felt": json.dumps(felt and [getattr(felt, name) for name in _GAINS]),
+        "felt": json.dumps(effective and [getattr(effective, name) for name in _GAINS]),
         "discretization": method_named(method).discretization,
         "grip": parameters.grip,
         "clock": clock,
@@ -242,7 +242,7 @@ def describe_run(
     }
 
 
-def _felt(meta: Mapping[str, str], method: Method) -> Coupling | None:
+def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
     """Returns a weld's measured coupling; None for other methods."""
     if method.scheme != Scheme.WELD:
         return None
@@ -263,7 +263,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     try:
         method = method_named(meta.get("method", ""))
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
-        burning, rotational = (None, None) if device is None else device.burning_damping
+        damping, rotational = (None, None) if device is None else device.dissipating_damping
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
@@ -279,9 +279,9 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             handle_origin=meta_numbers(meta, "handle_origin", 7),
             device_start=meta_numbers(meta, "device_start", 7),
             scheme=method.scheme,
-            felt=_felt(meta, method),
+            effective=_effective(meta, method),
             contact_stiffness=meta_float(meta, "contact_stiffness"),
-            device_damping=burning,
+            device_damping=damping,
             device_rotational_damping=rotational,
             guarding=GuardParameters.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
         )

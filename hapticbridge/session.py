@@ -96,14 +96,14 @@ class RecordOutput:
     live: bool = False
 
     def open_stream(
-        self, period: float, snapshot: Snapshot | None, *, is_lossless: bool
+        self, period: float, snapshot: Snapshot | None, *, may_wait: bool
     ) -> RecordStream:
         """Returns the ring of the records; the files are opened when the stream is started.
 
         Args:
             period: T in s.
             snapshot: Shared memory with the scene's positions, for the observer.
-            is_lossless: True if the loop may wait for the recorder.
+            may_wait: True if the loop may wait for the recorder.
 
         Raises:
             RecordingError: There is no memory for the ring.
@@ -112,7 +112,7 @@ class RecordOutput:
             self.path,
             period,
             live=self.live,
-            is_lossless=is_lossless,
+            may_wait=may_wait,
             observer=self.observer,
             snapshot=str(snapshot and snapshot.name),
         )
@@ -252,9 +252,7 @@ class Session:
         self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
         if self._snapshot is not None:
             resources.callback(self._snapshot.close)
-        self.stream = self.output.open_stream(
-            setup.period, self._snapshot, is_lossless=clock.is_lossless
-        )
+        self.stream = self.output.open_stream(setup.period, self._snapshot, may_wait=clock.may_wait)
         resources.callback(self.stream.close)
         sample = np.zeros(1, SAMPLE_DTYPE)
         self.kernel = TickKernel(sample, self.stream)

@@ -52,15 +52,15 @@ def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
     Yields a list of callbacks. While it is empty a signal raises KeyboardInterrupt; otherwise the
     last callback receives the signal's name.
     """
-    told: list[Callable[[str], None]] = []
+    callbacks: list[Callable[[str], None]] = []
 
     def heed(name: str) -> None:
-        if not told:
+        if not callbacks:
             raise KeyboardInterrupt
-        told[-1](name)
+        callbacks[-1](name)
 
     with stopping_on_signals(heed):
-        yield told
+        yield callbacks
 
 
 @contextmanager

@@ -19,12 +19,12 @@ from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method
-from hapticbridge.theory.compensation import IMPLICIT_LAG, effective_damping
+from hapticbridge.theory.compensation import IMPLICIT_SHARE, effective_damping
 
 # Sentences on the effective coupling and its law.
 
 
-def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
+def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
     """Returns True if a lossless coupling stays implicit because the tool is never free.
 
     References:
@@ -34,7 +34,7 @@ def is_always_held(model: mujoco.MjModel, grip: str) -> bool:
     return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
 
 
-def was_always_held(ticks: NDArray[np.void]) -> bool:
+def was_always_implicit(ticks: NDArray[np.void]) -> bool:
     """Returns True if no record of a run was lossless; False without records."""
     return was_never_lossless(len(ticks), int(np.bitwise_or.reduce(ticks["flags"])))
 
@@ -45,7 +45,7 @@ def was_never_lossless(count: int, flags: int) -> bool:
 
 
 def coupling_sentences(
-    law: Coupling, method: Method, period: float, substeps: int, *, is_always_held: bool = False
+    law: Coupling, method: Method, period: float, substeps: int, *, is_always_implicit: bool = False
 ) -> tuple[str, ...]:
     """Describes effective and law coupling: translation, then rotation if it has a spring.
 
@@ -59,8 +59,8 @@ def coupling_sentences(
         method: The rendering method; without a coupling law there are no sentences.
         period: T in s.
         substeps: MuJoCo steps per tick.
-        is_always_held: True if the tool of a lossless coupling is never free. The coupling is then
-            always implicit and adds the implicit form's damping. No effect on other methods.
+        is_always_implicit: True if the tool of a lossless coupling is never free. The coupling is
+            then always implicit and adds the implicit form's damping. No effect on other methods.
     """
     if not method.has_law:
         return ()
@@ -68,9 +68,9 @@ def coupling_sentences(
     if law.rotational_stiffness > 0:
         rotation = law.rotational_stiffness, law.rotational_damping
         kinds.append(_AxisGains("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
-    name, adds = method.name, method.adds
-    if is_always_held and method.scheme == Scheme.MIDPOINT:
-        name, adds = f"{name}, here always implicit,", IMPLICIT_LAG
+    name, adds = method.name, method.added_share
+    if is_always_implicit and method.scheme == Scheme.MIDPOINT:
+        name, adds = f"{name}, here always implicit,", IMPLICIT_SHARE
     return tuple(_sentence(name, adds, period / substeps, substeps, kind) for kind in kinds)
 
 
@@ -118,15 +118,15 @@ class Ledger:
         coupling_work: Work of the coupling on the tool, Σ f_k·δx_k + τ_k·δφ_k.
         actuator_work: Work of the scene's own actuators.
         external_work: Work of applied forces, gravity compensation, moved mocap bodies and resets.
-        tuning_work: Work on the coupling's spring by commands (``kernel.coupling``).
+        tuning_work: Work on the coupling's spring by commands (``kernel.law``).
         environment_energy: Σ E_k: energy created (> 0) or dissipated (< 0) by the simulation.
         device_energy: Energy given to the device by the wrenches sent.
         slack: Bound of Σ E_k up to which the guarantee holds.
         slack_share: Largest share of the slack used so far; 0 if always strict.
         first_unstrict: First tick at which (14) did not hold, or None.
         first_active: First tick at which the slack was exceeded, or None.
-        first_kick: First tick at which a device without a coupling law had received more than its
-            damping dissipates and the scene released, or None.
+        first_device_excess: First tick at which a device without a coupling law had received more
+            than its damping dissipates and the scene released, or None.
     """
 
     kinetic: float
@@ -141,7 +141,7 @@ class Ledger:
     slack_share: float
     first_unstrict: int | None
     first_active: int | None
-    first_kick: int | None
+    first_device_excess: int | None
 
     @classmethod
     def of(cls, state: NDArray[np.void]) -> Ledger:
@@ -150,7 +150,7 @@ class Ledger:
         values = {name: float(energy[name]) for name in _ENERGIES}
         ticks = [int(energy[name]) for name in _TICKS]
         unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
-        return cls(**values, first_unstrict=unstrict, first_active=active, first_kick=kick)
+        return cls(**values, first_unstrict=unstrict, first_active=active, first_device_excess=kick)
 
     @property
     def environment(self) -> Environment:
@@ -162,7 +162,7 @@ class Ledger:
     @property
     def fault(self) -> tuple[int, str] | None:
         """Tick and port of the first fault, ``environment`` or ``device``; None if passive."""
-        faults = ((self.first_active, "environment"), (self.first_kick, "device"))
+        faults = ((self.first_active, "environment"), (self.first_device_excess, "device"))
         found = [(tick, port) for tick, port in faults if tick is not None]
         return min(found) if found else None
 
@@ -184,7 +184,7 @@ _ENERGIES = (
     "slack_share",
 )
 
-_TICKS = ("first_unstrict", "first_active", "first_kick")
+_TICKS = ("first_unstrict", "first_active", "first_device_excess")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +230,7 @@ class Summary:
             one.
         requested: Requested coupling: K and B to be felt.
         law: Coupling of the law, with the damping B' of the device condition.
-        rendered: Sentences on effective and law coupling. They hold away from contact, or
+        coupling_sentences: Sentences on effective and law coupling. They hold away from contact, or
             everywhere if the tool was never released.
         effective: Effective coupling of a weld (its stiffest axis, measured at the start); None
             with a coupling law.
@@ -262,7 +262,7 @@ class Summary:
     hazard: str
     requested: Coupling
     law: Coupling
-    rendered: tuple[str, ...]
+    coupling_sentences: tuple[str, ...]
     effective: Coupling | None
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
@@ -305,14 +305,14 @@ class Summary:
             hazard=method.hazard,
             requested=requested,
             law=parameters.coupling,
-            rendered=coupling_sentences(
+            coupling_sentences=coupling_sentences(
                 parameters.coupling,
                 method,
                 parameters.period,
                 parameters.substeps,
-                is_always_held=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
+                is_always_implicit=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
             ),
-            effective=parameters.felt,
+            effective=parameters.effective,
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
             is_certified=is_run_certified(conditions, method),

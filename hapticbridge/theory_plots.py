@@ -58,18 +58,18 @@ class Alternative:
     spectrum: tuple[_Array, _Array] | None
 
 
-def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
+def alternatives(requested: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
     """Returns the requirements of a coupling by method, and by each way around the bound.
 
     The methods with a guarantee come first, the default one leading. Each uses the damping B' of
-    ``Method.used``; if that would be negative, the effective damping exceeds the requested one.
-    Laws with B' = B follow: at half the period; with a first-order low-pass behind the damper; with
-    Tustin's damper; with one sample of delay against a wall, and for any environment. Last is a
-    lossless transmission line of equal static stiffness, with impedance Z = K T and one sample each
-    way, terminated by the device.
+    ``Method.law_coupling``; if that would be negative, the effective damping exceeds the requested
+    one. Laws with B' = B follow: at half the period; with a first-order low-pass behind the damper;
+    with Tustin's damper; with one sample of delay against a wall, and for any environment. Last is
+    a lossless transmission line of equal static stiffness, with impedance Z = K T and one sample
+    each way, terminated by the device.
 
     Args:
-        felt: Requested K and B; only the translation counts.
+        requested: Requested K and B; only the translation counts.
         period: T in s, finite and > 0.
         filter_time: τ in s of the low-pass, >= 0.
 
@@ -86,7 +86,7 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         scheme: Discretization = "backward",
         delay: int = 0,
         low_pass: float = 0.0,
-        law: Coupling = felt,
+        law: Coupling = requested,
     ) -> Alternative:
         needed = minimum_damping(
             law, step, discretization=scheme, delay=delay, filter_time=low_pass
@@ -101,14 +101,14 @@ def alternatives(felt: Coupling, period: float, filter_time: float) -> tuple[Alt
         return Alternative(name, needed, float(worst), (frequency, spectrum))
 
     def by(method: Method) -> Alternative:
-        used = method.used(felt, period)
-        shown = effective_damping(used.stiffness, used.damping, period, method.adds or 0.0)
+        used = method.law_coupling(requested, period)
+        shown = effective_damping(used.stiffness, used.damping, period, method.added_share or 0.0)
         name = f"method {method.name}: B = {shown:.4g} felt, B' = {used.damping:.4g}"
         return way(name, law=used)
 
     methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
-    line = transmission_line_spectrum(felt.stiffness * period, period, frequency)
+    line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B
     anywhere = Alternative("B' = B, one tick late, any environment", float("inf"), None, None)
     return (
@@ -165,7 +165,7 @@ def draw_alternatives(
 
 def recommended(z: ZWidth) -> Coupling:
     """Returns the corner as a requested coupling of the default method, without clipping of B'."""
-    return default_method().rendered(z.corner, z.period)
+    return default_method().requested_coupling(z.corner, z.period)
 
 
 def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | None = None) -> Figure:

@@ -25,7 +25,7 @@ class UnpacedClock:
     """Real time that never waits, so that the records' times tell how long each tick took."""
 
     name = "unpaced"
-    is_lossless = True
+    may_wait = True
 
     def start(self, period_ns: int) -> None:
         """Does nothing: there is no deadline."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.energy import EnergyBalance, energy_balances
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.guard import AuditedBlock
 from hapticbridge.audit.state import AuditState
+from hapticbridge.audit.wrench_limits import AuditedBlock
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -208,7 +208,7 @@ class SlowClock(SimulatedClock):
         late: Ticks that begin late, by a share of the period below 1.
     """
 
-    is_lossless = False
+    may_wait = False
 
     def __init__(self, stalls: Mapping[int, int], late: Mapping[int, float] | None = None) -> None:
         super().__init__()

@@ -29,7 +29,7 @@ def made_up(
         "panel",
         Setting(METHODS[method], period, substeps, contact, iterations),
         Cost(cost, cost * (1 - spread), cost * (1 + spread), 1.0, 1.0, 1.0, 3),
-        Score(felt=felt, created=0.0, verdict=verdict),
+        Score(jnd=felt, created=0.0, verdict=verdict),
         limit_apart=limit_apart,
     )
 

@@ -20,8 +20,8 @@ from emulated.virtual_usb import VirtualClock, VirtualLink, VirtualTime
 
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.device import Device, SimulatedDevice
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.falcon.device import FalconDevice
-from hapticbridge.device.family import ignore_message
 from hapticbridge.device.haply.device import HaplyDevice
 from hapticbridge.device.haply.device import opened as open_haply
 from hapticbridge.device.pid.device import PidDevice, open_pid
@@ -64,7 +64,7 @@ class FalconBench:
         self.told: list[str] = []
 
     def opened(self, **options: Any) -> FalconDevice:
-        return FalconDevice(self.link, tell=self.told.append, **options)
+        return FalconDevice(self.link, notify=self.told.append, **options)
 
     def clock(self, drift: float = 0.0) -> VirtualClock:
         clock = VirtualClock(self.time, drift)

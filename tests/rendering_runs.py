@@ -70,7 +70,7 @@ def rendered(
         coupling,
         substeps=substeps,
         scheme=chosen.scheme,
-        felt=felt,
+        effective=felt,
         contact_stiffness=resolve_contact_stiffness(chosen, coupling, contact_stiffness),
         **changes,
     )
@@ -160,7 +160,7 @@ COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 
 
 FREE = Limits(
-    force=100.0, torque=10.0, rise=0.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
+    force=100.0, torque=10.0, slew_time=0.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
 )
 
 

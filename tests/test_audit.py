@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.audit import audit
 from hapticbridge.audit.energy import energy_deviations
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.guard import wrench_deviations
 from hapticbridge.audit.motion import turn_between
+from hapticbridge.audit.wrench_limits import wrench_deviations
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -202,13 +202,13 @@ def test_certificate_is_the_device_condition_with_what_is_used(
         rotational_stiffness=rotational_stiffness,
         rotational_damping=5e-4,
     )
-    felt = METHODS[method].rendered(used, 1e-3)
+    felt = METHODS[method].requested_coupling(used, 1e-3)
     recorded(path, "point_mass", "simulated", felt, duration=0.05, method=method)
     assert float(read_recording(path).meta["damping"]) == pytest.approx(0.5)  # the law's
     report = audit(path)
     assert report.verdict == "passive"
     assert report.certified is certified
-    assert "B' = 0.5" in report.rendered[0]
+    assert "B' = 0.5" in report.coupling_sentences[0]
     assert report.exit_code == (0 if certified else 1)
     assert any("<" in sentence for sentence in report.conditions) is not certified
 

@@ -162,7 +162,7 @@ def balance(path: Path, damping: float | None = None, rotational: float = 1.0) -
 
 def unpaid(path: Path, damping: float | None = None, rotational: float = 1.0) -> np.ndarray:
     """Returns what the device of a recording was given beyond what is paid for, in J."""
-    return balance(path, damping, rotational).unpaid_energy
+    return balance(path, damping, rotational).excess_device_energy
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_what_the_scene_creates_within_its_slack_is_not_the_devices_fault(
     created = found.environment_energy
     assert created.max() > 1e-9
     assert np.all(created <= found.slack + 1e-12)
-    assert found.unpaid_energy.max() <= 1e-12
+    assert found.excess_device_energy.max() <= 1e-12
 
 
 class Turning(ScriptedDevice):

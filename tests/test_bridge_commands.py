@@ -104,7 +104,7 @@ def test_a_run_with_commands_is_repeated_bit_for_bit_and_passive(
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.certified is True
-    assert "changed the coupling 2 times, last to K = 3000 N/m" in report.rendered[-1]
+    assert "changed the coupling 2 times, last to K = 3000 N/m" in report.coupling_sentences[-1]
     assert (summary.verdict, summary.is_certified) == ("passive", True)
     # on the way no tick asks more of the device than both ends do
     assert max(script.bound) <= 2.0 * (1 + 1e-12)
@@ -155,7 +155,9 @@ def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squ
     assert summary.energies["tuning_work"] == pytest.approx(500.0 * 2e-3**2, rel=0.03)
     assert summary.energies["tuning_work"] == pytest.approx(grown(path, 1000.0), rel=1e-9)
     # the audit says so too, from its own sum
-    assert f"which gave the coupling {grown(path, 1000.0):.3g} J" in audit(path).rendered[-1]
+    assert (
+        f"which gave the coupling {grown(path, 1000.0):.3g} J" in audit(path).coupling_sentences[-1]
+    )
     climb = np.diff(script.stiffness)[250 : 250 + STEPS]
     np.testing.assert_allclose(climb, 1000.0 / STEPS, rtol=1e-9)
     assert summary.energies["environment_energy"] <= 1e-9
@@ -184,7 +186,7 @@ def test_a_change_of_turning_stiffness_gives_half_of_it_times_the_angle_squared(
     assert event["rotational_stiffness"] == 3.0
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    assert "K_r = 3 N m/rad" in report.rendered[-1]
+    assert "K_r = 3 N m/rad" in report.coupling_sentences[-1]
     # the torque in the end is that of the new spring
     last = 2 * np.arccos(np.sum(both[0][-1] * both[1][-1]))
     assert ticks["wrench_on_tool"][-1, 4] == pytest.approx(3.0 * last, rel=0.02)
@@ -310,7 +312,7 @@ def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> N
 
     def on_tick(bridge: Bridge, tick: int) -> None:
         script(bridge, tick)
-        given.append(float(bridge.session.kernel.bound.state["observer"]["energy_to_device"][0]))
+        given.append(float(bridge.session.kernel.bound.state["observer"]["net_device_energy"][0]))
 
     run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
     # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated

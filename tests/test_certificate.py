@@ -15,7 +15,7 @@ from hapticbridge.certificate import (
     default_coupling,
     delay_ticks,
     device_conditions,
-    felt_period,
+    device_period,
     is_certified,
 )
 from hapticbridge.clock import SimulatedClock
@@ -41,10 +41,10 @@ def test_a_delay_counts_in_whole_ticks_upwards(delay: float | None, ticks: int |
 
 
 def test_a_device_slower_than_the_loop_is_judged_by_its_own_period() -> None:
-    assert felt_period(info(rate=500.0), T) == 2e-3
-    assert felt_period(info(rate=4000.0), T) == T
-    assert felt_period(info(rate=None), T) == T
-    assert felt_period(info(rate=500.0, is_prescribed=True), T) == T
+    assert device_period(info(rate=500.0), T) == 2e-3
+    assert device_period(info(rate=4000.0), T) == T
+    assert device_period(info(rate=None), T) == T
+    assert device_period(info(rate=500.0, is_prescribed=True), T) == T
     (slow,) = device_conditions(info(rate=500.0), SPRING, T, 1.0, 1.0)
     assert slow.needed == pytest.approx(SPRING.stiffness * 2e-3 / 2)
 
@@ -90,8 +90,8 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
 @pytest.mark.parametrize("laws", [1, 4])
 def test_the_default_coupling_meets_the_condition_with_margin(delay: float, laws: int) -> None:
     late = info(delay=delay)
-    felt = default_coupling(late, T, laws=laws)
-    coupling = default_method(laws).used(felt, T / laws)
+    felt = default_coupling(late, T, law_evaluations=laws)
+    coupling = default_method(laws).law_coupling(felt, T / laws)
     (condition,) = device_conditions(late, coupling, T, 1.0, 1.0, laws)
     assert condition.needed <= NEEDED_SHARE * 2.0 * (1 + 1e-9)
     assert condition.needed > 0.7 * 2.0

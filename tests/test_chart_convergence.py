@@ -102,7 +102,7 @@ def test_rk4_turns_a_free_body_with_fourth_order_and_euler_with_first() -> None:
     workload = open_workload("spinning_body", Extent(periods[0], periods[-1]))
     found = [score(workload, "explicit:rk4", period) for period in periods]
     assert order([each.angle_peak for each in found], periods) == pytest.approx(4, abs=0.3)
-    assert order([each.felt for each in found], periods) == pytest.approx(4, abs=0.3)
+    assert order([each.jnd for each in found], periods) == pytest.approx(4, abs=0.3)
     euler = [score(spinning(), "explicit", period).angle_peak for period in FINE]
     assert order(euler) == pytest.approx(1, abs=0.05)
     lossless = [score(spinning(), "lossless", period).angle_peak for period in FINE]
@@ -114,7 +114,7 @@ def test_energy_alone_would_not_tell_a_wrong_spin() -> None:
     lossy, active = (score(spinning(), name, 1e-3) for name in ("implicitfast", "explicit"))
     assert lossy.verdict == "strict"
     assert active.verdict == "active"
-    assert lossy.felt == pytest.approx(active.felt, rel=0.02)
+    assert lossy.jnd == pytest.approx(active.jnd, rel=0.02)
 
 
 def test_wrong_mass_shows_as_a_worse_point(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,8 +128,8 @@ def test_wrong_mass_shows_as_a_worse_point(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(free_bodies, "load_scene", heavier)
     wrong = score(free_bodies.DrivenMass(COUPLING, GRID, FINE[-1]), "explicit", 5e-4)
-    assert wrong.felt > 5 * right.felt
-    assert wrong.felt > 1
+    assert wrong.jnd > 5 * right.jnd
+    assert wrong.jnd > 1
 
 
 def test_coupling_that_would_turn_the_spinning_body_is_refused() -> None:
@@ -151,7 +151,7 @@ def test_rod_that_meets_a_damped_contact_is_nearer_to_an_impact_without_rebound(
     key = workload.panels[0].key
     shipped = workload.run(Setting(METHODS["implicit"], 1e-3)).scores()[key]
     damped = workload.run(Setting(METHODS["implicit"], 1e-3, contact="damped")).scores()[key]
-    assert damped.felt < shipped.felt / 2
+    assert damped.jnd < shipped.jnd / 2
 
 
 @lru_cache
@@ -166,10 +166,10 @@ def test_settled_peg_is_nearer_to_the_rigid_one_the_stiffer_its_contacts() -> No
         for contact in ("2 steps", "soft")
     )
     assert stiff.position_peak < 2e-5
-    assert stiff.felt < 0.2
+    assert stiff.jnd < 0.2
     assert abs(stiff.stiffness) < 0.02
     assert soft.position_peak > 10 * stiff.position_peak
-    assert soft.felt > 1
+    assert soft.jnd > 1
 
 
 def test_peg_that_never_reaches_its_hole_has_lost_contact() -> None:
@@ -216,7 +216,7 @@ def test_central_limit_is_one_of_the_coupling_that_was_asked_for() -> None:
 def test_sliding_block_converges_to_the_closed_form(method: str) -> None:
     workload = open_workload("sliding_block", Extent(GRID, FINE[-1]))
     coarse, fine = (score(workload, method, period) for period in (1e-3, 2.5e-4))
-    assert fine.felt < coarse.felt / 2
+    assert fine.jnd < coarse.jnd / 2
     assert fine.position_peak < 3e-5
     assert fine.verdict == "strict"
 
@@ -224,7 +224,7 @@ def test_sliding_block_converges_to_the_closed_form(method: str) -> None:
 def test_reference_of_a_scene_is_said_to_be_no_truth() -> None:
     workload = open_workload("virtual_wall", Extent(GRID, 1e-3))
     assert not workload.panels[0].is_truth
-    found = [score(workload, "implicit", period).felt for period in (4e-3, 1e-3)]
+    found = [score(workload, "implicit", period).jnd for period in (4e-3, 1e-3)]
     assert found[1] < found[0]
     with pytest.raises(Exception, match="no reference that is true for every engine"):
         workload.peer_work()

@@ -79,13 +79,13 @@ class Altered:
 def score(engine: Engine, name: str, period: float) -> float:
     """Returns the error in JND in the first panel."""
     run = EngineRun(engine, workload(name).peer_work(), Setting(METHODS["explicit"], period))
-    return run.scores()[workload(name).panels[0].key].felt
+    return run.scores()[workload(name).panels[0].key].jnd
 
 
 def test_mujoco_as_a_peer_errs_as_the_held_method_of_the_bridge_does() -> None:
     setting = Setting(METHODS["explicit"], FINE)
     own = workload("point_mass").run(setting).scores()["driven"]
-    assert score(open_engine("mujoco"), "point_mass", FINE) == pytest.approx(own.felt, rel=1e-6)
+    assert score(open_engine("mujoco"), "point_mass", FINE) == pytest.approx(own.jnd, rel=1e-6)
 
 
 def test_engine_with_a_wrong_mass_shows_as_a_worse_point() -> None:
@@ -135,7 +135,7 @@ def test_peers_are_points_at_every_step_and_only_where_the_reference_is_true() -
     assert {each.panel for each in chart.measurements} == {"settled"}
     (point,) = chart.measurements
     assert point.score.verdict == "not metered"
-    assert point.score.felt < 0.5
+    assert point.score.jnd < 0.5
     assert not point.is_sound
     assert "implicitfast" in str(point.chosen["engine_settings"])
     assert "documentation" in str(point.chosen["engine_settings"])
@@ -218,7 +218,7 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     assert broken.cost.median > 0  # of the 300 steps that it came
     point = next(p for p in summary_of(chart)["points"] if p["error_verdict"] == "failed")
     assert point["error_reason"] == said
-    assert point["error_felt"] is None
+    assert point["error_jnd"] is None
 
 
 def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:

@@ -83,7 +83,7 @@ def written(found: Lean, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_over_modelled_peg_is_three_times_cheaper_within_one_jnd(found: Lean) -> None:
     assert found.result.cost and found.result.cost < 1 / 3
-    assert found.result.felt and found.result.felt.felt <= 1.0
+    assert found.result.error and found.result.error.jnd <= 1.0
     assert found.result.environment == "strict"
     taken = {trial.name for trial in found.together}
     assert {"primitives", "nothing only seen", "usual tolerance", "condim 3"} <= taken
@@ -112,12 +112,12 @@ def test_lean_peg_does_its_task(written: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_each_step_together_is_cheaper_than_the_one_before_and_within_budget(found: Lean) -> None:
     costs = [1.0, *(trial.cost or 0.0 for trial in found.together)]
     assert all(later < 0.96 * earlier for earlier, later in itertools.pairwise(costs))
-    assert all(trial.felt and trial.felt.felt <= 1.0 for trial in found.together)
+    assert all(trial.error and trial.error.jnd <= 1.0 for trial in found.together)
     assert found.result.cost == pytest.approx(costs[-1])
 
 
 def test_smaller_budget_takes_less(found: Lean, monkeypatch: pytest.MonkeyPatch) -> None:
-    felt = {trial.name: trial.felt.felt for trial in found.alone if trial.felt}
+    felt = {trial.name: trial.error.jnd for trial in found.alone if trial.error}
     assert 0.1 < felt["primitives"] < 1.0
     motion, every = own_motion("peg_in_hole", 2.0, speed=2.0), lean.all_simplifications
     two = "primitives", "usual tolerance"
@@ -171,7 +171,7 @@ def felt_of(draft: SceneVariant, motion: Motion, name: str) -> float:
     changed = draft.copy()
     assert freedoms(draft, motion)[name](changed)
     before, after = (each.rehearsed(motion).records for each in (draft, changed))
-    return felt_error(before, after).felt
+    return felt_error(before, after).jnd
 
 
 def test_free_tool_keeps_the_axes_that_it_uses(tmp_path: Path) -> None:
@@ -275,8 +275,8 @@ def test_scene_with_includes_and_meshes_is_written_elsewhere(with_files: Path) -
     target.parent.mkdir(parents=True)
     trial = write_lean(replace(lean, draft=kept), target)
     asked = lean.judge.judge("", "", kept)
-    assert trial.felt and asked.felt
-    assert trial.felt.felt == pytest.approx(asked.felt.felt, abs=1e-3)
+    assert trial.error and asked.error
+    assert trial.error.jnd == pytest.approx(asked.error.jnd, abs=1e-3)
     text = target.read_text(encoding="utf-8")
     assert 'file="../../meshes/tool.obj"' in text
     assert "<include" not in text
@@ -309,11 +309,11 @@ def test_table_picture_and_facts_hold_every_trial_by_name(found: Lean, tmp_path:
     with (tmp_path / "lean.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["name"] for row in rows] == [*alone, *together, "lean"]
-    assert float(rows[-1]["felt_jnd"]) == found.result.felt.felt  # type: ignore[union-attr]
+    assert float(rows[-1]["felt_jnd"]) == found.result.error.jnd  # type: ignore[union-attr]
     facts = json.loads(json.dumps(lean_facts(found), allow_nan=False))
     assert [trial["name"] for trial in facts["alone"]] == alone
     drawn = [text.get_text() for text in draw_lean(found, "peg").axes[0].texts]
-    felt = [trial.name for trial in found.alone if trial.felt]
+    felt = [trial.name for trial in found.alone if trial.error]
     assert sorted(drawn) == sorted(felt + [f"{k}: {name}" for k, name in enumerate(together, 1)])
     with pytest.raises(SceneError, match="cannot write the table"):
         write_table(found, tmp_path / "no" / "lean.csv")

@@ -36,7 +36,7 @@ FORCES = np.random.default_rng(1).normal(0.0, 2.0, (500, 3))
 
 def test_force_seven_percent_larger_is_one_just_noticeable_difference() -> None:
     felt = felt_error(records(FORCES), records(1.07 * FORCES))
-    assert felt.felt == pytest.approx(1.0, abs=1e-12)
+    assert felt.jnd == pytest.approx(1.0, abs=1e-12)
     assert felt.force_rms == pytest.approx(0.07 * np.sqrt((FORCES**2).sum(axis=1).mean()))
     assert felt.force_peak == pytest.approx(0.07 * np.linalg.norm(FORCES, axis=1).max())
 
@@ -59,13 +59,13 @@ def test_spring_seven_percent_stiffer_is_one_just_noticeable_difference(tmp_path
         done.append(SceneVariant(source, "grip", Setting(coupling)).rehearsed(Motion(time, path)))
     felt = felt_error(done[0].records, done[1].records)
     # 10 g swing with 0.05 N at most beside 3.8 N, and damping adds as little
-    assert felt.felt == pytest.approx(1.0, abs=0.01)
+    assert felt.jnd == pytest.approx(1.0, abs=0.01)
 
 
 def test_difference_below_the_absolute_threshold_is_not_felt_however_small_the_force() -> None:
     faint = np.full((100, 3), [1e-3, 0.0, 0.0])
     felt = felt_error(records(faint), records(faint + np.array([FORCE_FLOOR / 2, 0, 0])))
-    assert felt.felt == pytest.approx(0.5)
+    assert felt.jnd == pytest.approx(0.5)
     assert felt.force_threshold == FORCE_FLOOR
 
 
@@ -74,11 +74,11 @@ def test_torque_counts_as_a_force_on_a_lever_until_it_is_large_itself() -> None:
     twist = np.array([0.0, 0.0, 1.0])
     arm = LEVER * WEBER * 2.0
     small = felt_error(records(push), records(push, np.full((100, 3), arm * twist)))
-    assert small.felt == small.torque == pytest.approx(1.0)
+    assert small.jnd == small.torque == pytest.approx(1.0)
     assert small.force == 0.0
     before = np.full((100, 3), 0.5 * twist)
     large = felt_error(records(push, before), records(push, (1 + WEBER) * before))
-    assert large.felt == pytest.approx(1.0)
+    assert large.jnd == pytest.approx(1.0)
     assert large.torque_threshold == pytest.approx(WEBER * 0.5)
 
 
@@ -93,7 +93,7 @@ def test_pose_error_is_the_largest_distance_and_angle() -> None:
     felt = felt_error(first, second)
     assert felt.position_peak == pytest.approx(5e-6)
     assert felt.angle_peak == pytest.approx(2e-7, rel=1e-6)
-    assert felt.felt == 0.0
+    assert felt.jnd == 0.0
 
 
 @pytest.mark.parametrize("count", [500, 501])

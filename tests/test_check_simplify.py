@@ -142,8 +142,8 @@ TEN_DOWN = through((0.4, (0, 0, -0.01), NOWHERE), (0.1, (0, 0, -0.01), NOWHERE))
 def test_what_stays_clear_may_go_and_what_comes_near_stays(tmp_path: Path, name: str) -> None:
     clear = judged(draft_of(tmp_path, with_obstacle(2 * CLEARANCE)), TEN_DOWN, name)
     assert clear.verdict == MAY_GO
-    assert clear.felt is not None
-    assert clear.felt.force_peak == 0.0
+    assert clear.error is not None
+    assert clear.error.force_peak == 0.0
     assert clear.loses == "in this motion"
     # not touched, but too near to promise anything
     assert tried(draft_of(tmp_path, with_obstacle(0.5 * CLEARANCE)), TEN_DOWN, name) is None

@@ -13,7 +13,7 @@ from emulated.pid_model import PidStick
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
 from hapticbridge.device.discovery import RULES_FILE, plugged_devices, udev_rules
-from hapticbridge.device.family import (
+from hapticbridge.device.driver import (
     RULES_COMMAND,
     Driver,
     FoundDevice,
@@ -23,7 +23,7 @@ from hapticbridge.device.family import (
 from hapticbridge.device.force_dimension.dhd import VARIABLE
 from hapticbridge.device.haply import device as haply
 from hapticbridge.device.pid import device as effects
-from hapticbridge.device.registry import DRIVERS, all_families
+from hapticbridge.device.registry import DRIVERS, all_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_bus
 from hapticbridge.device.transport import usb as usb_search
@@ -66,7 +66,7 @@ class Nothing:
 
 def test_what_a_device_calls_itself_cannot_steer_a_terminal() -> None:
     plugged = FoundDevice(
-        family="rawhid",
+        driver="rawhid",
         name="a\x1b[31mb\n",
         serial="\x071\u202e2",
         path="/dev/hidraw0",
@@ -86,7 +86,7 @@ def test_devices_never_fails_on_a_machine_without_usb(
     monkeypatch.setattr(hid_search, "hid_api", lambda: None)
     code, out, err = call("devices")
     assert (code, err) == (0, "")
-    for family in all_families():
+    for family in all_drivers():
         assert f"{family.name}: {family.about}" in out
     assert "none; 'simulated' and 'trajectory:FILE' need none" in out
     assert "hidapi cannot be loaded, so HID devices are not seen" in out
@@ -103,7 +103,7 @@ def test_devices_runs_on_this_machine_whatever_it_has(call: Called) -> None:
 def test_who_stands_still_reads_what_becomes_of_each_devices_force(call: Called) -> None:
     code, out, _ = call("devices")
     assert code == 0
-    told = {family.name: family.on_stall for family in all_families()}
+    told = {family.name: family.on_stall for family in all_drivers()}
     assert [name for name, words in told.items() if not words] == ["spacemouse"]  # has no force
     shown = " ".join(out.split())
     for words in filter(None, told.values()):
@@ -137,7 +137,7 @@ def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
 
 def listed(problem: str | None, serial: str = "") -> FoundDevice:
     return FoundDevice(
-        family="rawhid", name="[red]Te\x1bensy", serial=serial, path="/dev/hidraw0", vendor=0x16C0,
+        driver="rawhid", name="[red]Te\x1bensy", serial=serial, path="/dev/hidraw0", vendor=0x16C0,
         product=0x0486, transport="hid", problem=problem,
     )  # fmt: skip
 
@@ -171,9 +171,9 @@ def test_the_rules_name_every_product_once_and_sort_before_the_seat(call: Called
     code, out, _ = call("devices", "--udev-rules")
     assert (code, out) == (0, udev_rules())
     rules = [line for line in out.splitlines() if line and not line.startswith("#")]
-    assert len(rules) == len(set(rules)) == sum(len(family.ids) for family in all_families())
+    assert len(rules) == len(set(rules)) == sum(len(family.ids) for family in all_drivers())
     assert all(rule.endswith('TAG+="uaccess"') for rule in rules)
-    for family in all_families():
+    for family in all_drivers():
         for usb_id in family.ids:
             if family.transport == "hid":
                 match = f'SUBSYSTEM=="hidraw", KERNELS=="*:{str(usb_id).upper()}.*"'
@@ -188,7 +188,7 @@ def test_the_rules_name_every_product_once_and_sort_before_the_seat(call: Called
 def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus: Path) -> None:
     plug(bus, "1-1", "0403:cb48", name="FALCON HAPTIC", serial="FT000001")
     (device,) = plugged_devices()
-    assert (device.family, device.name, device.serial) == ("falcon", "FALCON HAPTIC", "FT000001")
+    assert (device.driver, device.name, device.serial) == ("falcon", "FALCON HAPTIC", "FT000001")
     assert device.problem is not None
     assert "libusb cannot be loaded" in device.problem
 
@@ -200,7 +200,7 @@ def test_a_hid_device_is_listed_by_the_kernels_word_where_hidapi_is_missing(
     assert plugged_devices() == []  # where hidapi is there, it lists what has a node
     monkeypatch.setattr(hid_search, "hid_api", lambda: None)
     (device,) = plugged_devices()
-    assert (device.family, device.serial) == ("rawhid", "77")
+    assert (device.driver, device.serial) == ("rawhid", "77")
     code, _, err = call("run", "peg_in_hole", "--device", "rawhid")
     assert code == 2
     assert "hidapi cannot be loaded; 'pip install hidapi' installs it" in err
@@ -243,7 +243,7 @@ def test_the_bus_is_read_without_opening_anything(bus: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "family", [f for f in all_families() if f.find is None], ids=lambda family: family.name
+    "family", [f for f in all_drivers() if f.find is None], ids=lambda family: family.name
 )
 def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     call: Called, family: Driver, bus: Path
@@ -293,7 +293,7 @@ def test_a_class_gets_a_rule_for_each_product_that_is_plugged_in(
     seam.plugged[2].product = 0x4802
     monkeypatch.setattr(hid_search, "hid_api", lambda: seam)
     plugged = plugged_devices()
-    assert [(one.family, one.serial, one.product) for one in plugged] == [
+    assert [(one.driver, one.serial, one.product) for one in plugged] == [
         ("pid", "A", 0x4801),
         ("pid", "B", 0x4801),
         ("pid", "P1", 0x4802),
@@ -325,7 +325,7 @@ def test_how_often_a_device_is_asked_is_read_where_the_kernel_shows_it(
     assert hid_search.polling("/dev/hidraw4") == (None, None)
 
 
-@pytest.mark.parametrize("family", all_families(), ids=lambda family: family.name)
+@pytest.mark.parametrize("family", all_drivers(), ids=lambda family: family.name)
 def test_hardware_and_fast_are_refused_together_before_anything_is_opened(
     call: Called, monkeypatch: pytest.MonkeyPatch, family: Driver
 ) -> None:

@@ -308,7 +308,7 @@ def test_no_random_passive_hand_turns_a_certified_coupling_unstable_or_active(
 ) -> None:
     info, method = SimulatedDevice().info, METHODS[name]
     coupling = default_coupling(info, T, method=method)
-    assert is_certified(device_conditions(info, method.used(coupling, T), T, 1.0, 1.0))
+    assert is_certified(device_conditions(info, method.law_coupling(coupling, T), T, 1.0, 1.0))
     for seed in range(20):
         outcome = point_mass.run(
             SimulatedDevice(hand=random_hand(seed), path=STILL),

@@ -63,7 +63,7 @@ def test_the_sliders_end_where_the_bound_does(method: str, spent: int, back: flo
         stiffest = 2 * (device - spent * other) / T
         max_damped = device + (back - 0.5) * gain * T
         assert span.max_stiffness(other) == pytest.approx(stiffest, rel=1e-9)
-        assert span.most_damping(gain) == pytest.approx(max_damped, rel=1e-9)
+        assert span.max_damping(gain) == pytest.approx(max_damped, rel=1e-9)
         span.check(0.9999 * stiffest, other)
         span.check(gain, 0.9999 * max_damped)
         for couple in ((1.0001 * stiffest, other), (gain, 1.0001 * max_damped)):

@@ -36,7 +36,7 @@ from hapticbridge.device import (
     SimulatedDevice,
     open_device,
 )
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.rawhid.device import open_rawhid
 from hapticbridge.device.spacemouse import open_spacemouse

@@ -326,7 +326,7 @@ def test_a_falcon_that_falls_silent_while_it_is_homed_is_lost() -> None:
         bench.model.faults.is_mute = True
 
     with pytest.raises(DeviceLost, match="gave no usable reply for 50 ms"):
-        FalconDevice(bench.link, tell=silenced)
+        FalconDevice(bench.link, notify=silenced)
 
 
 def test_rate_and_delay_are_those_of_the_bridges_timer() -> None:

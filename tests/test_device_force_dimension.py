@@ -15,7 +15,7 @@ from device_benches import PERIOD, ticks
 from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
 
 from hapticbridge.device import open_device
-from hapticbridge.device.family import FoundDevice
+from hapticbridge.device.driver import FoundDevice
 from hapticbridge.device.force_dimension import device as forcedimension
 from hapticbridge.device.force_dimension.device import ForceDimensionDevice
 from hapticbridge.device.force_dimension.dhd import MODELS, VARIABLE, Dhd, quaternion_of
@@ -106,14 +106,14 @@ def test_a_limit_that_nobody_knows_must_be_named() -> None:
 def test_what_was_set_is_said_and_gravity_is_the_users_choice() -> None:
     said: list[str] = []
     stub = Stub()
-    device = stub.opened(tell=said.append)
+    device = stub.opened(notify=said.append)
     assert said == ["omega.3: limits 12 N; gravity compensation on, end effector 0.19 kg"]
     assert stub.call("gravity") == 1
     assert device.effector_mass == 0.19
     # what the compensation carries is not the inertia that is felt
     assert device.info.mass is None
     device.close()
-    stub.opened(gravity=False, tell=said.append).close()
+    stub.opened(gravity=False, notify=said.append).close()
     assert stub.call("gravity") == 0
     assert "gravity compensation off" in said[1]
 
@@ -148,7 +148,7 @@ def test_a_device_without_a_watchdog_says_so_and_runs() -> None:
     said: list[str] = []
     stub = Stub()
     stub.call("watchdog", 0)
-    device = stub.opened(tell=said.append)
+    device = stub.opened(notify=said.append)
     device.start(PERIOD)
     assert "has no watchdog (feature not available)" in said[-1]
     assert ticks(device, stub, 3, WRENCH) == [0] * 3
@@ -208,7 +208,7 @@ def test_what_the_library_does_not_know_comes_from_the_profile_of_its_model() ->
     for kind, resolution in ((OMEGA3, 1e-5), (SIGMA7, 1.5e-6), (203, None)):
         stub = Stub(kind)
         stub.call("limits", 15.0, 0.3)
-        device = open_device(f"forcedimension:library={stub.file}", tell=told.append)
+        device = open_device(f"forcedimension:library={stub.file}", notify=told.append)
         device.close()
         assert device.info.resolution == resolution
         assert device.info.damping is None
@@ -269,7 +269,7 @@ def test_another_library_is_told_from_dhd(tmp_path: Path) -> None:
 
 def test_without_library_device_is_listed_with_its_want(monkeypatch: pytest.MonkeyPatch) -> None:
     plugged = FoundDevice(
-        family="forcedimension", name="omega", serial="", path="/dev/bus/usb/001/002",
+        driver="forcedimension", name="omega", serial="", path="/dev/bus/usb/001/002",
         vendor=0x1451, product=0x402, transport="usb", problem=None,
     )  # fmt: skip
     monkeypatch.setenv(VARIABLE, "/no/such.so")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 import hapticbridge as hb
 from hapticbridge.clock import Clock
 from hapticbridge.device import Device, Motion, SimulatedDevice, device_for
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid import device as sheet
 from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.profile import read_profile

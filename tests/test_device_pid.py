@@ -12,7 +12,7 @@ from device_benches import opened_stick as opened
 from emulated.hid_seam import HidSeam
 from emulated.pid_model import PidStick
 
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.pid import device as sheet
 from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
@@ -125,7 +125,7 @@ def test_the_faster_the_bus_the_shorter_the_life() -> None:
         model = PidStick()
         seam, scale = HidSeam(model), sheet.Scale(NEWTONS, TRAVEL, np.ones(2))
         seam.advance(0.0)
-        (plugged,) = find(sheet.FAMILY, seam)
+        (plugged,) = find(sheet.DRIVER, seam)
         link = HidLink.open(plugged, seam, is_overlapped=False, slots=sheet.SLOTS)
         device = PidDevice(link, "fast", scale=scale, intervals=(1e-3, interval))
         device.start(PERIOD)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.device.base import AXES
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost

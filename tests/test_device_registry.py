@@ -12,7 +12,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device import registry as library
-from hapticbridge.device.falcon.device import FAMILY
+from hapticbridge.device.falcon.device import DRIVER
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
 
@@ -53,8 +53,8 @@ def test_a_refused_bridge_lets_go_of_what_it_opened_alone(monkeypatch: pytest.Mo
 
 def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     device = Counted()
-    family = replace(FAMILY, open=lambda *_: device)
-    monkeypatch.setattr(library, "family_named", lambda _: family)
+    family = replace(DRIVER, open=lambda *_: device)
+    monkeypatch.setattr(library, "driver_named", lambda _: family)
 
     def broken(*_: str) -> None:
         raise DeviceError("broken profile")

@@ -319,7 +319,7 @@ def test_friction_ends_its_search_where_only_rounding_moves() -> None:
     hand = Hand(mass=0.0, damping=0.0, stiffness=438704.6)
     for speed in np.linspace(0.6, 0.7, 41):
         path = Motion([0.0, period], np.outer([0.0, speed * period], [1.0, 0.0, 0.0]))
-        device = SimulatedDevice(hand=hand, path=path, **numbers)
+        device = SimulatedDevice(hand=hand, path=path, **numbers)  # type: ignore[arg-type]
         _, velocities = run(device, along_x(np.array([-friction])), period)
         assert velocities[1, 0] == pytest.approx(speed, rel=1e-9)
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import spacemouse as driver
-from hapticbridge.device.family import ignore_message
+from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import SpaceMouseDevice, decoded, open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE
@@ -197,8 +197,8 @@ CADMOUSE = (0xC650, 0xC651, *range(0xC654, 0xC659), 0xC664, 0xC665, 0xC668)
 
 
 def test_flat_mice_of_the_same_maker_are_not_taken_for_one() -> None:
-    products = {(usb_id.vendor, usb_id.product) for usb_id in driver.FAMILY.ids}
-    assert len(products) == len(driver.FAMILY.ids) == 22
+    products = {(usb_id.vendor, usb_id.product) for usb_id in driver.DRIVER.ids}
+    assert len(products) == len(driver.DRIVER.ids) == 22
     assert not products & {(0x256F, product) for product in CADMOUSE}
     assert {(0x046D, 0xC626), (0x256F, 0xC635), (0x256F, 0xC652)} <= products
 

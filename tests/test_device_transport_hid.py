@@ -17,14 +17,14 @@ from emulated.hid_seam import HidSeam
 from emulated.spacemouse_model import SpaceMouse
 from emulated.usb_device import StallError
 
-from hapticbridge.device.family import FoundDevice, UsbId
-from hapticbridge.device.spacemouse import FAMILY
+from hapticbridge.device.driver import FoundDevice, UsbId
+from hapticbridge.device.spacemouse import DRIVER
 from hapticbridge.device.transport import hid as transport_hid
 from hapticbridge.device.transport.hid import QUEUE, HidLink, find
 from hapticbridge.device.transport.trace import VARIABLE, HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
-ECHO = replace(FAMILY, name="echo", ids=(UsbId(EchoHid.vendor, EchoHid.product, "Echo"),))
+ECHO = replace(DRIVER, name="echo", ids=(UsbId(EchoHid.vendor, EchoHid.product, "Echo"),))
 
 
 def linked(device: EchoHid | None = None) -> tuple[HidLink, EchoHid, HidSeam]:
@@ -293,7 +293,7 @@ def test_forbidden_node_is_listed_with_remedy(
 
 
 NOWHERE = FoundDevice(
-    family="rawhid", name="none", serial="", path="/dev/hidraw99", vendor=1, product=2,
+    driver="rawhid", name="none", serial="", path="/dev/hidraw99", vendor=1, product=2,
     transport="hid", problem=None,
 )  # fmt: skip
 

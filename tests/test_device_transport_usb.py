@@ -21,9 +21,9 @@ from emulated.handle import Handle
 from emulated.pyusb_backend import PyusbBackend
 
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.device.falcon.device import FAMILY, FalconDevice, open_falcon
+from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.falcon.device import DRIVER, FalconDevice, open_falcon
 from hapticbridge.device.falcon.protocol import READ_FROM, SIZE, WRITE_TO, encode, enter_run_mode
-from hapticbridge.device.family import ignore_message
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import UsbContext, UsbLink, find, libusb
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -86,9 +86,9 @@ def _opened() -> Iterator[Open]:
     links = []
 
     def opened(host: Host, log: Path | None = None) -> UsbLink:
-        (plugged,) = find(FAMILY, host)
+        (plugged,) = find(DRIVER, host)
         link = UsbLink.open(
-            plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=host, log=HexLog(log)
+            plugged, DRIVER, read_from=READ_FROM, write_to=WRITE_TO, backend=host, log=HexLog(log)
         )
         links.append(link)
         return link
@@ -112,8 +112,8 @@ def test_what_is_plugged_in_is_found_with_name_serial_and_place() -> None:
     libusb()
     other = falcon()
     other.product = 0x6001  # any serial adapter
-    assert find(FAMILY, PyusbBackend()) == find(FAMILY, Host(other)) == []
-    first, second = find(FAMILY, Host(falcon("A1"), falcon("B2")))
+    assert find(DRIVER, PyusbBackend()) == find(DRIVER, Host(other)) == []
+    first, second = find(DRIVER, Host(falcon("A1"), falcon("B2")))
     assert (first.name, first.serial, first.path) == ("FALCON HAPTIC", "A1", "/dev/bus/usb/001/001")
     assert (second.serial, second.path) == ("B2", "/dev/bus/usb/001/002")
     assert (first.vendor, first.product, first.problem) == (0x0403, 0xCB48, None)
@@ -122,7 +122,7 @@ def test_what_is_plugged_in_is_found_with_name_serial_and_place() -> None:
 def test_a_device_that_may_not_be_opened_is_listed_with_its_remedy() -> None:
     host = Host(falcon())
     host.fails["open"] = errno.EACCES
-    (plugged,) = find(FAMILY, host)
+    (plugged,) = find(DRIVER, host)
     assert plugged.problem is not None
     assert "no permission to open /dev/bus/usb/001/001" in plugged.problem
     with pytest.raises(DeviceError, match="no permission to open"):

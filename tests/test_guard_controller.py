@@ -165,7 +165,7 @@ def rubbed_then_shaken(tick: int) -> tuple[float, ...]:
 def test_what_an_environment_burnt_does_not_pay_for_all_that_it_creates_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticbridge.guard.SURPLUS", 1e-4)
+    monkeypatch.setattr("hapticbridge.guard.ENERGY_CREDIT", 1e-4)
     scene, path = tmp_path / "floor.xml", tmp_path / "run.mcap"
     scene.write_text(FLOOR)
     device, coupling = ScriptedDevice(rubbed_then_shaken), Coupling(2000.0, 0.5, 1.0, 5e-4)
@@ -193,16 +193,16 @@ def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     info = SimulatedDevice().info
     limits = limits_for(info, None)
     enough = guard_parameters_for(info, limits, T, needed=(2.0, 2e-3))
-    assert (enough.credit, enough.rotational_credit) == (2.0, 2e-3)
+    assert (enough.assumed_damping, enough.assumed_rotational_damping) == (2.0, 2e-3)
     short = guard_parameters_for(info, limits, T, needed=(2.1, 1e-3))
-    assert (short.credit, short.rotational_credit) == (1.0, 2e-3)
+    assert (short.assumed_damping, short.assumed_rotational_damping) == (1.0, 2e-3)
     assert (enough.controller, short.controller) == (ENVIRONMENT, DAMPER)
     light = guard_parameters_for(SimulatedDevice(mass=1e-3).info, limits, T)
-    assert light.most_damping == pytest.approx(1.0)  # m/T, below b
-    assert light.most_rotational_damping == 2e-3  # b, below I/T
+    assert light.max_damping == pytest.approx(1.0)  # m/T, below b
+    assert light.max_rotational_damping == 2e-3  # b, below I/T
     slight = guard_parameters_for(SimulatedDevice(rotational_inertia=1e-6).info, limits, T)
-    assert slight.most_rotational_damping == pytest.approx(1e-3)
-    assert slight.most_damping == 2.0
+    assert slight.max_rotational_damping == pytest.approx(1e-3)
+    assert slight.max_damping == 2.0
 
 
 @pytest.mark.parametrize("is_turning", [False, True])
@@ -255,7 +255,7 @@ def test_an_hour_of_dissipation_pays_for_no_more_than_the_surplus(axis: int) -> 
     expected[axis] = -0.05
     assert observer["observed_energy"][0] == -0.05
     assert observer["axis_energy"][0].tolist() == expected.tolist()
-    assert observer["energy_to_device"][0] == pytest.approx(-2.0)
+    assert observer["net_device_energy"][0] == pytest.approx(-2.0)
     for _ in range(30):
         move(-1e-3)
     assert observer["observed_energy"][0] == pytest.approx(0.01)

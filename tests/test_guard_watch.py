@@ -36,7 +36,7 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 
 LIMIT = 10.0
-CLUTCH, RESEATED = int(TickFlag.CLUTCH), int(TickFlag.RESEATED)
+CLUTCH, REANCHORED = int(TickFlag.CLUTCH), int(TickFlag.REANCHORED)
 DOWN, UP = 1200, 1500
 
 
@@ -67,7 +67,7 @@ def test_a_clutch_moves_the_device_without_the_handle_and_comes_back_without_a_s
     assert outcome.forces[UP] < 0.01 * LIMIT
     assert np.abs(np.diff(outcome.forces[UP - 1 : UP + 400])).max() < 0.1 * LIMIT
     assert np.flatnonzero(ticks["flags"] & CLUTCH).tolist() == list(range(DOWN, UP))
-    assert np.flatnonzero(ticks["flags"] & RESEATED).tolist() == [UP]
+    assert np.flatnonzero(ticks["flags"] & REANCHORED).tolist() == [UP]
     assert outcome.energy < 0.05
     assert (outcome.report.verdict, outcome.report.resimulation) == ("passive", "bit for bit")
 
@@ -84,7 +84,7 @@ def test_a_clutch_let_go_while_the_force_is_off_puts_the_handle_to_the_tool(tmp_
     assert np.linalg.norm(apart) < 1e-4
     assert np.linalg.norm(np.ptp(ticks["device_position"][DOWN:UP], axis=0)) > 0.01
     assert not outcome.forces[UP : UP + 300].any()
-    assert ticks["flags"][UP] & RESEATED
+    assert ticks["flags"][UP] & REANCHORED
     assert outcome.report.resimulation == "bit for bit"
 
 
@@ -161,14 +161,14 @@ def test_beyond_its_reach_a_device_moves_without_handle_and_force(tmp_path: Path
     out = begun + np.arange(np.argmin(is_out[begun:]))  # the first time that it is there
     assert not ticks["wrench_on_device"][out[0] + 25 : out[-1]].any()
     assert np.ptp(ticks["handle_position"][out], axis=0).max() == 0.0
-    assert ticks["flags"][out[-1] + 1] & RESEATED
+    assert ticks["flags"][out[-1] + 1] & REANCHORED
     assert np.linalg.norm(ticks["wrench_on_device"][out[-1] + 1, :3]) < 0.01 * LIMIT
     # without an edge the same hand presses on
     assert not (free["flags"] & CLUTCH).any()
     assert np.linalg.norm(free["wrench_on_device"][out, :3], axis=1).max() > 5.0
 
 
-@pytest.mark.parametrize("flag", [CLUTCH, RESEATED])
+@pytest.mark.parametrize("flag", [CLUTCH, REANCHORED])
 def test_a_changed_flag_does_not_pass_the_audit(tmp_path: Path, flag: int) -> None:
     run(tmp_path, lambda k: DOWN <= k < UP, clutch=3)
     recording = read_recording(tmp_path / "run.mcap")
@@ -193,7 +193,7 @@ def test_the_wrench_changes_no_faster_than_it_may(
         return (0.005 * steps, 0, 0, 1, 0, 0, 0)
 
     device = ScriptedDevice(moved)
-    limits = Limits(force=10.0, torque=0.5, ramp=0.0, rise=rise)
+    limits = Limits(force=10.0, torque=0.5, ramp=0.0, slew_time=rise)
     with fast("virtual_wall", device, limits=limits) as bridge:
         bridge.run(0.06)
         flags = bridge.latest_records(60)["flags"]
@@ -219,7 +219,7 @@ def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretche
     with fast("point_mass", device) as bridge:
         bridge.run(0.01)
         rows = bridge.latest_records(10)
-    assert rows["flags"][0] & RESEATED
+    assert rows["flags"][0] & REANCHORED
     assert np.abs(rows["wrench_on_tool"][:, :3]).max() < 1e-9
 
 
@@ -321,7 +321,13 @@ def test_what_the_guard_is_not_is_refused(options: dict[str, Any], message: str)
 
 @pytest.mark.parametrize(
     "change",
-    [{"rise": -1.0}, {"stretch": 0.0}, {"angle": 4.0}, {"energy": float("nan")}, {"reach": 0.0}],
+    [
+        {"slew_time": -1.0},
+        {"stretch": 0.0},
+        {"angle": 4.0},
+        {"energy": float("nan")},
+        {"reach": 0.0},
+    ],
 )
 def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(DeviceError, match="it must be"):
@@ -330,7 +336,8 @@ def test_limits_that_cannot_be_are_refused(change: dict[str, float]) -> None:
 
 def test_a_guard_reads_back_as_it_was_written() -> None:
     info = ScriptedDevice(lambda _k: (0,) * 7).info
-    guarding = guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3, clutch=0b100)
+    guarding = guard_parameters_for(info, Limits(force=10.0, torque=0.5), 1e-3)
+    guarding = replace(guarding, clutch=0b100)
     assert GuardParameters.from_json(guarding.to_json()) == guarding
     assert GuardParameters.from_json(UNGUARDED.to_json()) == UNGUARDED
     older = {k: v for k, v in json.loads(guarding.to_json()).items() if k != "reach"}
@@ -338,7 +345,7 @@ def test_a_guard_reads_back_as_it_was_written() -> None:
     for text in ("", "{}", "[1]", guarding.to_json().replace("0.05", '"x"')):
         with pytest.raises(HapticBridgeError, match="guard"):
             GuardParameters.from_json(text)
-    assert not UNLIMITED.rise
+    assert not UNLIMITED.slew_time
 
 
 KILLED = """

@@ -193,7 +193,7 @@ def test_the_run_stays_within_its_travel_and_force_and_ends_without_force() -> N
 def test_the_step_of_a_position_is_exact_and_one_without_steps_has_none() -> None:
     walk = np.cumsum(np.random.default_rng(1).integers(-3, 4, 3000))
     for step in (1e-6, 3.3e-5, 1e-4):
-        assert step_of(step * walk + 0.1) == pytest.approx(step, rel=1e-9)
+        assert step_of(np.asarray(step * walk + 0.1, np.float64)) == pytest.approx(step, rel=1e-9)
     assert step_of(np.sin(np.linspace(0.0, 30.0, 4000))) == 0.0
     assert step_of(np.array([np.nan, 1.0, 1.0])) == 0.0
 
@@ -209,7 +209,7 @@ def test_the_step_of_a_position_is_exact_and_one_without_steps_has_none() -> Non
     ],
 )
 def test_an_estimate_tells_no_digits_that_mean_nothing(estimate: Estimate, told: str) -> None:
-    assert estimate.told() == told
+    assert estimate.as_text() == told
 
 
 STILL = Motion([0.0, 100.0], np.zeros((2, 3)))

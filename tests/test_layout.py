@@ -141,11 +141,11 @@ INTERFACES = {
 WRITERS = {
     "mj": "state",
     "run": "state",
-    "coupling": "coupling",
+    "coupling": "law",
     "pose": "handle",
     "loop": "tick",
     "energy": "ledger",
-    "guard": "guard",
+    "guard": "tick_guard",
     "observer": "passivity_controller",
     "lossless": "lossless",
 }

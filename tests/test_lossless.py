@@ -135,16 +135,18 @@ def test_energy_that_turning_creates_is_given_back(tmp_path: Path) -> None:
 
 def test_damping_used_is_what_the_integration_leaves_and_never_negative() -> None:
     asked = Coupling(1000.0, 5.0, 2.0, 0.0015)
-    used = METHODS["compensated"].used(asked, T)
+    used = METHODS["compensated"].law_coupling(asked, T)
     assert (used.damping, used.rotational_damping) == (4.0, 0.0)
-    used = LOSSLESS.used(asked, T)
+    used = LOSSLESS.law_coupling(asked, T)
     assert used.damping == 4.5
     assert used.rotational_damping == pytest.approx(0.0005)
-    assert LOSSLESS.rendered(used, T) == asked
-    soft = LOSSLESS.used(Coupling(1000.0, 0.1, 2.0, 0.0015), T)
+    assert LOSSLESS.requested_coupling(used, T) == asked
+    soft = LOSSLESS.law_coupling(Coupling(1000.0, 0.1, 2.0, 0.0015), T)
     assert soft.damping == 0.0
-    assert LOSSLESS.rendered(soft, T).damping == 0.5  # the least that this K and T can show
-    assert METHODS["implicit"].used(asked, T) is asked
+    assert (
+        LOSSLESS.requested_coupling(soft, T).damping == 0.5
+    )  # the least that this K and T can show
+    assert METHODS["implicit"].law_coupling(asked, T) is asked
 
 
 @pytest.mark.parametrize(
@@ -158,7 +160,7 @@ def test_worst_hand_needs_half_kt_and_the_damping_used(
 ) -> None:
     # at Nyquist a tool of any mass stands still under the midpoint rule; 1e9 kg is a wall
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    used = METHODS[method].used(asked, T)
+    used = METHODS[method].law_coupling(asked, T)
     needed = share * (0.5 * used.stiffness * T + used.damping)
     hand = WorstHand(needed, np.pi / T, T)
     device = SimulatedDevice(damping=needed, hand=hand)
@@ -191,7 +193,7 @@ def stays(loop: ClosedLoop, asked: Coupling, method: str, hand: WorstHand, axis:
 @pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
 def test_tool_on_a_floor_needs_half_kt_and_the_damping_used(method: str, tmp_path: Path) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    used = METHODS[method].used(asked, T)
+    used = METHODS[method].law_coupling(asked, T)
     loop = ClosedLoop(scene_of(FLOOR, tmp_path))
     for share in (0.98, 1.01):
         hand = WorstHand(share * (0.5 * used.stiffness * T + used.damping), np.pi / T, T)
@@ -203,7 +205,7 @@ def test_free_tool_behind_the_compensated_coupling_needs_what_its_spectrum_says(
     mass: float, tmp_path: Path
 ) -> None:
     asked = Coupling(1000.0, 2.0, 1.0, 0.002)
-    theory = SampledLoop(METHODS["compensated"].used(asked, T), T, mass)
+    theory = SampledLoop(METHODS["compensated"].law_coupling(asked, T), T, mass)
     worst = theory.worst_frequency()
     needed = float(theory.damping_spectrum(worst))
     assert needed < 0.5 * 1.0 + 1.0  # K T/2 + B', which a wall needs
@@ -256,7 +258,7 @@ def test_touch_and_go_errs_by_a_share_of_implicit(
     lossless = error("lossless", felt)
     assert lossless / error("implicit", felt) == pytest.approx(same_felt, rel=0.05)
     # with the same B', so that both need the same device
-    assert lossless / error("implicit", LOSSLESS.used(felt, T)) == pytest.approx(
+    assert lossless / error("implicit", LOSSLESS.law_coupling(felt, T)) == pytest.approx(
         same_device, rel=0.05
     )
 
@@ -305,7 +307,7 @@ def scene_of(xml: str, folder: Path) -> Scene:
 
 def bound(scene: Scene, method: str, asked: Coupling, period: float) -> BoundKernel:
     """Returns a kernel bound to a scene at its start, rendering what is asked for."""
-    used = METHODS[method].used(asked, period)
+    used = METHODS[method].law_coupling(asked, period)
     prepare(scene, asked, period, 1, METHODS[method], warns=False)
     parameters = unlimited(scene, used, period, scheme=METHODS[method].scheme)
     return BoundKernel(scene.model, scene.data, parameters)
@@ -478,9 +480,9 @@ def struck(method: str) -> tuple[Array, float, Array]:
     scene = load_scene("virtual_wall")
     scene.model.body_mass[scene.model.body("tool").id] = 0.03
     mujoco.mj_setConst(scene.model, scene.data)
-    law = METHODS["lossless"].used(Coupling(6000.0, 7.5, 1.0, 0.002), T)
+    law = METHODS["lossless"].law_coupling(Coupling(6000.0, 7.5, 1.0, 0.002), T)
     path = tapping(T, 5.0)[:100]
-    rows, _ = led(scene, method, METHODS[method].rendered(law, T), path, T)
+    rows, _ = led(scene, method, METHODS[method].requested_coupling(law, T), path, T)
     first = int(np.argmax(rows["contacts"] > 0))
     energy: Array = rows["environment_energy"]
     return energy[:first], float(energy.max() - energy[first - 1]), rows["tool_position"][:, 0]

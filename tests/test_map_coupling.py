@@ -50,7 +50,7 @@ def test_worst_hand_on_a_wall_finds_the_bound_within_a_percent(damping: float) -
 @pytest.mark.parametrize("method", ["implicit", "compensated", "lossless", "explicit"])
 def test_the_bound_of_a_method_is_that_of_the_coupling_it_uses(method: str) -> None:
     for k in (500.0, 1500.0, 6000.0):
-        used = METHODS[method].used(Coupling(k, 1.2, 1.0, 0.0), PERIOD)
+        used = METHODS[method].law_coupling(Coupling(k, 1.2, 1.0, 0.0), PERIOD)
         assert used_damping(method, k, 1.2, PERIOD) == pytest.approx(used.damping)
         assert needed_by_6(method, k, 1.2, PERIOD) == pytest.approx(minimum_damping(used, PERIOD))
     limit = limit_by_6(method, DEVICE_DAMPING, PERIOD, 1.2)

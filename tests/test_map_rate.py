@@ -114,7 +114,9 @@ def test_of_no_damper_nothing_is_taken_off_at_uneven_ticks_too(hand: str, timing
             assert other.peak_force == pytest.approx(one.peak_force, rel=1e-4)
             assert other.device_energy == pytest.approx(one.device_energy, rel=1e-4)
     # with a damper they differ
-    told = {name: METHODS[name].used(Coupling(500.0, 1.0, 0, 0), 1e-3) for name in METHODS_SHOWN}
+    told = {
+        name: METHODS[name].law_coupling(Coupling(500.0, 1.0, 0, 0), 1e-3) for name in METHODS_SHOWN
+    }
     assert [used.damping for used in told.values()] == [1.0, 0.5, 0.75]
 
 

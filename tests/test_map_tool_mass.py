@@ -17,8 +17,8 @@ from hapticbridge.lab.maps.tool_mass import (
     DEVICE_DAMPING,
     PERIOD,
     TOOL_MASS,
+    effective_response,
     evaluate,
-    felt,
     held_still,
     min_mass,
     predicted_limit,
@@ -37,7 +37,7 @@ def test_the_theory_here_is_that_of_the_passivity_package(method: str) -> None:
     assert min_mass(method, 1000.0, 2.0, 1e-3) == minimum_mass(coupling, 1e-3, TWINS[method])
     for mass in (0.005, 0.05):
         other = SampledLoop(coupling, 1e-3, mass=mass, integrator=TWINS[method])
-        mine = felt(method, 1000.0, 2.0, mass, 1e-3, angle)
+        mine = effective_response(method, 1000.0, 2.0, mass, 1e-3, angle)
         np.testing.assert_allclose(mine, other.response(angle / 1e-3), rtol=1e-12)
         needed = environment_minimum_damping(coupling, 1e-3, mass, TWINS[method])
         assert worst_angle(method, 1000.0, 2.0, mass, 1e-3)[1] == pytest.approx(needed, rel=1e-6)

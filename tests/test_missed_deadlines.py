@@ -21,7 +21,8 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
 from hapticbridge.guard import Limits
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.recording import Recording, Timeline, due_times, read_recording
+from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording.timeline import Timeline, due_times
 from hapticbridge.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}

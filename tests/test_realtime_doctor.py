@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from hapticbridge.cli import main
-from hapticbridge.device.family import FoundDevice
+from hapticbridge.device.driver import FoundDevice
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.realtime import Grant, Lateness, real_time, stolen_time
 from hapticbridge.realtime import doctor as cyclictest
@@ -116,7 +116,7 @@ def test_what_one_shell_may_is_also_said_for_good(tmp_path: Path) -> None:
 
 def test_forbidden_devices_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     device = FoundDevice(
-        family="falcon", name="Falcon", serial="", path="/dev/bus/usb/001/004", vendor=0x0403,
+        driver="falcon", name="Falcon", serial="", path="/dev/bus/usb/001/004", vendor=0x0403,
         product=0xCB48, transport="usb", problem=None,
     )  # fmt: skip
     locked = replace(device, problem="no permission to open /dev/bus/usb/001/004")
@@ -240,7 +240,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int, int]]:
 
 def test_the_loops_take_turns_and_share_the_time(quick: list[tuple[str, int, int]]) -> None:
     done: list[float] = []
-    result = diagnose(2000.0, 6.0, tell=lambda at, _whole: done.append(at))
+    result = diagnose(2000.0, 6.0, progress=lambda at, _whole: done.append(at))
     assert [name for name, _, _ in quick] == ["bare", "bridge"] * 3
     assert {(period, ticks) for _, period, ticks in quick} == {(500_000, 2000)}
     assert done == [2.0, 4.0, 6.0]

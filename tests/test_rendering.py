@@ -201,7 +201,7 @@ def test_an_option_that_cannot_be_is_refused_wherever_it_enters(
         with pytest.raises(CouplingError, match=message):
             required_damping(LIGHT, T, options["substeps"])
         with pytest.raises(CouplingError, match=message):
-            default_coupling(SimulatedDevice().info, T, laws=options["substeps"])
+            default_coupling(SimulatedDevice().info, T, law_evaluations=options["substeps"])
         with pytest.raises(HapticBridgeError, match=message):
             ClosedLoop(load_scene("point_mass")).run(
                 SimulatedDevice(), LIGHT, METHODS["implicit"], **options
@@ -576,7 +576,7 @@ def test_wrench_of_the_weld_is_what_moves_the_tool() -> None:
     scene = load(TURNED_TOOL)
     felt = prepare(scene, COUPLING, T, 1, method)
     run = rendered("weld", COUPLING, samples, TURNED_TOOL)
-    assert felt == run.parameters.felt
+    assert felt == run.parameters.effective
     model, data = scene.model, scene.data
     binding = BoundKernel(model, data, run.parameters)
     jacobian = np.zeros((6, model.nv))
@@ -738,7 +738,7 @@ def test_weld_affords_no_slack_and_is_told_by_its_stiffest_axis() -> None:
     )
     run = rendered("weld", COUPLING, waved(50), flat)
     assert run.ledger.slack == 0
-    felt = run.parameters.felt
+    felt = run.parameters.effective
     assert felt is not None
     largest = 0.1 / 3 * (0.05**2 + 0.005**2)
     assert felt.rotational_stiffness == pytest.approx(largest * 2000 / 0.05, rel=1e-6)
@@ -841,7 +841,7 @@ def test_default_coupling_is_certified_with_any_number_of_substeps(
     info = SimulatedDevice().info
     for scales in ((1.0, 1.0), (3.0, 0.5)):
         coupling = default_coupling(info, period, *scales, laws)
-        used = default_method(laws).used(coupling, period / laws)
+        used = default_method(laws).law_coupling(coupling, period / laws)
         conditions = device_conditions(info, used, period, *scales, laws)
         assert all(c.needed <= 0.85 * (c.available or 0.0) * (1 + 1e-6) for c in conditions)
         assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)

@@ -127,7 +127,7 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     ticks = recording.ticks.copy()
     ticks["flags"] = 0
     ticks["flags"][20:50] = int(TickFlag.STALE_SAMPLE)
-    ticks["flags"][50] = int(TickFlag.RESEATED)
+    ticks["flags"][50] = int(TickFlag.REANCHORED)
     ticks["flags"][60:70] = int(TickFlag.CONTROLLER_ACTIVE)
     ticks["injected_damping"][60:70] = 1.5
     events = [*recording.events, {"event": "trip", "tick": len(ticks), "reason": "it jumped"}]
@@ -136,7 +136,7 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     evidence = evidence_of(guarded)
     shown = dict(activities(evidence))
     assert np.flatnonzero(shown["faded: no samples"]).tolist() == list(range(30, 50))
-    assert np.flatnonzero(shown["re-seated"]).tolist() == [50]
+    assert np.flatnonzero(shown["re-anchored"]).tolist() == [50]
     assert np.flatnonzero(shown["tripped"]).tolist() == [len(ticks) - 1]
     damped = draw_timing(evidence).axes[-1].get_lines()[0]
     assert np.asarray(damped.get_ydata()).max() == 1.5
@@ -157,7 +157,7 @@ def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> 
         replace(evidence, parameters=replace(evidence.parameters, guarding=guarding))
     )
     said = {name.replace(" ", "_") for name, _ in told}
-    assert said == set(names) - {"reseats"}  # which is what every run of a device does
+    assert said == set(names) - {"reanchors_at_start"}  # which is what every run of a device does
 
 
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.lab.paper import coupling, impact, integrators, transmission_line
+from hapticbridge.lab.paper import device_damping, impact, integrators, transmission_line
 from hapticbridge.lab.paper.section import PAGE, Check, Relation
 from hapticbridge.lab.paper.walk import STEPS
 from hapticbridge.theory.sampled_loop import stability_limit
@@ -73,9 +73,9 @@ def explicit(function: Any) -> Any:
 @pytest.mark.parametrize(
     ("module", "section", "name", "broken", "equation"),
     [
-        (coupling, "direct_section", "maximum_stiffness", scaled(1.001), "(1)"),
-        (coupling, "backward_difference", "damping_spectrum", scaled(1 + 1e-8), "(6)"),
-        (coupling, "backward_difference", "wall_limit", scaled(1.003), "(6)"),
+        (device_damping, "direct_section", "maximum_stiffness", scaled(1.001), "(1)"),
+        (device_damping, "backward_difference", "damping_spectrum", scaled(1 + 1e-8), "(6)"),
+        (device_damping, "backward_difference", "wall_limit", scaled(1.003), "(6)"),
         (integrators, "discrete_passivity_section", "integrate_particle", explicit, "(13)"),
         (integrators, "implicit_euler_section", "integrate_particle", heavier(1.01), "(16)"),
         (integrators, "explicit_euler_section", "integrate_particle", heavier(1.01), "(18)"),
@@ -88,7 +88,7 @@ def explicit(function: Any) -> Any:
             "(19)",
         ),
         (impact, "section", "RESTITUTION", lambda e: e + 1e-6, "§4"),
-        (coupling, "worst_hand_section", "minimum_damping", scaled(1.002), "worst hand"),
+        (device_damping, "worst_hand_section", "minimum_damping", scaled(1.002), "worst hand"),
         (transmission_line, "section", "transmission_line_stiffness", scaled(1.001), "future"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -112,7 +112,7 @@ def test_a_wrong_number_is_reported(
 def test_script_fails_and_names_what_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(coupling, "stability_limit", scaled(1.01)(stability_limit))
+    monkeypatch.setattr(device_damping, "stability_limit", scaled(1.01)(stability_limit))
     names = script()
     monkeypatch.setitem(names["computed"].__globals__, "STEPS", (STEPS[0],))
     assert names["main"]([str(tmp_path)]) == 1

@@ -42,7 +42,7 @@ def test_a_mark_button_notes_each_press_but_not_the_first_hold() -> None:
 
 
 def test_an_output_without_readers_keeps_the_newest_records_in_its_own_memory() -> None:
-    stream = RecordOutput().open_stream(1e-3, None, is_lossless=True)
+    stream = RecordOutput().open_stream(1e-3, None, may_wait=True)
     assert not stream.is_read
     assert stream.recorder is None
     stream.close()

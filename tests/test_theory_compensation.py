@@ -11,9 +11,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.compensation import (
     effective_damping,
-    largest_felt_damping,
+    largest_effective_damping,
     law_damping,
-    needed_for_felt,
+    required_device_damping,
 )
 from hapticbridge.theory.rigid_body import drive_mass
 from hapticbridge.theory.sampled_loop import WorstHand
@@ -44,7 +44,7 @@ def tool_spectrum(
 def test_no_free_tool_needs_more_than_a_wall(k: float, b: float, mass: float, scheme: str) -> None:
     damping = law_damping(k, b, T, LAGS[scheme])
     theta = np.linspace(1e-3, np.pi, 4001)
-    needed = needed_for_felt(k, b, T, LAGS[scheme])
+    needed = required_device_damping(k, b, T, LAGS[scheme])
     spectrum = tool_spectrum(theta, k, damping, mass, scheme)
     assert spectrum.max() <= needed * (1 + 1e-9)
     if scheme == "midpoint":  # at Nyquist a tool of any mass stands still
@@ -79,7 +79,7 @@ def test_worst_hand_in_time_domain_needs_what_spectrum_says(scheme: str, mass: f
     theta = np.linspace(0.05, np.pi, 20_001)
     spectrum = tool_spectrum(theta, 1000.0, damping, mass, scheme)
     most = int(np.argmax(spectrum))
-    bound = needed_for_felt(1000.0, 2.0, T, LAGS[scheme])
+    bound = required_device_damping(1000.0, 2.0, T, LAGS[scheme])
     # a light tool helps the compensated coupling, and never the lossless one
     is_as_hard = mass > 1 or scheme == "midpoint"
     assert spectrum[most] == pytest.approx(bound, rel=1e-6) or not is_as_hard
@@ -94,9 +94,9 @@ def test_worst_hand_in_time_domain_needs_what_spectrum_says(scheme: str, mass: f
 
 
 def test_formulas_of_the_theory_where_nothing_is_clipped() -> None:
-    assert needed_for_felt(1000.0, 5.0, T, 1.0) == pytest.approx(5.0 - 0.5)  # B − KT/2
-    assert needed_for_felt(1000.0, 5.0, T, 0.5) == pytest.approx(5.0)  # B
-    assert needed_for_felt(2400.0, 0.5, T, 0.5) == pytest.approx(1.2)  # clipped: KT/2
+    assert required_device_damping(1000.0, 5.0, T, 1.0) == pytest.approx(5.0 - 0.5)  # B − KT/2
+    assert required_device_damping(1000.0, 5.0, T, 0.5) == pytest.approx(5.0)  # B
+    assert required_device_damping(2400.0, 0.5, T, 0.5) == pytest.approx(1.2)  # clipped: KT/2
     assert effective_damping(2400.0, 0.0, T, 0.5) == pytest.approx(1.2)
     assert law_damping(1000.0, 5.0, T, 0.5) == pytest.approx(4.5)
 
@@ -120,15 +120,15 @@ def test_a_mass_decays_as_fast_as_the_felt_damping_says(scheme: str) -> None:
 @pytest.mark.parametrize("period", [0.0, -1e-3, float("nan"), float("inf")])
 def test_a_period_out_of_range_is_refused(period: float) -> None:
     with pytest.raises(CouplingError, match="period"):
-        needed_for_felt(1000.0, 5.0, period, 0.5)
+        required_device_damping(1000.0, 5.0, period, 0.5)
 
 
 @given(k=st.floats(10.0, 1e4), b=st.floats(0.1, 20.0), scheme=st.sampled_from(sorted(LAGS)))
 def test_largest_felt_damping_is_what_device_just_bears(k: float, b: float, scheme: str) -> None:
-    most = largest_felt_damping(b, k, T, LAGS[scheme])
+    most = largest_effective_damping(b, k, T, LAGS[scheme])
     if k * T > 2 * b:
         assert most == 0.0
-        assert needed_for_felt(k, 0.0, T, LAGS[scheme]) > b
+        assert required_device_damping(k, 0.0, T, LAGS[scheme]) > b
         return
-    assert needed_for_felt(k, most, T, LAGS[scheme]) == pytest.approx(b)
-    assert needed_for_felt(k, 1.01 * most, T, LAGS[scheme]) > b
+    assert required_device_damping(k, most, T, LAGS[scheme]) == pytest.approx(b)
+    assert required_device_damping(k, 1.01 * most, T, LAGS[scheme]) > b

@@ -162,8 +162,10 @@ def test_doubling_the_rate_doubles_the_stiffness_but_not_the_damping(b: float, r
 @given(st.floats(0.1, 20), st.floats(0.02, 2))
 def test_corner_is_the_default_coupling_where_only_damping_limits(b: float, mass: float) -> None:
     felt = default_coupling(open_device(f"simulated:damping={b!r}").info, T)
-    default = default_method().used(felt, T)
-    assert default_method().rendered(default, T).damping == pytest.approx(felt.damping)  # unclipped
+    default = default_method().law_coupling(felt, T)
+    assert default_method().requested_coupling(default, T).damping == pytest.approx(
+        felt.damping
+    )  # unclipped
     z = z_width(b, T, mass=mass, friction=1e3, resolution=1e-6)
     assert z.corner.stiffness == pytest.approx(default.stiffness, rel=1e-12)
     assert z.corner.damping == pytest.approx(default.damping, rel=1e-12)

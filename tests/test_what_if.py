@@ -382,7 +382,14 @@ def drift(step: float) -> Callable[[int], tuple[float, ...]]:
 
 
 EVERY_LIMIT = Limits(
-    force=3.0, torque=0.2, rise=0.05, ramp=0.02, stretch=0.1, angle=1.0, energy=math.inf, reach=0.5
+    force=3.0,
+    torque=0.2,
+    slew_time=0.05,
+    ramp=0.02,
+    stretch=0.1,
+    angle=1.0,
+    energy=math.inf,
+    reach=0.5,
 )
 REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
@@ -400,8 +407,8 @@ REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
         {},
         TickFlag.STALE_SAMPLE,
     ),
-    "a device moved before the first tick": (Moved(drift(1e-5)), {}, TickFlag.RESEATED),
-    "a stall": (ScriptedDevice(drift(2e-5)), {"clock": SlowClock({20: 80})}, TickFlag.RESEATED),
+    "a device moved before the first tick": (Moved(drift(1e-5)), {}, TickFlag.REANCHORED),
+    "a stall": (ScriptedDevice(drift(2e-5)), {"clock": SlowClock({20: 80})}, TickFlag.REANCHORED),
 }
 
 

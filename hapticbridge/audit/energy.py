@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.guard import AuditedBlock, limits_on_tool, spring_energy
 from hapticbridge.audit.motion import Array, turn_between
 from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import TOLERANCE, Deviation
+from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters
 
 SLACK_SHARE = 0.5
@@ -166,10 +166,10 @@ class EnergyBalance:
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
-        unpaid_energy: Energy given to the device beyond its dissipation and the energy released by
-            scene and coupling, (n,) in J. Zero for an unknown damping or several laws per tick.
-            With a coupling law, energy created by the environment is not included; it belongs to
-            the other port.
+        excess_device_energy: Energy given to the device beyond its dissipation and the energy
+            released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
+            per tick. With a coupling law, energy created by the environment is not included; it
+            belongs to the other port.
         commanded: Energy that commands added to the effective coupling, (n,) in J.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
     """
@@ -180,7 +180,7 @@ class EnergyBalance:
     device_throughput: Array
     environment_energy: Array
     slack: Array
-    unpaid_energy: Array
+    excess_device_energy: Array
     commanded: Array
     sums: dict[str, float]
 
@@ -230,12 +230,12 @@ class EnergyBalance:
             # a share of the slack. Counted here, it would blame a device that bears its coupling.
             lost = np.minimum(created, 0.0)
         totals["commanded"] = _summed(commanded, before["commanded"])
-        unpaid = np.zeros(len(ticks))
+        excess = np.zeros(len(ticks))
         if parameters.device_damping is not None and (
             not parameters.has_law or parameters.law_evaluations == 1
         ):
-            unpaid = totals["energy_to_device"] - totals["device_dissipation"]
-            unpaid = unpaid + parameters.force_scale / parameters.scale * (lost + released)
+            excess = totals["delayed_device_energy"] - totals["device_dissipation"]
+            excess = excess + parameters.force_scale / parameters.scale * (lost + released)
         return cls(
             coupling_work=coupling_work,
             throughput=totals["throughput"],
@@ -243,7 +243,7 @@ class EnergyBalance:
             device_throughput=totals["device_throughput"],
             environment_energy=created,
             slack=totals["slack"],
-            unpaid_energy=unpaid,
+            excess_device_energy=excess,
             commanded=totals["commanded"],
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
@@ -280,7 +280,7 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     return {
         "device_energy": _summed(works[0], before["device_energy"]),
         "device_throughput": _summed(np.abs(works[0]), before["device_throughput"]),
-        "energy_to_device": _summed(works[1], before["energy_to_device"]),
+        "delayed_device_energy": _summed(works[1], before["delayed_device_energy"]),
         "device_dissipation": dissipation,
     }
 

@@ -127,7 +127,7 @@ class RunEvents:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordedRun:
+class AuditedRun:
     """Device, method, parameters and events of a recorded run.
 
     Attributes:
@@ -143,7 +143,7 @@ class RecordedRun:
     events: RunEvents
 
     @classmethod
-    def of(cls, recording: RecordingFile) -> RecordedRun:
+    def of(cls, recording: RecordingFile) -> AuditedRun:
         """Reads metadata and events.
 
         Raises:
@@ -158,7 +158,7 @@ class RecordedRun:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         if meta.get("discretization") != method.discretization:
             raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
-        linear, angular = info.burning_damping
+        linear, angular = info.dissipating_damping
         parameters = replace(parameters, device_damping=linear, device_rotational_damping=angular)
         return cls(info, method, parameters, RunEvents.of(recording, parameters))
 

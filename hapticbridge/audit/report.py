@@ -33,7 +33,7 @@ class AuditReport:
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
         conditions: Device condition per kind of axis, as sentences.
-        rendered: Sentences on effective and law coupling. They hold away from contact, or
+        coupling_sentences: Sentences on effective and law coupling. They hold away from contact, or
             everywhere if the tool was never released.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
             re-simulation a recording whose wrench is such a part is invalid instead of passive. Any
@@ -60,7 +60,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
-    rendered: tuple[str, ...] = ()
+    coupling_sentences: tuple[str, ...] = ()
     unchecked: str = ""
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)

@@ -19,7 +19,7 @@ SUMS = (
     "device_energy",
     "device_throughput",
     "slack",
-    "energy_to_device",
+    "delayed_device_energy",
     "device_dissipation",
     "stored_in_coupling",
     "commanded",

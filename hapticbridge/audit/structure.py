@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
-from hapticbridge.kernel.guard import DEVICE_BUTTONS
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, RunParameters
+from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS
 from hapticbridge.record import CLOCK_FIELDS, TickFlag, has_flag
 from hapticbridge.recording import RecordingFile
 
@@ -218,14 +218,14 @@ def may_fade(ticks: NDArray[np.void]) -> Flags:
     return np.asarray(is_off | has_flag(ticks, TickFlag.CLUTCH | TickFlag.STALE_SAMPLE))
 
 
-def _is_released(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
+def _is_clutched(ticks: NDArray[np.void], parameters: RunParameters) -> Flags:
     """Returns True for each record in which the handle does not follow the device."""
     guarding, buttons = parameters.guarding, ticks["buttons"]
-    is_released = (buttons & (guarding.clutch | CLUTCHED)) != 0
+    is_clutched = (buttons & (guarding.clutch | CLUTCHED)) != 0
     if guarding.dead_man:
-        is_released |= (buttons & guarding.dead_man) == 0
+        is_clutched |= (buttons & guarding.dead_man) == 0
     is_out = np.linalg.norm(ticks["device_position"], axis=1) > guarding.reach
-    return np.asarray(is_released | is_out)
+    return np.asarray(is_clutched | is_out)
 
 
 def _flag_faults(
@@ -235,12 +235,12 @@ def _flag_faults(
     parameters = events.parameters
     guarding = parameters.guarding
     none, every = np.zeros(len(ticks), bool), np.ones(len(ticks), bool)
-    is_released = _is_released(ticks, parameters)
-    was_released = _is_released(before, parameters) if before.size else [guarding.dead_man != 0]
-    was_released = np.concatenate([was_released, is_released[:-1]])
+    is_clutched = _is_clutched(ticks, parameters)
+    was_clutched = _is_clutched(before, parameters) if before.size else [guarding.dead_man != 0]
+    was_clutched = np.concatenate([was_clutched, is_clutched[:-1]])
     is_touching = ticks["contacts"] > 0
-    is_anchored = ~is_released & (was_released | events.is_reset(ticks["tick"]))
-    may_anchor, ramps, may_ramp = ~is_released, none, every
+    is_anchored = ~is_clutched & (was_clutched | events.is_reset(ticks["tick"]))
+    may_anchor, ramps, may_ramp = ~is_clutched, none, every
     if has_share(ticks.dtype):
         may_ramp = ticks["share"] < 1
         ramps = may_ramp & ~may_fade(ticks)
@@ -251,8 +251,8 @@ def _flag_faults(
     for flag, is_due, is_possible in (
         (TickFlag.DROPPED_BEFORE, none, none),  # the ticks are contiguous
         (TickFlag.CONTACT, is_touching, is_touching),
-        (TickFlag.CLUTCH, is_released, is_released),
-        (TickFlag.RESEATED, is_anchored, may_anchor),
+        (TickFlag.CLUTCH, is_clutched, is_clutched),
+        (TickFlag.REANCHORED, is_anchored, may_anchor),
         (TickFlag.RAMPING, ramps, may_ramp),
         (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
     ):

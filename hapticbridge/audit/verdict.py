@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
-from hapticbridge.audit.events import RecordedRun, RunEvents
-from hapticbridge.audit.guard import AuditedBlock, wrench_deviations
+from hapticbridge.audit.events import AuditedRun, RunEvents
 from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation
 from hapticbridge.audit.report import AuditReport
 from hapticbridge.audit.state import AuditState
@@ -25,6 +24,7 @@ from hapticbridge.audit.structure import (
     has_share,
     structure_fault,
 )
+from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
     damping_margin,
@@ -87,7 +87,7 @@ class PassivityTally:
         commanded: Energy that commands have added to the coupling, in J.
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
-        unpaid: First tick in which the device received unpaid energy, and that energy.
+        excess: First tick in which the device received unpaid energy, and that energy.
     """
 
     is_watched: bool
@@ -96,7 +96,7 @@ class PassivityTally:
     commanded: float = 0.0
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
-    unpaid: tuple[int, float] | None = None
+    excess: tuple[int, float] | None = None
 
     def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
         """Adds at least one record with its balance."""
@@ -109,8 +109,8 @@ class PassivityTally:
         self.unstrict = self.unstrict or _first(is_unstrict, created, start)
         self.active = self.active or _first(created > allowed, created - balance.slack, start)
         if self.is_watched:
-            unpaid = balance.unpaid_energy
-            self.unpaid = self.unpaid or _first(unpaid > rounding, unpaid, start)
+            excess = balance.excess_device_energy
+            self.excess = self.excess or _first(excess > rounding, excess, start)
         self.commanded = float(balance.commanded[-1])
         last = ticks[-1]
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
@@ -152,9 +152,9 @@ def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool
             "port": fault.port,
             "joules": fault.joules,
         }
-    unstrict, active, unpaid = energies.unstrict, energies.active, energies.unpaid
-    if unpaid is not None and not (active is not None and active[0] <= unpaid[0]):
-        tick, joules = unpaid
+    unstrict, active, excess = energies.unstrict, energies.active, energies.excess
+    if excess is not None and not (active is not None and active[0] <= excess[0]):
+        tick, joules = excess
         return {
             "verdict": "active",
             "environment": "within slack" if unstrict else "strict",
@@ -216,10 +216,10 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     }
     energies, outcome = None, ReplayOutcome("")
     try:
-        run = RecordedRun.of(recording)
+        run = AuditedRun.of(recording)
         facts |= _device_facts(run, recording)
-        rendered = facts["rendered"]
-        facts["rendered"] = rendered + run.events.sentences()
+        sentences = facts["coupling_sentences"]
+        facts["coupling_sentences"] = sentences + run.events.sentences()
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
@@ -227,7 +227,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             energies = PassivityTally(is_watched=facts["certified"] is not True)
             fault, facts["duration"] = _check_records(recording, run, energies)
             facts["energies"] = energies.energies
-            facts["rendered"] = rendered + run.events.sentences(energies.commanded)
+            facts["coupling_sentences"] = sentences + run.events.sentences(energies.commanded)
         if fault is None:
             outcome = compare_resimulation(recording, run.parameters)
             facts["resimulation"] = outcome.agreement
@@ -246,7 +246,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
 
 
 def _check_records(
-    recording: RecordingFile, run: RecordedRun, energies: PassivityTally
+    recording: RecordingFile, run: AuditedRun, energies: PassivityTally
 ) -> tuple[Fault | None, float]:
     """Compares all records with their second computation and collects their energies.
 
@@ -291,7 +291,7 @@ def _event_counts(recording: RecordingFile) -> dict[str, int]:
     return counts
 
 
-def _device_facts(run: RecordedRun, recording: RecordingFile) -> dict[str, Any]:
+def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
     info, method, parameters = run.info, run.method, run.parameters
     try:
         worst = run.worst
@@ -300,19 +300,19 @@ def _device_facts(run: RecordedRun, recording: RecordingFile) -> dict[str, Any]:
             "certified": is_run_certified(conditions, method),
             "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
-            "rendered": coupling_sentences(
+            "coupling_sentences": coupling_sentences(
                 parameters.coupling,
                 method,
                 parameters.period,
                 parameters.substeps,
-                is_always_held=was_never_lossless(recording.count, recording.flags),
+                is_always_implicit=was_never_lossless(recording.count, recording.flags),
             ),
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
 
 
-def _unchecked(run: RecordedRun) -> str:
+def _unchecked(run: AuditedRun) -> str:
     """Returns the part that no second computation covers; empty if there is none."""
     method: Method = run.method
     if not method.has_coupling:

@@ -110,7 +110,7 @@ class SceneUnderCheck:
         refused: MuJoCo's message by the id of each body whose inertia it refuses; a stand-in
             replaces it.
         workspace: Edge in m of the cube that the device reaches.
-        is_rate_given: True if the user chose the period.
+        has_chosen_period: True if the user chose the period.
         observation: Result of the motion; None if the motion did not finish.
         motion_fault: Reason why the motion did not finish.
     """
@@ -127,7 +127,7 @@ class SceneUnderCheck:
     samples: NDArray[np.void]
     refused: dict[int, str]
     workspace: float
-    is_rate_given: bool
+    has_chosen_period: bool
     observation: Observation | None = None
     motion_fault: str = ""
 
@@ -137,9 +137,9 @@ class SceneUnderCheck:
         return self.scene.model
 
     @property
-    def used(self) -> Coupling:
+    def law(self) -> Coupling:
         """Coupling that the default method's law uses."""
-        return default_method().used(self.coupling, self.period)
+        return default_method().law_coupling(self.coupling, self.period)
 
 
 def open_case(
@@ -174,7 +174,7 @@ def open_case(
     """
     if not math.isfinite(workspace) or workspace <= 0:
         raise DeviceError(f"workspace is {workspace!r} m; it must be finite and > 0")
-    is_rate_given, period = period is not None, DEFAULT_PERIOD if period is None else period
+    has_chosen_period, period = period is not None, DEFAULT_PERIOD if period is None else period
     info = SimulatedDevice().info
     coupling = coupling or default_coupling(info, period, scale, scale)
     scene, refused = _compile(source, grip)
@@ -197,7 +197,7 @@ def open_case(
         samples=samples,
         refused=refused,
         workspace=workspace,
-        is_rate_given=is_rate_given,
+        has_chosen_period=has_chosen_period,
     )
     scene.set_timestep(period)
     try:

@@ -46,7 +46,7 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         pair = min(first, second), max(first, second)
         if is_tool[first] or is_tool[second] or pair in meetings:
             where.setdefault(setting, []).append(pair)
-    push, cone_told = push_of(case), False
+    push, is_cone_reported = push_of(case), False
     case.scene.reset()
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
     for setting, pairs in where.items():
@@ -65,9 +65,9 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
-            if is_cone and cone_told:  # one option changes it for all contacts
+            if is_cone and is_cone_reported:  # one option changes it for all contacts
                 continue
-            cone_told |= is_cone
+            is_cone_reported |= is_cone
             yield Fault(
                 "pyramidal cone" if is_cone else "not passive",
                 case.places.option("cone") if is_cone else place,
@@ -148,7 +148,7 @@ def inertia_of(case: SceneUnderCheck, pair: tuple[int, int], setting: ContactSet
         return seen.inertia
     is_tool = tool_geoms(model, case.scene.grip)
     step, inverse = float(model.opt.timestep), 0.0
-    share = step * case.used.damping + step**2 * case.used.stiffness
+    share = step * case.law.damping + step**2 * case.law.stiffness
     for geom in pair:
         inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
         inverse += 1.0 / (inertia + (share if is_tool[geom] else 0.0))

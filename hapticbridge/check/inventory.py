@@ -100,12 +100,12 @@ def take_inventory(
     met = possible if observation is None else set(observation.meetings)
     uses = _uses(model, is_tool, possible, met)
     of_tool = is_tool[model.geom_bodyid]
-    felt = [
+    touching = [
         meeting
         for pair, meeting in (observation.meetings if observation else {}).items()
         if of_tool[list(pair)].any()
     ]
-    carried = [meeting for meeting in felt if np.isfinite(meeting.softest)]
+    carried = [meeting for meeting in touching if np.isfinite(meeting.softest)]
     names = [model.actuator(i).name for i in range(model.nactuator)]
     return Inventory(
         bodies=int(own.sum()),
@@ -124,7 +124,7 @@ def take_inventory(
         )
         if carried
         else None,
-        deepest=max((meeting.deepest for meeting in felt), default=0.0),
+        deepest=max((meeting.deepest for meeting in touching), default=0.0),
         actuators=sum(name not in COUPLING_ACTUATORS for name in names),
         equalities=int(model.neq),
         tendons=int(model.ntendon),

@@ -59,7 +59,7 @@ class VariantVerdict:
         loses: Further loss, see ``Simplification``.
         cost: Processor time relative to the original, without unit. It comes from a single run if
             the version is refused for another reason; None if it failed.
-        felt: Perceptible difference; None if it failed.
+        error: Perceptible difference; None if it failed.
         environment: ``strict``, ``within slack`` or ``active``.
         warnings: Number of MuJoCo's warnings.
         needed_damping: b in N s/m that a device needs at this version's rate.
@@ -70,7 +70,7 @@ class VariantVerdict:
     verdict: str
     loses: str = ""
     cost: float | None = None
-    felt: FeltError | None = None
+    error: FeltError | None = None
     environment: str = ""
     warnings: int = 0
     needed_damping: float = 0.0
@@ -136,9 +136,9 @@ class Judge:
             SceneError: The version does not compile, or a result is not finite.
         """
         done = draft.rehearsed(self.motion)
-        felt = felt_error(self.rehearsal.records, done.records)
+        error = felt_error(self.rehearsal.records, done.records)
         needed = draft.setting.needed_damping
-        verdict = self._refusal(done, felt, needed)
+        verdict = self._refusal(done, error, needed)
         cost = done.seconds / (self.seconds * self.motion.duration)
         if not verdict and not is_last_word and cost > CLEARLY_MORE * share:
             verdict = SAVES_NOTHING
@@ -152,13 +152,13 @@ class Judge:
             verdict=verdict,
             loses=loses,
             cost=cost,
-            felt=felt,
+            error=error,
             environment=done.environment,
             warnings=done.warnings,
             needed_damping=needed,
         )
 
-    def _refusal(self, done: Playback, felt: FeltError, needed: float) -> str:
+    def _refusal(self, done: Playback, error: FeltError, needed: float) -> str:
         """Returns the reason against a version regardless of its cost; empty if there is none."""
         ranks = [_ENVIRONMENTS.index(each.environment) for each in (done, self.rehearsal)]
         bearable = max(self.device_damping, self.original.setting.needed_damping)
@@ -168,7 +168,7 @@ class Judge:
             return CREATES
         if needed > bearable * (1.0 + _ROUNDING):
             return NOT_BORNE
-        return IS_FELT if felt.felt > self.budget else ""
+        return IS_FELT if error.jnd > self.budget else ""
 
 
 Progress = Callable[[int, int, str], None]

@@ -60,14 +60,14 @@ NAMES = 1.04
 
 def draw_lean(lean: Lean, name: str) -> Figure:
     """Draws cost against felt error of every version that was tried."""
-    points = [(trial.name, trial, "") for trial in lean.alone if trial.felt is not None]
+    points = [(trial.name, trial, "") for trial in lean.alone if trial.error is not None]
     steps = [(f"{k + 1}: {t.name}", t, "path") for k, t in enumerate(lean.together)]
     points += steps
     figure = new_figure(8.0, max(4.2, 1.3 + LINE * len(points)))
     axes = figure.add_subplot()
     axes.set_yscale("symlog", linthresh=LINEAR)
-    felt = [_felt(trial) for _, trial, _ in points]
-    axes.set_ylim(-0.35 * LINEAR, 2.5 * max([lean.judge.budget, *felt]))
+    errors = [_error_of(trial) for _, trial, _ in points]
+    axes.set_ylim(-0.35 * LINEAR, 2.5 * max([lean.judge.budget, *errors]))
     costs = [100.0 * _cost(trial) for _, trial, _ in points]
     axes.set_xlim(0.0, 1.06 * max([104.0, *costs]))
     axes.axhline(lean.judge.budget, color="black", linewidth=1.0, linestyle="--")
@@ -77,7 +77,7 @@ def draw_lean(lean: Lean, name: str) -> Figure:
         if not kind:
             axes.plot(
                 100.0 * _cost(trial),
-                _felt(trial),
+                _error_of(trial),
                 _MARKERS[trial.verdict],
                 color=_COLOURS[trial.verdict],
                 markersize=6,
@@ -99,8 +99,8 @@ def draw_lean(lean: Lean, name: str) -> Figure:
     return figure
 
 
-def _felt(trial: VariantVerdict) -> float:
-    return 0.0 if trial.felt is None else trial.felt.felt
+def _error_of(trial: VariantVerdict) -> float:
+    return 0.0 if trial.error is None else trial.error.jnd
 
 
 def _cost(trial: VariantVerdict) -> float:
@@ -109,7 +109,7 @@ def _cost(trial: VariantVerdict) -> float:
 
 def _draw_path(axes: Axes, lean: Lean) -> None:
     x = [100.0, *(100.0 * _cost(trial) for trial in lean.together)]
-    y = [0.0, *(_felt(trial) for trial in lean.together)]
+    y = [0.0, *(_error_of(trial) for trial in lean.together)]
     axes.plot(x, y, "-", color=_PATH, linewidth=1.5, zorder=1)
     axes.plot(x, y, "D", color=_PATH, markersize=6, zorder=3)
 
@@ -119,13 +119,13 @@ def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> N
 
     Names at the points would overlap, because many points coincide.
     """
-    order = sorted(points, key=lambda point: (_felt(point[1]), -_cost(point[1])))
+    order = sorted(points, key=lambda point: (_error_of(point[1]), -_cost(point[1])))
     heights = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.array([0.5])
     for height, (name, trial, kind) in zip(heights, order, strict=True):
         colour = _PATH if kind else _COLOURS[trial.verdict]
         axes.annotate(
             name,
-            xy=(100.0 * _cost(trial), _felt(trial)),
+            xy=(100.0 * _cost(trial), _error_of(trial)),
             xytext=(NAMES, float(height)),
             textcoords="axes fraction",
             fontsize=8,
@@ -193,23 +193,23 @@ def lean_rows(lean: Lean) -> list[dict[str, str | float | int | None]]:
 
 def trial_facts(trial: VariantVerdict) -> dict[str, str | float | int | None]:
     """Returns one trial as a dictionary; values that a failed trial lacks are None."""
-    felt = trial.felt
+    error = trial.error
     return {
         "name": trial.name,
         "sentence": trial.sentence,
         "verdict": trial.verdict,
         "loses": trial.loses,
         "cost_ratio": trial.cost,
-        "felt_jnd": None if felt is None else felt.felt,
-        "peak_jnd": None if felt is None else felt.peak,
-        "force_rms_n": None if felt is None else felt.force_rms,
-        "force_peak_n": None if felt is None else felt.force_peak,
-        "force_percent_of_jnd": None if felt is None else 100.0 * felt.force,
-        "torque_rms_nm": None if felt is None else felt.torque_rms,
-        "torque_peak_nm": None if felt is None else felt.torque_peak,
-        "torque_percent_of_jnd": None if felt is None else 100.0 * felt.torque,
-        "position_peak_m": None if felt is None else felt.position_peak,
-        "angle_peak_rad": None if felt is None else felt.angle_peak,
+        "felt_jnd": None if error is None else error.jnd,
+        "peak_jnd": None if error is None else error.peak,
+        "force_rms_n": None if error is None else error.force_rms,
+        "force_peak_n": None if error is None else error.force_peak,
+        "force_percent_of_jnd": None if error is None else 100.0 * error.force,
+        "torque_rms_nm": None if error is None else error.torque_rms,
+        "torque_peak_nm": None if error is None else error.torque_peak,
+        "torque_percent_of_jnd": None if error is None else 100.0 * error.torque,
+        "position_peak_m": None if error is None else error.position_peak,
+        "angle_peak_rad": None if error is None else error.angle_peak,
         "environment": trial.environment,
         "mujoco_warnings": trial.warnings,
         "needed_damping_ns_per_m": trial.needed_damping,
@@ -370,13 +370,13 @@ def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> 
 def _comment(lean: Lean, before: str) -> str:
     """Returns the list of changes; XML forbids two dashes in a row within a comment."""
     source, setting, result = lean.draft.source, lean.draft.setting, lean.result
-    felt = 0.0 if result.felt is None else result.felt.felt
+    error = 0.0 if result.error is None else result.error.jnd
     judge, cost = lean.judge, 100.0 * (result.cost or 1.0)
     lines = [
         "",
         f"  Made leaner from {source.path.name} by 'hapticbridge check': in a motion of "
         f"{judge.motion.duration:g} s it costs {cost:.0f} % of that scene,",
-        f"  and differs by {felt:.2g} just noticeable differences (allowed: {judge.budget:g}).",
+        f"  and differs by {error:.2g} just noticeable differences (allowed: {judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
     if any(trial.loses == OTHER_MOTIONS for trial in lean.together):

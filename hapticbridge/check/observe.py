@@ -245,7 +245,7 @@ def rehearsal_parameters(
         grip=scene.grip,
         period=period,
         substeps=substeps,
-        coupling=method.used(coupling, period / substeps),
+        coupling=method.law_coupling(coupling, period / substeps),
         force_limit=_UNLIMITED,
         torque_limit=_UNLIMITED,
         ramp_ticks=0,

@@ -58,7 +58,7 @@ class FeltError:
         return self.torque_rms / self.torque_threshold
 
     @property
-    def felt(self) -> float:
+    def jnd(self) -> float:
         """Larger of force and torque difference; 1 is just noticeable."""
         return max(self.force, self.torque)
 

@@ -57,7 +57,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             else '<flag diagexact="enable"/> in <option>',
         )
     step = float(option.timestep)
-    if not case.is_rate_given and abs(step - case.period) > _SAME_STEP * case.period:
+    if not case.has_chosen_period and abs(step - case.period) > _SAME_STEP * case.period:
         yield Fault(
             "time step",
             places.option("timestep"),

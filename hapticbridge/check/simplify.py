@@ -89,14 +89,14 @@ def rate_simplifications(draft: SceneVariant) -> list[Simplification]:
     return simpler + [_rate(divisor, word, period) for divisor, word in RATE_DIVISORS.items()]
 
 
-def _substeps(count: int, asked: int) -> Simplification:
+def _substeps(count: int, present: int) -> Simplification:
     def lower(draft: SceneVariant) -> bool:
         changed = draft.setting.substeps > count
         draft.setting = replace(draft.setting, substeps=min(draft.setting.substeps, count))
         return changed
 
     name = f"{count} substep{'s' * (count > 1)}"
-    return Simplification(name, f"MuJoCo takes {count} of {asked} steps a tick", lower)
+    return Simplification(name, f"MuJoCo takes {count} of {present} steps a tick", lower)
 
 
 def _rate(divisor: int, word: str, period: float) -> Simplification:

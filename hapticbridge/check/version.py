@@ -36,7 +36,7 @@ class Setting:
     def needed_damping(self) -> float:
         """Device damping in N s/m required by the default method."""
         method = default_method(self.substeps)
-        used = method.used(self.coupling, self.period / self.substeps)
+        used = method.law_coupling(self.coupling, self.period / self.substeps)
         return required_damping(used, self.period, method.law_evaluations(self.substeps))
 
 

@@ -54,16 +54,16 @@ def print_audits(table: Table) -> None:
         margin = "-" if math.isnan(margins[row]) else f"{margins[row]:.3g}"
         duration = "-" if math.isnan(durations[row]) else f"{durations[row]:.3f}"
         words = verdict_words(verdict, environment, port)
-        told = f"[{_VERDICT_COLOURS[verdict]}]{words}[/]" + " " * max(22 - len(words), 0)
+        coloured = f"[{_VERDICT_COLOURS[verdict]}]{words}[/]" + " " * max(22 - len(words), 0)
         name = plain(file) + (" [yellow](cut)[/]" if cut[row] == 1 else "")
-        out.print(f"{margin:>8}  {told} {duration:>8}  {name}")
+        out.print(f"{margin:>8}  {coloured} {duration:>8}  {name}")
         if codes[row]:
             out.print(f"{'':>10}{_why(verdict, reason, str(table.texts('certified')[row]))}")
     counts = Counter(verdicts)
-    told = ", ".join(
+    counted = ", ".join(
         f"{counts[verdict]} {verdict}" for verdict in _VERDICT_COLOURS if counts[verdict]
     )
-    out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {told}")
+    out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {counted}")
 
 
 def print_unreadable(table: Table) -> None:
@@ -193,14 +193,14 @@ class Audit:
                     progress=show,
                 )
         except Interrupted as stop:
-            self._tell(stop.table)
+            self._print_table(stop.table)
             missing = f"{len(files) - len(stop.table)} of {len(files)} recordings were not judged"
             err.print(f"[yellow]warning:[/yellow] incomplete: {missing}")
             raise
-        self._tell(table)
+        self._print_table(table)
         return worst_exit_code(table)
 
-    def _tell(self, table: Table) -> None:
+    def _print_table(self, table: Table) -> None:
         if self.as_json:
             out.print_json(json.dumps(reports_of(table)))
             print_unreadable(table)
@@ -260,7 +260,7 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
-    for sentence in (*report.rendered[:1], *report.conditions):
+    for sentence in (*report.coupling_sentences[:1], *report.conditions):
         out.print(f"  {plain(sentence)}")
     if not report.conditions:
         out.print(
@@ -272,9 +272,9 @@ def _print_report(report: AuditReport) -> None:
             "  the file is cut: the verdict is on what it holds; "
             f"'hapticbridge repair {plain(shlex.quote(str(report.path)))} OUTPUT' makes it whole"
         )
-    told = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
-    if told:
-        listed = ", ".join(f"{name} ({count})" for name, count in told.items())
+    unusual = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
+    if unusual:
+        listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s")
     energies = [

@@ -16,7 +16,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
-from hapticbridge.theory.compensation import largest_felt_damping, law_damping
+from hapticbridge.theory.compensation import largest_effective_damping, law_damping
 from hapticbridge.theory.transfer import scalar
 from hapticbridge.theory_plots import Alternative, alternatives, draw_alternatives
 
@@ -75,7 +75,9 @@ class Bound:
             "frequency_hz": _hertz(ways[0]),
             "holds": None if b is None else b >= ways[0].needed,
             "method": default_method().name,
-            "used_damping": law_damping(self.stiffness, self.damping, period, default_method().lag),
+            "used_damping": law_damping(
+                self.stiffness, self.damping, period, default_method().compensated_share
+            ),
             "largest_stiffness": self._largest_stiffness(period),
             "alternatives": [
                 {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
@@ -101,7 +103,7 @@ class Bound:
             verdict = [] if b is None else ["yes" if b >= way.needed else "no"]
             table.add_row(way.name, amount, _where(way), *verdict)
         out.print(table)
-        least = method.lag * self.stiffness * period
+        least = method.compensated_share * self.stiffness * period
         if self.damping < least:
             out.print(
                 f"method {method.name} cannot show less than B = {least:.4g} N s/m at this "
@@ -120,10 +122,10 @@ class Bound:
         self._print_remedies(b, needed, period)
 
     def _print_remedies(self, b: float, needed: float, period: float) -> None:
-        lag, changes = default_method().lag, []
+        lag, changes = default_method().compensated_share, []
         if law_damping(self.stiffness, self.damping, period, lag) > 0:
             stiffness = min(self.stiffness, 2 * b / period)
-            most = largest_felt_damping(b, stiffness, period, lag)
+            most = largest_effective_damping(b, stiffness, period, lag)
             changes.append(f"lower the damping to {most:.4g} N s/m")
         if self.stiffness * period > 2 * b:
             changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")

@@ -68,14 +68,14 @@ class Chart:
             workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
         paths = prepared_files(self.out, workload.name)
         settings = settings_for(methods, periods, has_contact=workload.has_contact)
-        with caught_prints(_tell), progress(f"chart {workload.name}") as show:
+        with caught_prints(_print_dim), progress(f"chart {workload.name}") as show:
             settings += peer_settings(self._peers(), periods)
             chart = measure_chart(
                 workload, settings, repeats=MIN_REPEATS if self.quick else REPEATS, progress=show
             )
         files = write_chart(chart, paths)
         if self.as_json:
-            print_json(files.said)
+            print_json(files.facts)
         else:
             _print(files)
         return 0
@@ -84,11 +84,11 @@ class Chart:
         paths = prepared_files(self.out, WORK, WORK_ENDINGS)
         with progress(f"chart {WORK}") as show:
             chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
-        said = write_work(chart, paths)
+        facts = write_work(chart, paths)
         if self.as_json:
-            print_json(said)
+            print_json(facts)
         else:
-            out.print(plain(said["paragraph"]))
+            out.print(plain(facts["paragraph"]))
         err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
         return 0
 
@@ -106,12 +106,12 @@ class Chart:
         return list(self.engines)
 
 
-def _tell(line: str) -> None:
+def _print_dim(line: str) -> None:
     err.print(f"[dim]{plain(line)}[/]")
 
 
 def _print(files: ChartFiles) -> None:
-    for panel in files.said["panels"]:
+    for panel in files.facts["panels"]:
         out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
         out.print(f"  {plain(panel['recommendation'])}")
         out.print("  on the front, by cost:" if panel["front"] else "  nothing is on the front")
@@ -120,8 +120,8 @@ def _print(files: ChartFiles) -> None:
                 f"    {point['cost']:.2g} s per s, {point['error']:.3g} JND: "
                 f"{plain(point['setting'])}"
             )
-    for note in files.said["notes"]:
+    for note in files.facts["notes"]:
         out.print(f"  {plain(note)}")
-    for name, reason in files.said["skipped"].items():
+    for name, reason in files.facts["skipped"].items():
         out.print(f"  not simulated: {plain(name)} ({plain(reason)})")
     err.print("wrote " + ", ".join(plain(str(path)) for path in files.paths.values()))

@@ -96,7 +96,7 @@ def print_lean(lean: Lean) -> None:
         cells[0] = row[0].ljust(widths[0])
         out.print(f"  {plain('  '.join(cells))}  {end}".rstrip())
     for trial in lean.alone:
-        if trial.felt is None:
+        if trial.error is None:
             out.print(f"  {plain(trial.name)}: {plain(trial.sentence)}")
     if not lean.together:
         out.print("  [green]nothing may go: the scene is lean[/]")
@@ -118,18 +118,18 @@ def print_lean(lean: Lean) -> None:
 
 def print_written(lean: Lean, written: VariantVerdict, path: Path, *, is_quiet: bool) -> None:
     """Prints what the written scene is like, read back, and how to run it."""
-    felt = 0.0 if written.felt is None else written.felt.felt
+    error = 0.0 if written.error is None else written.error.jnd
     cost = written.cost or 1.0
     err.print(
-        f"wrote {plain(str(path))}: read back, {100 * cost:.0f} % of the cost, felt {felt:.2g} JND"
+        f"wrote {plain(str(path))}: read back, {100 * cost:.0f} % of the cost, felt {error:.2g} JND"
     )
     if is_quiet:
         return
-    setting, asked = lean.draft.setting, lean.judge.original.setting
+    setting, original = lean.draft.setting, lean.judge.original.setting
     command = f"hapticbridge run {shlex.quote(str(path))}"
     if lean.draft.grip != "grip":
         command += f" --grip {shlex.quote(lean.draft.grip)}"
-    if setting.period != asked.period:
+    if setting.period != original.period:
         command += f" --rate {1 / setting.period:g}"
     out.print(f"next: {plain(command)}")
 
@@ -141,22 +141,22 @@ def _verdict(trial: VariantVerdict) -> str:
 
 
 def _numbers(trial: VariantVerdict) -> list[str]:
-    felt = trial.felt
-    if felt is None or trial.cost is None:
+    error = trial.error
+    if error is None or trial.cost is None:
         return [trial.name, *["-"] * 6]
     return [
         trial.name,
         f"{100 * trial.cost:.0f} %",
-        f"{felt.felt:.3f}",
+        f"{error.jnd:.3f}",
         *(
             format_si(0.0 if value < _ROUNDING else value, unit)
             for value, unit in (
-                (felt.force_rms, "N"),
-                (felt.force_peak, "N"),
-                (felt.torque_rms, "N m"),
+                (error.force_rms, "N"),
+                (error.force_peak, "N"),
+                (error.torque_rms, "N m"),
             )
         ),
-        f"{1e6 * felt.position_peak:.0f} µm",
+        f"{1e6 * error.position_peak:.0f} µm",
     ]
 
 
@@ -359,8 +359,8 @@ class Check:
         """Checks and prints; returns the exit code."""
         if self.plot is not None:
             check_ending(self.plot)
-        is_lean_asked = self.lean or self.write is not None or self.table is not None
-        if self.budget is not None and not is_lean_asked:
+        wants_lean = self.lean or self.write is not None or self.table is not None
+        if self.budget is not None and not wants_lean:
             raise SceneError("--budget goes with --lean")
         if self.overwrite and self.write is None:
             raise SceneError("--overwrite goes with --write FILE; nothing else is replaced")
@@ -396,8 +396,8 @@ class Check:
             print_inventory(inventory)
             print_cost(cost)
             print_faults(faults)
-        lean = self._looked_for(case, budget) if is_lean_asked else None
-        written = None if lean is None else self._told(lean)
+        lean = self._looked_for(case, budget) if wants_lean else None
+        written = None if lean is None else self._print_lean(lean)
         if self.as_json:
             facts = _facts(case, inventory, faults, cost)
             print_json(facts if lean is None else facts | {"lean": lean_facts(lean, written)})
@@ -405,10 +405,10 @@ class Check:
             figure = _picture(case, cost, lean)
             if figure is not None:
                 write_picture(figure, self.plot)
-            told = "wrote" if figure is not None else "there is nothing to draw in"
-            err.print(f"{told} {plain(str(self.plot))}")
+            outcome = "wrote" if figure is not None else "there is nothing to draw in"
+            err.print(f"{outcome} {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
-        return 1 if faults or is_worse or (is_lean_asked and lean is None) else 0
+        return 1 if faults or is_worse or (wants_lean and lean is None) else 0
 
     def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""
@@ -418,7 +418,7 @@ class Check:
             err.print(f"what could go cannot be said: {plain(str(error))}")
             return None
 
-    def _told(self, lean: Lean) -> VariantVerdict | None:
+    def _print_lean(self, lean: Lean) -> VariantVerdict | None:
         """Prints and writes what was found; returns the written scene's trial."""
         if not self.as_json:
             print_lean(lean)

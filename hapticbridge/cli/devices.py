@@ -9,8 +9,8 @@ import tyro
 
 from hapticbridge.cli.terminal import out, plain, print_json
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
-from hapticbridge.device.family import RULES_COMMAND, FoundDevice
-from hapticbridge.device.registry import all_families
+from hapticbridge.device.driver import RULES_COMMAND, FoundDevice
+from hapticbridge.device.registry import all_drivers
 from hapticbridge.errors import HapticBridgeError
 
 
@@ -41,16 +41,16 @@ class Devices:
             print_json(_facts(plugged, unseen))
             return 0
         out.print("[bold]supported[/bold]")
-        for family in all_families():
-            out.print(f"{family.name}: {plain(family.about)}")
-            out.print(f"  axes {family.axes}; force {family.force}; rate {family.rate}")
-            if family.on_stall:
-                out.print(f"  if this machine stands still: {plain(family.on_stall)}")
-            if family.medium is not None:
-                out.print(f"  {plain(family.medium())}")
+        for driver in all_drivers():
+            out.print(f"{driver.name}: {plain(driver.about)}")
+            out.print(f"  axes {driver.axes}; force {driver.force}; rate {driver.rate}")
+            if driver.on_stall:
+                out.print(f"  if this machine stands still: {plain(driver.on_stall)}")
+            if driver.medium is not None:
+                out.print(f"  {plain(driver.medium())}")
         out.print("[bold]plugged in[/bold]")
         for device in plugged:
-            out.print(f"{device.family}: {plain(str(device))} at {plain(device.path)}")
+            out.print(f"{device.driver}: {plain(str(device))} at {plain(device.path)}")
             if device.problem:
                 out.print(f"  [yellow]not usable:[/yellow] {plain(device.problem)}")
         if not plugged:
@@ -71,26 +71,26 @@ class Devices:
 
 def _specification(first: FoundDevice, plugged: list[FoundDevice]) -> str:
     """Returns what to type for a device; its serial where there are more like it."""
-    is_only = sum(device.family == first.family for device in plugged) == 1
-    return first.family if is_only else f"{first.family}:serial={first.serial or first.path}"
+    is_only = sum(device.driver == first.driver for device in plugged) == 1
+    return first.driver if is_only else f"{first.driver}:serial={first.serial or first.path}"
 
 
 def _facts(plugged: list[FoundDevice], unseen: list[str]) -> dict[str, Any]:
     return {
         "supported": [
             {
-                "name": family.name,
-                "about": family.about,
-                "transport": family.transport,
-                "axes": family.axes,
-                "force": family.force,
-                "rate": family.rate,
-                "on_stall": family.on_stall,
-                "options": list(family.options),
-                "medium": None if family.medium is None else family.medium(),
-                "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in family.ids],
+                "name": driver.name,
+                "about": driver.about,
+                "transport": driver.transport,
+                "axes": driver.axes,
+                "force": driver.force,
+                "rate": driver.rate,
+                "on_stall": driver.on_stall,
+                "options": list(driver.options),
+                "medium": None if driver.medium is None else driver.medium(),
+                "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in driver.ids],
             }
-            for family in all_families()
+            for driver in all_drivers()
         ],
         "plugged": [asdict(device) for device in plugged],
         "warnings": unseen,

@@ -36,7 +36,7 @@ class Doctor:
     def execute(self) -> int:
         """Measures and prints; returns the exit code."""
         with progress(f"measuring for {self.duration:g} s") as show:
-            diagnosis = diagnose(self.rate, self.duration, tell=_in_tenths(show))
+            diagnosis = diagnose(self.rate, self.duration, progress=_in_tenths(show))
         if self.as_json:
             print_json(asdict(diagnosis))
         else:

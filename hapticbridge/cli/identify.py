@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import out, plain, print_json, progress, tell, write_figure
+from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
@@ -67,9 +67,9 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
             if (len(axis) == 2) == turns:
                 table.add_row(
                     axis,
-                    fit.mass.told(),
-                    fit.damping.told(),
-                    fit.friction.told(),
+                    fit.mass.as_text(),
+                    fit.damping.as_text(),
+                    fit.friction.as_text(),
                     f"{1e3 * fit.delay.value:.2f} ± {1e3 * fit.delay.half_width:.2f}",
                 )
         if table.row_count:
@@ -87,7 +87,7 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
             unit = "N m s²/rad²" if len(axis) == 2 else "N s²/m²"
             at = f"{fit.drag_speed:.2g} {'rad/s' if len(axis) == 2 else 'm/s'}"
             out.print(
-                f"{axis}: resistance also changes with speed squared, {fit.drag.told()} {unit}; "
+                f"{axis}: resistance also changes with speed squared, {fit.drag.as_text()} {unit}; "
                 f"damping is that at {at if fit.drag_speed else 'small speeds'}, the least seen"
             )
     if left := [axis for axis in result.info.axes if axis not in result.fits]:
@@ -99,10 +99,10 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
         f"{z.limit[0]:.4g} N/m at B' = 0 ({z.corner_limited_by})"
     )
-    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
-    felt = recommended(z)
-    out.print(f"use {told}")
-    out.print(f"next: {plain(next_command(felt.stiffness, felt.damping, 1.0 / z.period))}")
+    (sentence,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    coupling = recommended(z)
+    out.print(f"use {sentence}")
+    out.print(f"next: {plain(next_command(coupling.stiffness, coupling.damping, 1.0 / z.period))}")
 
 
 def why_none(result: Identification) -> str:
@@ -178,7 +178,7 @@ class Identify:
         self._check(duration)
         if self.plot is not None and self.plot == self.zwidth:
             raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
-        device = open_device(self.device, tell=tell)
+        device = open_device(self.device, notify=notify)
         try:
             axes = self._axes(device.info.axes)
             clock = RealClock() if device.info.is_real else SimulatedClock()
@@ -214,7 +214,7 @@ class Identify:
             print_result(result, z)
         if path is not None:
             _write(profile, path)
-            tell(f"wrote {path}")
+            notify(f"wrote {path}")
         for target, figure in (
             (self.plot, draw_identification(result) if self.plot else None),
             (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
@@ -222,7 +222,7 @@ class Identify:
             if target is not None and figure is not None:
                 write_figure(figure, target)
         if self.zwidth is not None and z is None:
-            tell(f"'{self.zwidth}' is not drawn: {why_none(result)}")
+            notify(f"'{self.zwidth}' is not drawn: {why_none(result)}")
         return 0
 
     def _check(self, duration: float) -> None:
@@ -233,9 +233,9 @@ class Identify:
             ("force_share", self.force_share, 1e-3, 1.0, ""),
         ):
             if not least <= value <= most:
-                told = name.replace("_", "-")
+                flag = name.replace("_", "-")
                 raise HapticBridgeError(
-                    f"--{told} is {value!r} {unit}".rstrip() + f"; it must be {least:g} to {most:g}"
+                    f"--{flag} is {value!r} {unit}".rstrip() + f"; it must be {least:g} to {most:g}"
                 )
 
     def _axes(self, present: tuple[str, ...]) -> tuple[str, ...]:

@@ -63,8 +63,8 @@ class Export:
         if found.is_cut:
             err.print("[yellow]warning:[/yellow] the recording is cut; this is what it holds")
         if done.damage:
-            told = plain("; ".join(done.damage))
-            err.print(f"[yellow]warning:[/yellow] the recording is damaged: {told}")
+            damage = plain("; ".join(done.damage))
+            err.print(f"[yellow]warning:[/yellow] the recording is damaged: {damage}")
         return 1 if done.damage else 0
 
 
@@ -121,7 +121,7 @@ def _print(found: Comparison) -> None:
             "the second"
         )
     for name, pair in found.decisive.items():
-        out.print(f"  {name}: {_told(pair[0])} and {_told(pair[1])}")
+        out.print(f"  {name}: {_shortened(pair[0])} and {_shortened(pair[1])}")
     for name, counts in found.events.items():
         other = ", which say other things" if counts[0] == counts[1] else ""
         out.print(f"  events '{plain(name)}': {counts[0]} and {counts[1]}{other}")
@@ -130,7 +130,7 @@ def _print(found: Comparison) -> None:
         for each in found.largest:
             out.print(f"  {each.column:24} {_size(each):>12} at tick {_ticks(each)}")
         for name, pair in found.beside.items():
-            out.print(f"  may explain it: {name} {_told(pair[0])} and {_told(pair[1])}")
+            out.print(f"  may explain it: {name} {_shortened(pair[0])} and {_shortened(pair[1])}")
 
 
 def _ticks(difference: Difference) -> str:
@@ -148,7 +148,7 @@ def _size(difference: Difference) -> str:
     return format_si(difference.size, difference.unit)
 
 
-def _told(text: str | None) -> str:
+def _shortened(text: str | None) -> str:
     """Returns metadata as a line has room for it."""
     if text is None:
         return "nothing"

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
-from hapticbridge.cli.terminal import err, out, tell
+from hapticbridge.cli.terminal import err, notify, out
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
@@ -28,7 +28,7 @@ from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import Summary, coupling_sentences, is_always_held
+from hapticbridge.summary import Summary, coupling_sentences, is_always_implicit
 from hapticbridge.units import format_energy, format_si
 
 if TYPE_CHECKING:
@@ -43,9 +43,9 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     coupling, method, substeps = setup.coupling, setup.method, setup.substeps
     scene, device = escape(setup.scene.name), escape(setup.info.name)
     err.print(f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}")
-    held = is_always_held(setup.scene.model, setup.scene.grip)
+    held = is_always_implicit(setup.scene.model, setup.scene.grip)
     for sentence in coupling_sentences(
-        setup.law, method, setup.period, substeps, is_always_held=held
+        setup.law, method, setup.period, substeps, is_always_implicit=held
     ):
         err.print(f"  {sentence}")
     if not method.has_law:
@@ -96,8 +96,8 @@ def announce_measured(bridge: Bridge) -> None:
     setup, parameters = bridge.setup, bridge.session.parameters
     if setup.method.has_law:
         return
-    if parameters.felt is not None:
-        err.print(_true_weld(parameters.felt, setup.coupling))
+    if parameters.effective is not None:
+        err.print(_true_weld(parameters.effective, setup.coupling))
     conditions = run_conditions(setup.info, parameters, setup.method)
     met = {condition.sentence() for condition in conditions if condition.holds}
     for sentence in bridge.conditions():
@@ -114,13 +114,13 @@ def _true_weld(effective: Coupling, requested: Coupling) -> str:
     )
 
 
-def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
+def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = True) -> None:
     """Prints what a run was, whether the device bears it, and what to do next.
 
     Args:
         summary: Of the run.
-        laws: How often per tick the wrench was computed.
-        is_felt: Whether the device moves by force at all.
+        law_evaluations: How often per tick the wrench was computed.
+        has_hand: True if a hand holds the device.
     """
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
@@ -149,17 +149,21 @@ def print_summary(summary: Summary, laws: int, *, is_felt: bool = True) -> None:
             out.print(escape(sentence))
         out.print("nothing proves that the device bears this")
     else:
-        for sentence in summary.rendered[:1]:
+        for sentence in summary.coupling_sentences[:1]:
             out.print(sentence)
-        bound = "KT/2 + B'" if laws == 1 else f"what {laws} substeps need"
+        bound = "KT/2 + B'" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
         certified = {
             True: f"device certified: b >= {bound}",
             False: f"device not certified: b < {bound}",
             None: f"device unknown: b >= {bound} not checked",
         }
         unfelt = "the device feels no force: there is nothing to certify"
-        out.print(certified[summary.is_certified] if is_felt else unfelt)
-    if summary.is_certified is False and method_named(summary.method).has_law and laws == 1:
+        out.print(certified[summary.is_certified] if has_hand else unfelt)
+    if (
+        summary.is_certified is False
+        and method_named(summary.method).has_law
+        and law_evaluations == 1
+    ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
     if summary.recording is not None:
@@ -303,10 +307,10 @@ class Run:
         window = self._window() if self.view else None
         scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
         with ExitStack() as stack:
-            told = stack.enter_context(interrupting_on_signals())
-            device = device_for(scene, self.device, tell)
+            callbacks = stack.enter_context(interrupting_on_signals())
+            device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, clock, stack, window, told)
+            return self._feel(scene, device, clock, stack, window, callbacks)
 
     def _feel(
         self,
@@ -315,7 +319,7 @@ class Run:
         clock: Clock,
         stack: ExitStack,
         window: Window | None,
-        told: list[Callable[[str], None]],
+        callbacks: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         options = BridgeOptions(
@@ -357,9 +361,9 @@ class Run:
             announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
-        told.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
+        callbacks.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
         if window is not None:
-            tell(f"view: {window.url}")
+            notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
@@ -369,7 +373,7 @@ class Run:
             out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
         else:
             print_summary(
-                summary, bridge.setup.law_evaluations, is_felt=not device.info.is_prescribed
+                summary, bridge.setup.law_evaluations, has_hand=not device.info.is_prescribed
             )
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
@@ -384,5 +388,5 @@ class Run:
         gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
         chosen = {name: value for name, value in gains.items() if value is not None}
         method, period = options.rendering_method, period_of(options.rate)
-        laws, scales = method.law_evaluations(options.substeps), options.workspace.scales
-        return replace(default_coupling(info, period, *scales, laws, method), **chosen)
+        law_evaluations, scales = method.law_evaluations(options.substeps), options.workspace.scales
+        return replace(default_coupling(info, period, *scales, law_evaluations, method), **chosen)

@@ -77,6 +77,6 @@ def _show(scene: str) -> int:
             plain(parameter.about),
         )
     out.print(table)
-    first, asked = parameters[0], plain(scene)
-    out.print(f"next: hapticbridge run {asked} --set {first.name}={first.minimum:g}")
+    first, name = parameters[0], plain(scene)
+    out.print(f"next: hapticbridge run {name} --set {first.name}={first.minimum:g}")
     return 0

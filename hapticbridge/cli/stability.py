@@ -50,14 +50,14 @@ class Stability:
                 f"no map is called '{self.name}'; maps: {choices([*MAPS, ALL])} ({listed})"
             )
         chosen = MAPS.values() if self.name == ALL else (MAPS[self.name],)
-        said = []
+        facts = []
         for each in chosen:
             files = self._computed(each)
-            said.append(json.loads(files.boundary.read_text(encoding="utf-8")))
+            facts.append(json.loads(files.boundary.read_text(encoding="utf-8")))
             if not self.as_json:
                 _print(each, files)
         if self.as_json:
-            out.print_json(json.dumps(said))
+            out.print_json(json.dumps(facts))
         return 0
 
     def _computed(self, each: StabilityMap) -> MapFiles:

@@ -32,7 +32,7 @@ def plain(text: str) -> str:
     return escape("".join(letter if letter.isprintable() else "�" for letter in text))
 
 
-def tell(sentence: str) -> None:
+def notify(sentence: str) -> None:
     """Prints what the user should know or do while a device is opened, on stderr."""
     err.print(plain(sentence))
 
@@ -94,8 +94,8 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
         task = bar.add_task(words, total=None)
 
         def show(done: int, total: int, name: str = "") -> None:
-            told = f"{words}: {plain(name)}" if name else words
-            bar.update(task, completed=done, total=total, description=told)
+            description = f"{words}: {plain(name)}" if name else words
+            bar.update(task, completed=done, total=total, description=description)
 
         yield show
 

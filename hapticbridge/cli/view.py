@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from hapticbridge.cli.terminal import progress, tell
+from hapticbridge.cli.terminal import notify, progress
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
 
@@ -41,7 +41,7 @@ class View:
         with progress("simulating again") as show:
             replay = Replay(self.file, show)
         theatre = Theatre(replay, address)
-        tell(f"view: {theatre.url}")
+        notify(f"view: {theatre.url}")
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()

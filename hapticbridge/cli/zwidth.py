@@ -10,7 +10,7 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.certificate import delay_ticks
-from hapticbridge.cli.terminal import err, out, plain, print_json, progress, tell, write_figure
+from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.errors import HapticBridgeError, choices
@@ -88,13 +88,13 @@ class Zwidth:
             if device is not None:
                 device.close()
         # the run command has no low-pass to offer, and without it this corner is not passive
-        felt = recommended(z)
-        command = next_command(felt.stiffness, felt.damping, self.rate)
-        told = None if z.filter_time else command
+        coupling = recommended(z)
+        command = next_command(coupling.stiffness, coupling.damping, self.rate)
+        next_step = None if z.filter_time else command
         if self.as_json:
-            print_json(_z_width_facts(z, told) | _measured_facts(measured))
+            print_json(_z_width_facts(z, next_step) | _measured_facts(measured))
         else:
-            _print_z_width(z, told)
+            _print_z_width(z, next_step)
             if measured is not None:
                 _print_measured(measured)
         if self.plot is not None:
@@ -108,7 +108,7 @@ class Zwidth:
                 "--measure tries walls without low-pass or further delay: leave --filter-time and "
                 "--delay out"
             )
-        device = open_device(spec, tell=tell)
+        device = open_device(spec, notify=notify)
         here = [name for name in AXES[:3] if name in device.info.axes]
         if device.info.is_prescribed or axis not in here:
             device.close()
@@ -120,27 +120,27 @@ class Zwidth:
 
     def _computed(self, period: float, info: DeviceInfo | None) -> ZWidth:
         """Computes the lines from what was given, else from what is known of the device."""
-        given = {
+        numbers = {
             name: getattr(self, name) for name in ("damping", "mass", "friction", "resolution")
         }
         delay = self.delay
         if info is not None:
-            given = {
+            numbers = {
                 name: getattr(info, name) if value is None else value
-                for name, value in given.items()
+                for name, value in numbers.items()
             }
             delay = delay_ticks(info, period) or 0
-        if given["damping"] is None:
+        if numbers["damping"] is None:
             missing = "the device's is unknown" if info else "it is missing"
             raise HapticBridgeError(
                 f"zwidth needs --damping, and {missing}; 'hapticbridge identify' measures it"
             )
         return z_width(
-            given["damping"],
+            numbers["damping"],
             period,
-            mass=given["mass"],
-            friction=given["friction"],
-            resolution=given["resolution"] or 0.0,
+            mass=numbers["mass"],
+            friction=numbers["friction"],
+            resolution=numbers["resolution"] or 0.0,
             delay=delay,
             filter_time=self.filter_time,
         )
@@ -184,8 +184,8 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     out.print(f"limited by: {z.corner_limited_by} ({reason})")
     for note in z.notes:
         out.print(f"note: {note}")
-    (told,) = coupling_sentences(z.corner, default_method(), z.period, 1)
-    out.print(f"use {told}: 80 % of the limit at a quarter of its damping")
+    (sentence,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    out.print(f"use {sentence}: 80 % of the limit at a quarter of its damping")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"

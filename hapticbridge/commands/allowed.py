@@ -107,8 +107,8 @@ class AxisCouplingLimits:
         """
         linear, angular = assumed_damping(self.info)
         known = replace(self.info, damping=linear, rotational_damping=angular)
-        laws = self.method.law_evaluations(self.substeps)
-        is_linear = laws == 1 and not delay_ticks(known, self.period)
+        law_evaluations = self.method.law_evaluations(self.substeps)
+        is_linear = law_evaluations == 1 and not delay_ticks(known, self.period)
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
         ratios = self.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
@@ -117,7 +117,7 @@ class AxisCouplingLimits:
             scales = self.scale, self.force_scale
             try:
                 need = required_axis_damping(
-                    known, requested, self.period, *scales, laws, self.method
+                    known, requested, self.period, *scales, law_evaluations, self.method
                 )
                 needs.append(need[self.axis == "rotation"])
             except CouplingError:  # no damping compensates this delay
@@ -130,7 +130,9 @@ class AxisCouplingLimits:
         It takes microseconds after the first call, because a refusal must not slow the loop.
         """
         requested = self.put(self.start, stiffness, damping)
-        stiffness, damping = self.gains(self.method.used(requested, self.period / self.substeps))
+        stiffness, damping = self.gains(
+            self.method.law_coupling(requested, self.period / self.substeps)
+        )
         ratios, needs = self._table
         highest = float(ratios[-1])
         ratio = min(damping / stiffness, highest) if stiffness > 0.0 else highest
@@ -144,7 +146,7 @@ class AxisCouplingLimits:
         most = 4.0 * self.damping / (self.period * self.leverage)
         return _largest(most, lambda stiffness: self.needed(stiffness, damping), self.damping)
 
-    def most_damping(self, stiffness: float) -> float:
+    def max_damping(self, stiffness: float) -> float:
         """Returns the largest damping for a stiffness; 0 if there is none."""
         most = 4.0 * self.damping / self.leverage
         return _largest(most, lambda damping: self.needed(stiffness, damping), self.damping)
@@ -257,7 +259,7 @@ class CouplingLimits:
 
     def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""
-        return self.method.used(requested, self.period / self.substeps)
+        return self.method.law_coupling(requested, self.period / self.substeps)
 
     def reason(self) -> str:
         """Returns the reason of the slider limits, in a sentence."""

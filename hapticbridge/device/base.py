@@ -175,7 +175,7 @@ class DeviceInfo:
         return any(axis in self.axes for axis in AXES[3:])
 
     @property
-    def burning_damping(self) -> tuple[float | None, float | None]:
+    def dissipating_damping(self) -> tuple[float | None, float | None]:
         """Damping that dissipates energy, in N s/m and N m s/rad; (None, None) if unknown.
 
         If one kind of axis is unknown, both are, because the energy cannot be assigned to an axis.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hapticbridge.device.family import Driver, FoundDevice, UsbId
-from hapticbridge.device.registry import all_families
+from hapticbridge.device.driver import Driver, FoundDevice, UsbId
+from hapticbridge.device.registry import all_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_search
 
@@ -13,17 +13,17 @@ RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
 
 
 def plugged_devices() -> list[FoundDevice]:
-    """Lists every connected device of every family; empty without USB."""
-    return [device for family in all_families() for device in plugged_of(family)]
+    """Lists every connected device of every driver; empty without USB."""
+    return [device for driver in all_drivers() for device in plugged_of(driver)]
 
 
-def plugged_of(family: Driver) -> list[FoundDevice]:
-    """Lists a family's connected devices, with the reason if one cannot be opened."""
-    if family.find is not None:
-        return family.find()
-    if family.transport == "hid":
-        return hid_search.find(family)
-    return usb_search.find(family)
+def plugged_of(driver: Driver) -> list[FoundDevice]:
+    """Lists a driver's connected devices, with the reason if one cannot be opened."""
+    if driver.find is not None:
+        return driver.find()
+    if driver.transport == "hid":
+        return hid_search.find(driver)
+    return usb_search.find(driver)
 
 
 def blind_spots() -> list[str]:
@@ -43,7 +43,7 @@ def udev_rules() -> str:
 
     A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``. It exists over
     Bluetooth too, where there is no USB parent. A rule cannot read a device's capabilities, so a
-    family that is a device class gets one rule per connected device.
+    driver that is a device class gets one rule per connected device.
     """
     lines = [
         "# Lets the user at the machine's own seat open haptic devices. Written by",
@@ -52,16 +52,16 @@ def udev_rules() -> str:
         f"#   hapticbridge devices --udev-rules | sudo tee {RULES_FILE}",
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
-    for family in all_families():
-        if not family.ids and family.recognises is None:
+    for driver in all_drivers():
+        if not driver.ids and driver.recognises is None:
             continue  # no node to open: a program of the maker's has it
-        lines += ["", f"# {family.name}: {family.about}"]
-        ids = family.ids if family.recognises is None else _ids_plugged_in(family)
+        lines += ["", f"# {driver.name}: {driver.about}"]
+        ids = driver.ids if driver.recognises is None else _ids_plugged_in(driver)
         if not ids:
             lines.append("# none is connected: plug it in, and write these rules again")
         for usb_id in ids:
             vendor, product = f"{usb_id.vendor:04x}", f"{usb_id.product:04x}"
-            if family.transport == "hid":
+            if driver.transport == "hid":
                 kernels = f"*:{vendor}:{product}.*".upper()
                 match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
             else:
@@ -73,7 +73,7 @@ def udev_rules() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _ids_plugged_in(family: Driver) -> tuple[UsbId, ...]:
-    """Returns the connected products of a family, each once."""
-    found = {(one.vendor, one.product): one.name for one in plugged_of(family)}
+def _ids_plugged_in(driver: Driver) -> tuple[UsbId, ...]:
+    """Returns the connected products of a driver, each once."""
+    found = {(one.vendor, one.product): one.name for one in plugged_of(driver)}
     return tuple(UsbId(*numbers, name) for numbers, name in sorted(found.items()))

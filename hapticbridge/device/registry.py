@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hapticbridge.device.base import Device
-from hapticbridge.device.family import Driver, Notify, ignore_message
+from hapticbridge.device.driver import Driver, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
@@ -28,43 +28,35 @@ DRIVERS = {
     "haply": "hapticbridge.device.haply.device",
     "forcedimension": "hapticbridge.device.force_dimension.device",
 }
-"""Module of each family by the family's name, in the order in which families are listed. The module
-holds the ``Driver`` as ``FAMILY``."""
+"""Module of each driver by the driver's name, in the order in which drivers are listed. The module
+holds the ``Driver`` as ``DRIVER``."""
 
 
-def family_named(name: str) -> Driver | None:
-    """Returns the family that ``open_device`` knows by a name, or None."""
+def driver_named(name: str) -> Driver | None:
+    """Returns the driver that ``open_device`` knows by a name, or None."""
     if name not in DRIVERS:
         return None
-    family: Driver = import_module(DRIVERS[name]).FAMILY
-    return family
+    driver: Driver = import_module(DRIVERS[name]).DRIVER
+    return driver
 
 
-def all_families() -> tuple[Driver, ...]:
-    """Returns every family; imports all drivers."""
-    return tuple(family for name in DRIVERS if (family := family_named(name)) is not None)
+def all_drivers() -> tuple[Driver, ...]:
+    """Returns every driver; imports all drivers."""
+    return tuple(driver for name in DRIVERS if (driver := driver_named(name)) is not None)
 
 
 # Options of a device specification: ``name=value,name=value``
 
-FILES = ("path",)
-"""Options that take all remaining text as a file's name, commas included."""
 
-TEXTS = ("hand", "serial", "firmware", "log", "profile", "reverse", "service", "library")
-"""Options that are text up to the next comma; a serial number may have leading zeros."""
-
-WHOLE = ("delay",)
-"""Options that are whole numbers; all others are numbers."""
-
-
-def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
+def parsed(device: str, text: str, valid: Options) -> dict[str, object]:
     """Parses the options after a device's name, separated by commas.
+
+    A ``Path`` takes all remaining text, commas included.
 
     Raises:
         DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
             not a number.
     """
-    names = tuple(valid)
     values: dict[str, object] = {}
     while text:
         name, equals, text = text.partition("=")
@@ -73,23 +65,18 @@ def parsed(device: str, text: str, valid: Iterable[str]) -> dict[str, object]:
             raise DeviceError(f"'{name}' is not an option; write options as name=value")
         if name in values:
             raise DeviceError(f"option '{name}' is set twice; set it once")
-        refuse_unknown(device, [name], names)
-        if name in FILES:
+        refuse_unknown(device, [name], valid)
+        kind = valid[name]
+        if kind is Path:
             value, text = text, ""
         else:
             value, _, text = text.partition(",")
-        values[name] = _value(name, value.strip())
+        try:
+            values[name] = kind(value.strip())
+        except ValueError:
+            number = "a whole number" if kind is int else "a number"
+            raise DeviceError(f"{name} = '{value.strip()}': must be {number}") from None
     return values
-
-
-def _value(name: str, text: str) -> object:
-    if name in FILES or name in TEXTS:
-        return text
-    try:
-        return int(text) if name in WHOLE else float(text)
-    except ValueError:
-        kind = "a whole number" if name in WHOLE else "a number"
-        raise DeviceError(f"{name} = '{text}': must be {kind}") from None
 
 
 def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) -> None:
@@ -105,11 +92,16 @@ def refuse_unknown(device: str, options: Iterable[str], valid: Iterable[str]) ->
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _HAND_PREFIX = "hand_"
 _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).parameters)
-_SIMULATED_OPTIONS = (*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS)
+_SIMULATED_OPTIONS: Options = {
+    **dict.fromkeys((*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS), float),
+    "delay": int,
+    "hand": str,
+    "path": Path,
+}
 _LIMITS = ("force_limit", "torque_limit", "speed_limit")
 
 
-def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) -> Device:
+def open_device(spec: str, *, notify: Notify = ignore_message, **options: object) -> Device:
     """Opens a device by its specification.
 
     A specification is a name, or a name, a colon and details of the device:
@@ -121,8 +113,8 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
       the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All text after the colon is the file's name, with commas and colons.
-    - a connected device, by the name of its family (``hapticbridge devices`` lists them), with
-      options of that family: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
+    - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
+      options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
       ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` selects one of several,
       ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
@@ -130,7 +122,8 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
 
     Args:
         spec: The specification.
-        tell: Receives messages for the user while the device is opened: instructions and progress.
+        notify: Receives messages for the user while the device is opened: instructions and
+            progress.
         **options: The parameters as keyword arguments; the specification takes precedence. A
             trajectory takes ``force_limit`` (N), ``torque_limit`` (N m) and ``speed_limit`` (m/s).
 
@@ -144,21 +137,21 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
         RecordingError: The file is a recording that cannot be read.
     """
     name, _, rest = spec.partition(":")
-    if (family := family_named(name)) is not None:
-        valid = tuple(dict.fromkeys((*family.options, "profile")))
+    if (driver := driver_named(name)) is not None:
+        valid: Options = {**driver.options, "profile": str}
         refuse_unknown(name, options, valid)
         requested = {**options, **parsed(name, rest, valid)}
         profile_option = requested.get("profile")
-        if "profile" not in family.options:
+        if "profile" not in driver.options:
             requested.pop("profile", None)
         profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
-        device = family.open(requested, tell)
+        device = driver.open(requested, notify)
         try:
             if profile_option is None:
                 model = device.info.name
                 profile = profile_of(name, device.info.serial, model)
                 if profile is None and (models := modelled(name)):
-                    tell(f"no profile of '{model}' exists; profiles: {choices(models)}")
+                    notify(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if profile is not None:
                 device.info = profile.fill(device.info)
         except BaseException:
@@ -171,7 +164,7 @@ def open_device(spec: str, *, tell: Notify = ignore_message, **options: object) 
     return _OPENERS[name](rest, options)
 
 
-def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device:
+def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Device:
     """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
@@ -183,7 +176,7 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
     """
     name, _, rest = spec.partition(":")
     if name != "simulated":
-        return open_device(spec, tell=tell)
+        return open_device(spec, notify=notify)
     options: dict[str, object] = {}
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
@@ -191,7 +184,7 @@ def device_for(scene: Scene, spec: str, tell: Notify = ignore_message) -> Device
     path = scene.path.with_suffix(".csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, tell=tell, **options)
+    return open_device(spec, notify=notify, **options)
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

@@ -20,7 +20,7 @@ from hapticbridge.device.base import (
     checked_number,
     checked_period,
 )
-from hapticbridge.device.family import Driver, Notify, UsbId, select_device
+from hapticbridge.device.driver import Driver, Notify, UsbId, select_device
 from hapticbridge.device.transport.hid import HidApi, HidLink, Link, find
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError
@@ -291,12 +291,12 @@ class SpaceMouseDevice:
 
 
 def open_spacemouse(
-    options: Mapping[str, object], _tell: Notify, api: HidApi | None = None
+    options: Mapping[str, object], _notify: Notify, api: HidApi | None = None
 ) -> SpaceMouseDevice:
     """Finds and opens a SpaceMouse; options are ``serial``, ``log`` and numbers of the device."""
-    plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
+    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
     # not overlapped: reports are written only before and after the loop
-    link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.asked(options))
+    link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.from_options(options))
     numbers: dict[str, float] = {
         key: value  # type: ignore[misc] # checked by the device
         for key, value in options.items()
@@ -313,7 +313,7 @@ def open_spacemouse(
 
 _NUMBERS = ("speed", "turn", "dead_band", "force_limit", "torque_limit")
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="spacemouse",
     about="3Dconnexion SpaceMouse and earlier models: input only, its rate moves the handle",
     ids=IDS,
@@ -321,6 +321,6 @@ FAMILY = Driver(
     axes="6, by rate",
     force="none; shown, not felt",
     rate="about 125 Hz",
-    options=("serial", "log", *_NUMBERS),
+    options={"serial": str, "log": str, **dict.fromkeys(_NUMBERS, float)},
     open=open_spacemouse,
 )

@@ -53,7 +53,7 @@ class Estimate:
         """Significance: true if the interval excludes zero."""
         return self.least > 0.0 or self.most < 0.0
 
-    def told(self) -> str:
+    def as_text(self) -> str:
         """Returns the value and its interval as text, rounded to the significant digits."""
         value = self.value
         if self.half_width > 0.0:

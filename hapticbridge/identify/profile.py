@@ -77,8 +77,8 @@ def _draw_axis(panel: Axes, result: Identification, axis: str, fit: AxisFit) -> 
         color=colour,
         lw=_WIDTHS[axis[-1]],
         alpha=0.45,
-        label=f"{axis}: b = {fit.damping.told()} {units[0]}, "
-        f"f_c = {fit.friction.told()} {units[1]}",
+        label=f"{axis}: b = {fit.damping.as_text()} {units[0]}, "
+        f"f_c = {fit.friction.as_text()} {units[1]}",
     )
 
 

@@ -71,7 +71,7 @@ CONTACT = int(TickFlag.CONTACT)
 CLUTCH = int(TickFlag.CLUTCH)
 STALE_SAMPLE = int(TickFlag.STALE_SAMPLE)
 TRIP = int(TickFlag.TRIP)
-RESEATED = int(TickFlag.RESEATED)
+REANCHORED = int(TickFlag.REANCHORED)
 LOSSLESS_TICK = int(TickFlag.MIDPOINT)
 """Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 

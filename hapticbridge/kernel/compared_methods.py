@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, Scheme, State
-from hapticbridge.kernel.coupling import command_handle_velocity, wrench_after_step
 from hapticbridge.kernel.handle import note_tool, tool_after_step, tool_motion
+from hapticbridge.kernel.law import command_handle_velocity, wrench_after_step
 from hapticbridge.kernel.ledger import set_contact_springs_energy
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.pose import (

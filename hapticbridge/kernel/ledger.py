@@ -56,7 +56,7 @@ ENERGY_DTYPE = np.dtype(
         ("slack_share", "<f8"),
         ("first_unstrict", "<i8"),
         ("first_active", "<i8"),
-        ("first_kick", "<i8"),
+        ("first_device_excess", "<i8"),
         ("mocap_has_moved", "<i8"),
         ("equality_rows", "<i8"),
     ]
@@ -69,7 +69,7 @@ moved mocap body leaves until the step is done."""
 def start_energies(energy: Part) -> None:
     """Takes the present storage as that of the start."""
     energy["start_energy"] = energy["kinetic"] + energy["potential"]
-    for name in ("first_unstrict", "first_active", "first_kick"):
+    for name in ("first_unstrict", "first_active", "first_device_excess"):
         energy[name] = -1
 
 
@@ -453,8 +453,8 @@ def judge_environment(s: State) -> bool:
         ratio = s.run.force_scale / s.run.scale
         gained = ratio * (stored - energy.actuator_work - energy.external_work)
         excess = energy.device_energy - energy.device_dissipation + gained
-        if energy.first_kick < 0 and excess > allowed:
-            energy.first_kick = s.loop.tick
+        if energy.first_device_excess < 0 and excess > allowed:
+            energy.first_device_excess = s.loop.tick
     if created > allowed:
         if energy.first_unstrict < 0:
             energy.first_unstrict = s.loop.tick

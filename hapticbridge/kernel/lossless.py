@@ -43,8 +43,8 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
-from hapticbridge.kernel.coupling import law_wrench, set_gains
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.law import law_wrench, set_gains
 from hapticbridge.kernel.ledger import add_body_wrenches, moment_dot, set_kinetic_energy
 from hapticbridge.kernel.mujoco_c import (
     floats,
@@ -353,7 +353,7 @@ def note_twist(s: State) -> None:
 
 
 @compiled
-def wrench_after_step(s: State) -> tuple[Vector, Vector, Vector, Vector]:
+def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     """Evaluates the lossless coupling after a step of MuJoCo, and notes the tool's new pose.
 
     Returns:
@@ -658,7 +658,7 @@ def _enter(s: State, force: Vector, torque: Vector) -> None:
 def finish_lossless(s: State) -> None:
     """Ends a step: balances its energy at v, carries half of the wrench over, changes the form.
 
-    Needs the poses and energies after the step, and the notes of ``wrench_after_step``.
+    Needs the poses and energies after the step, and the notes of ``lossless_wrench``.
     """
     mj = s.mj
     lossless, wrench = s.lossless, s.loop.wrench_on_tool

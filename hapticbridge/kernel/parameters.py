@@ -29,38 +29,51 @@ MAX_BUTTONS = 32
 LATER = frozenset({"reach", "ramp_energy"})
 """Fields missing in the first recordings with a guard; they default to infinity."""
 
-_POSITIVE = ("force_rise", "torque_rise", "longest_stall")
+_POSITIVE = ("force_slew", "torque_slew", "longest_stall")
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
-    "credit",
-    "rotational_credit",
-    "most_damping",
-    "most_rotational_damping",
-    "surplus",
+    "assumed_damping",
+    "assumed_rotational_damping",
+    "max_damping",
+    "max_rotational_damping",
+    "energy_credit_limit",
 )
+
+
+_FILE_KEYS = {
+    "assumed_damping": "credit",
+    "assumed_rotational_damping": "rotational_credit",
+    "max_damping": "most_damping",
+    "max_rotational_damping": "most_rotational_damping",
+    "energy_credit_limit": "surplus",
+    "force_slew": "force_rise",
+    "torque_slew": "torque_rise",
+    "reanchors_at_start": "reseats",
+}
+"""Keys of the metadata ``guard`` that differ from the names of ``GuardParameters``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
 
-    The names are those of the metadata ``guard`` of a recording.
+    A recording holds them as its metadata ``guard``, some under older names (``_FILE_KEYS``).
 
     Attributes:
         controller: ``OFF``, ``DAMPER`` or ``ENVIRONMENT``.
-        credit: Damping in N s/m that the passivity observer assumes the device to have.
-        rotational_credit: Damping in N m s/rad that it assumes in rotation.
-        most_damping: Largest damping in N s/m that the controller adds on an axis.
-        most_rotational_damping: Largest damping in N m s/rad that it adds on an axis.
-        surplus: Largest energy in J that earlier dissipation may pay for.
-        force_rise: Largest change of the force per tick in N.
-        torque_rise: Largest change of the torque per tick in N m.
+        assumed_damping: Damping in N s/m that the passivity observer assumes the device to have.
+        assumed_rotational_damping: Damping in N m s/rad that it assumes in rotation.
+        max_damping: Largest damping in N s/m that the controller adds on an axis.
+        max_rotational_damping: Largest damping in N m s/rad that it adds on an axis.
+        energy_credit_limit: Largest energy in J that earlier dissipation may pay for.
+        force_slew: Largest change of the force per tick in N.
+        torque_slew: Largest change of the torque per tick in N m.
         stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
         fade_ticks: Ticks in which the wrench fades to zero.
         clutch: Mask of buttons; while one is held, the device moves without the handle.
         dead_man: Mask of buttons of which one must be held; 0 for none.
         longest_stall: Time in s between two samples after which the handle is re-anchored.
-        reseats: True if a device that moved before the first tick is re-anchored.
+        reanchors_at_start: True if a device that moved before the first tick is re-anchored.
         speed: Speed of the device in m/s above which the run is stopped.
         turn_speed: Angular speed of the device in rad/s above which the run is stopped.
         stretch: Length of the coupling in m above which the run is stopped.
@@ -69,26 +82,26 @@ class GuardParameters:
         reach: Distance in m from the origin of the device's frame beyond which the device moves
             without the handle and without force.
         ramp_energy: Energy in J of the coupling up to which the ramp rises at full pace
-            (``kernel.guard``).
+            (``kernel.tick_guard``).
 
     Raises:
         HapticBridgeError: A value is out of range.
     """
 
     controller: int = OFF
-    credit: float = 0.0
-    rotational_credit: float = 0.0
-    most_damping: float = 0.0
-    most_rotational_damping: float = 0.0
-    surplus: float = 0.0
-    force_rise: float = math.inf
-    torque_rise: float = math.inf
+    assumed_damping: float = 0.0
+    assumed_rotational_damping: float = 0.0
+    max_damping: float = 0.0
+    max_rotational_damping: float = 0.0
+    energy_credit_limit: float = 0.0
+    force_slew: float = math.inf
+    torque_slew: float = math.inf
     stale_ticks: int = 0
     fade_ticks: int = 1
     clutch: int = 0
     dead_man: int = 0
     longest_stall: float = math.inf
-    reseats: bool = False
+    reanchors_at_start: bool = False
     speed: float = math.inf
     turn_speed: float = math.inf
     stretch: float = math.inf
@@ -121,7 +134,7 @@ class GuardParameters:
 
     def to_json(self) -> str:
         """Returns the text for a recording's metadata; infinity becomes null."""
-        values = asdict(self)
+        values = {_FILE_KEYS.get(name, name): value for name, value in asdict(self).items()}
         return json.dumps({k: None if v == math.inf else v for k, v in values.items()})
 
     @classmethod
@@ -135,10 +148,12 @@ class GuardParameters:
             values = dict(read_json(text))
         except (ValueError, TypeError):
             values = {}
-        names = {field.name for field in fields(cls)}
-        if not names - LATER <= values.keys() <= names:
+        names = {_FILE_KEYS.get(field.name, field.name): field.name for field in fields(cls)}
+        if not names.keys() - LATER <= values.keys() <= names.keys():
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
-        numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
+        numbers: dict[str, Any] = {
+            names[key]: math.inf if value is None else value for key, value in values.items()
+        }
         return cls(**numbers)
 
 
@@ -190,7 +205,8 @@ class RunParameters:
         grip: Name of the site on the tool.
         period: T in s.
         substeps: MuJoCo steps per tick, >= 1.
-        coupling: K and B' of the law (``rendering.Method.used``), not the effective coupling.
+        coupling: K and B' of the law (``rendering.Method.law_coupling``), not the effective
+            coupling.
         scale: Handle motion per device motion, without unit.
         force_scale: Force on the device per force on the tool, without unit. Power is equal on both
             sides if it equals ``scale``; torques are scaled by force_scale / scale.
@@ -202,8 +218,8 @@ class RunParameters:
         handle_origin: Handle pose of the same form, in the scene.
         device_start: Device pose of the same form before the first tick.
         scheme: Path of the wrench to the tool.
-        felt: Effective coupling as measured, for a weld; None if it follows from ``coupling``. The
-            device condition uses it.
+        effective: Effective coupling as measured, for a weld; None if it follows from ``coupling``.
+            The device condition uses it.
         contact_stiffness: K_c in N/m per contact of a tool without mass; 0 for other methods.
         device_damping: b of the device in N s/m; None for a prescribed motion, or if a damping is
             unknown. Its dissipation is compared with the energy delivered.
@@ -229,7 +245,7 @@ class RunParameters:
     handle_origin: tuple[float, ...]
     device_start: tuple[float, ...]
     scheme: int = Scheme.IMPLICIT
-    felt: Coupling | None = None
+    effective: Coupling | None = None
     contact_stiffness: float = 0.0
     device_damping: float | None = None
     device_rotational_damping: float | None = None
@@ -320,11 +336,11 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
         HapticBridgeError: The matrix is no rotation.
     """
     try:
-        given = np.asarray(matrix, dtype=np.float64)
+        numbers = np.asarray(matrix, dtype=np.float64)
     except (TypeError, ValueError):
-        given = np.zeros(0)
-    if given.size == 9 and np.all(np.isfinite(given)):
-        square = given.reshape(3, 3)
+        numbers = np.zeros(0)
+    if numbers.size == 9 and np.all(np.isfinite(numbers)):
+        square = numbers.reshape(3, 3)
         off = np.abs(square @ square.T - np.eye(3)).max()
         if off < 1e-5 and np.linalg.det(square) > 0:
             if off < _ROUNDING:  # a second time would change the last digits of a recorded one

@@ -10,7 +10,7 @@ import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF, Part, State
-from hapticbridge.kernel.coupling import releasable_energy
+from hapticbridge.kernel.law import releasable_energy
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, scaled
 
@@ -43,8 +43,8 @@ OBSERVER_DTYPE = np.dtype(
         ("max_rotational_damping", "<f8"),
         ("energy_credit_limit", "<f8"),
         ("observed_energy", "<f8"),
-        ("energy_to_device", "<f8"),
-        ("excess_energy_to_device", "<f8"),
+        ("net_device_energy", "<f8"),
+        ("excess_device_energy", "<f8"),
         ("stored_while_force_off", "<f8"),
         ("generated_energy", "<f8"),
         ("previous_generated", "<f8"),
@@ -64,11 +64,11 @@ tick."""
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     """Fills in the controller and its limits."""
     observer["controller"] = guarding.controller
-    observer["assumed_damping"] = guarding.credit
-    observer["assumed_rotational_damping"] = guarding.rotational_credit
-    observer["max_damping"] = guarding.most_damping
-    observer["max_rotational_damping"] = guarding.most_rotational_damping
-    observer["energy_credit_limit"] = guarding.surplus
+    observer["assumed_damping"] = guarding.assumed_damping
+    observer["assumed_rotational_damping"] = guarding.assumed_rotational_damping
+    observer["max_damping"] = guarding.max_damping
+    observer["max_rotational_damping"] = guarding.max_rotational_damping
+    observer["energy_credit_limit"] = guarding.energy_credit_limit
 
 
 def cap_dissipation(s: State) -> None:
@@ -76,7 +76,7 @@ def cap_dissipation(s: State) -> None:
 
         G ← max(G, −(A_max + r V + r max(S − S_0 − U, 0))),    r = force_scale / scale
 
-    G is ``energy_to_device``, A_max ``energy_credit_limit``, V the energy that the coupling's
+    G is ``net_device_energy``, A_max ``energy_credit_limit``, V the energy that the coupling's
     springs can release, S − S_0 the energy that the scene has taken up; all in J. Both V and S −
     S_0 may return to the hand. U is the energy that the scene took up while the force was off by
     command; it may not return, and neither may V then, because the handle is re-anchored before
@@ -96,7 +96,7 @@ def cap_dissipation(s: State) -> None:
     )
     released = 0.0 if s["guard"]["commanded"] & FORCE_OFF else releasable_energy(s)
     limit = float(observer["energy_credit_limit"]) + released + ratio * max(stored, 0.0)
-    observer["energy_to_device"] = max(float(observer["energy_to_device"]), -limit)
+    observer["net_device_energy"] = max(float(observer["net_device_energy"]), -limit)
 
 
 def observe_reset(s: State, stored_before: float) -> None:
@@ -110,12 +110,12 @@ def observe_reset(s: State, stored_before: float) -> None:
     start, ratio = float(energy["start_energy"]), s["run"]["force_scale"] / s["run"]["scale"]
     after = float(energy["kinetic"] + energy["potential"])
     lost_before, lost_after = min(stored_before - start, 0.0), min(after - start, 0.0)
-    observer["energy_to_device"] += ratio * (lost_before - lost_after)
+    observer["net_device_energy"] += ratio * (lost_before - lost_after)
     cap_dissipation(s)
 
 
 @compiled
-def excess_energy_to_device(s: State) -> float:
+def excess_device_energy(s: State) -> float:
     """Returns the energy in J that the device received beyond the hand's, up to the last tick.
 
         G + r min(S − S_0, 0),    r = force_scale / scale
@@ -124,7 +124,7 @@ def excess_energy_to_device(s: State) -> float:
     scene has given up since then has paid for as much.
     """
     lost = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
-    return float(s.observer.energy_to_device + (s.run.force_scale / s.run.scale) * lost)
+    return float(s.observer.net_device_energy + (s.run.force_scale / s.run.scale) * lost)
 
 
 @compiled
@@ -143,7 +143,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
 
     Also updated, each in J:
         ``generated_energy``: Σ E_k − slack of the environment's port; A_max caps its credit.
-        ``excess_energy_to_device``: as the function computes it; motors of the scene pay for none.
+        ``excess_device_energy``: as the function computes it; motors of the scene pay for none.
         ``stored_while_force_off``: energy that the scene took up while the force was off by
         command and still stores. No hand supplied it (``cap_dissipation``).
 
@@ -184,8 +184,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         a[3 + i] = max(a[3 + i] + angular, -limit)
         delivered += linear + angular
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
-    observer.energy_to_device += delivered
-    observer.excess_energy_to_device = excess_energy_to_device(s)
+    observer.net_device_energy += delivered
+    observer.excess_device_energy = excess_device_energy(s)
     for i in range(6):
         u = rate * (moved[i] if i < 3 else turned[i - 3])
         has_reversed = 1 if u * observer.device_velocity[i] < 0.0 else 0

@@ -8,11 +8,11 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 |-------------|---------------------------------------------------|-------------------------------|
 | mj          | addresses, sizes and ids of model and data        | state, once                   |
 | run         | period, scheme, scales, limits, axes              | state, once                   |
-| coupling    | K, B', gains of the actuators, goal of a change   | coupling                      |
+| coupling    | K, B', gains of the actuators, goal of a change   | law                           |
 | pose        | poses of device, handle and tool, and their steps | handle                        |
 | loop        | results that a stage of a tick hands to the next  | tick                          |
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
-| guard       | thresholds, ramp, fade, limited wrench            | guard                         |
+| guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 """
@@ -27,15 +27,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
-from hapticbridge.kernel.coupling import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
-from hapticbridge.kernel.guard import (
-    GUARD_DTYPE,
-    bind_guard,
-    request_anchor,
-    restart_ramp,
-    set_commanded,
-)
 from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_to_tool, set_tool
+from hapticbridge.kernel.law import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
 from hapticbridge.kernel.ledger import (
     ENERGY_DTYPE,
     add_reset_work,
@@ -52,6 +45,13 @@ from hapticbridge.kernel.passivity_controller import (
     observe_reset,
 )
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
+from hapticbridge.kernel.tick_guard import (
+    GUARD_DTYPE,
+    bind_guard,
+    request_reanchoring,
+    restart_ramp,
+    set_commanded,
+)
 from hapticbridge.record import TICK_DTYPE
 
 _FROM_PARAMETERS = (
@@ -147,7 +147,7 @@ class BoundKernel:
 
     @property
     def external_flags(self) -> NDArray[np.int64]:
-        """Flags ``STALE_SAMPLE`` and ``RESEATED`` of the next tick, a view that the loop fills."""
+        """Flags ``STALE_SAMPLE`` and ``REANCHORED`` of the next tick; the loop fills this view."""
         return cast(NDArray[np.int64], self.state["loop"]["external_flags"])
 
     @property
@@ -162,7 +162,7 @@ class BoundKernel:
         pause(s["loop"])
 
     def tune(self, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int) -> None:
-        """Changes the coupling from the next tick on (``kernel.coupling``).
+        """Changes the coupling from the next tick on (``kernel.law``).
 
         Args:
             parameters: Parameters of the run with the new coupling.
@@ -193,7 +193,7 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
-        request_anchor(s["guard"])
+        request_reanchoring(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
             restart_lossless(s)
 

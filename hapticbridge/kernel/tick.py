@@ -21,7 +21,7 @@ from hapticbridge.kernel.codes import (
     HALF_DONE,
     LARGEST_CONTROL,
     OK,
-    RESEATED,
+    REANCHORED,
     RING_FULL,
     TRIP,
     Part,
@@ -29,8 +29,6 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.coupling import command_handle_velocity, retune, wrench_after_step
-from hapticbridge.kernel.guard import DEVICE_BUTTONS, follow, limit_wrench, refusal
 from hapticbridge.kernel.handle import (
     anchor_handle,
     device_from_scene,
@@ -39,6 +37,7 @@ from hapticbridge.kernel.handle import (
     move_handle,
     place_handle,
 )
+from hapticbridge.kernel.law import command_handle_velocity, retune, wrench_after_step
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
     judge_environment,
@@ -47,8 +46,12 @@ from hapticbridge.kernel.ledger import (
     note_moved_mocap_bodies,
     refresh_energies,
 )
-from hapticbridge.kernel.lossless import apply_carried, finish_lossless, lossless_flag
-from hapticbridge.kernel.lossless import wrench_after_step as lossless_wrench
+from hapticbridge.kernel.lossless import (
+    apply_carried,
+    finish_lossless,
+    lossless_flag,
+    lossless_wrench,
+)
 from hapticbridge.kernel.mujoco_c import (
     floats,
     has_warned,
@@ -65,6 +68,7 @@ from hapticbridge.kernel.mujoco_c import (
     release_fence,
 )
 from hapticbridge.kernel.passivity_controller import control, observe_energy
+from hapticbridge.kernel.tick_guard import DEVICE_BUTTONS, follow, limit_wrench, refusal
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -97,7 +101,7 @@ LOOP_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
-next. ``external_flags`` are ``STALE_SAMPLE`` and ``RESEATED`` as the live loop or a recording has
+next. ``external_flags`` are ``STALE_SAMPLE`` and ``REANCHORED`` as the live loop or a recording has
 them, set before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
 ``motion`` is the tool's, in m and rad; wrenches in N and N m, peaks since the start."""
 
@@ -144,7 +148,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     handle, orientation = vector_of(pose.handle_position), quaternion_of(pose.handle_quaternion)
     buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
     if follow(s, position, moved, turned, buttons, elapsed):
-        if s.guard.flags & RESEATED:
+        if s.guard.flags & REANCHORED:
             anchor_handle(pose, position, quaternion)
         handle, orientation = handle_pose(s.run, pose, position, quaternion)
     move_handle(pose, handle, orientation)
@@ -620,7 +624,7 @@ def simulate_recorded(
     Args:
         state: The bound state.
         samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` and ``RESEATED`` as recorded, one per tick.
+        external_flags: ``STALE_SAMPLE`` and ``REANCHORED`` as recorded, one per tick.
         elapsed: Time between two samples in s, one per tick.
         row: The bound record.
         rows: Receives the records; as long as ``samples``.

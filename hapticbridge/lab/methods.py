@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.rendering import METHODS, Method
-from hapticbridge.theory.compensation import IMPLICIT_LAG
+from hapticbridge.theory.compensation import IMPLICIT_SHARE
 
 __all__ = ["METHODS"]
 
@@ -32,8 +32,8 @@ _COMPARED = (
         hazard="contacts are solved without the coupling's stiffness and may create energy",
         scheme=Scheme.IMPLICIT,
         integrator="implicitfast",
-        compensated=True,
-        adds=IMPLICIT_LAG,
+        has_extra_damping=True,
+        added_share=IMPLICIT_SHARE,
     ),
     *(
         Method(

@@ -438,12 +438,12 @@ def diagnose(
     rate: float = 1000.0,
     duration: float = 20.0,
     system: System | None = None,
-    tell: Callable[[float, float], None] = lambda _done, _whole: None,
+    progress: Callable[[float, float], None] = lambda _done, _whole: None,
 ) -> Diagnosis:
     """Measures this machine.
 
-    The duration in s, 1 to 3600, is shared by the loops. ``tell`` is called with the time done and
-    the whole time, in s.
+    The duration in s, 1 to 3600, is shared by the loops. ``progress`` is called with the time done
+    and the whole time, in s.
 
     Raises:
         HapticBridgeError: Rate or duration is out of range.
@@ -474,7 +474,7 @@ def diagnose(
                     refused = late  # no further attempt
                 else:
                     baseline.add(late, lateness_above_baseline(period_ns, late).missed)
-            tell(duration * (turn + 1) / rounds, duration)
+            progress(duration * (turn + 1) / rounds, duration)
     lateness = {loop.name: loop.lateness() for loop in loops if loop.late_ns}
     stolen = (stolen_time(machine.proc) or 0.0) - (before or 0.0)
     found = findings(machine, at_rest + granted, stolen, duration)

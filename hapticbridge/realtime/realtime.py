@@ -248,19 +248,19 @@ class Grant:
     remedy: str = ""
 
 
-def wants_real_time(asked: bool | None, clock: Clock, *, is_real: bool) -> bool:
+def wants_real_time(requested: bool | None, clock: Clock, *, is_real: bool) -> bool:
     """Decides if a run requests real time.
 
-    ``asked`` is the user's choice; None requests it for a device with motors on a real clock.
+    ``requested`` is the user's choice; None requests it for a device with motors on a real clock.
 
     Raises:
         HapticBridgeError: Real time was requested with a clock that is not real.
     """
-    if asked and clock.name != RealClock.name:
+    if requested and clock.name != RealClock.name:
         raise HapticBridgeError(
             f"real time and a {clock.name} clock exclude each other; request only one of them"
         )
-    return is_real and clock.name == RealClock.name if asked is None else asked
+    return is_real and clock.name == RealClock.name if requested is None else requested
 
 
 @contextmanager

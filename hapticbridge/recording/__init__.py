@@ -4,11 +4,10 @@ Read ``format`` first, the definition of a recording. Records leave the loop thr
 events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;
 ``snapshot`` holds the scene's positions for a viewer. ``writer`` writes a file. ``reader`` reads
 one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut.
+``timeline`` computes due times.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment
-from hapticbridge.recording.format import Timeline as Timeline
-from hapticbridge.recording.format import due_times as due_times
 from hapticbridge.recording.reader import Recording as Recording
 from hapticbridge.recording.reader import RecordingFile as RecordingFile
 from hapticbridge.recording.reader import open_recording as open_recording

@@ -348,7 +348,7 @@ class RecordStream:
         path: The recording, overwritten if it exists; None records nothing.
         period: T in s, which determines the ring's capacity.
         live: True shows the state of the run on standard error.
-        is_lossless: True if the loop may wait for the recorder (simulated time) instead of losing
+        may_wait: True if the loop may wait for the recorder (simulated time) instead of losing
             records.
         observer: Optional second reader of the ring, such as the live view. The loop never waits
             for it.
@@ -370,11 +370,11 @@ class RecordStream:
         period: float,
         *,
         live: bool,
-        is_lossless: bool,
+        may_wait: bool,
         observer: RingObserver | None = None,
         snapshot: str = "",
     ) -> None:
-        self._path, self._is_live, self._is_lossless = path, live, is_lossless
+        self._path, self._is_live, self._may_wait = path, live, may_wait
         self._is_read = path is not None or live
         capacity = min(round(RING_SECONDS / period), MAX_RECORDS)
         self._observer, self._snapshot = observer, snapshot
@@ -405,17 +405,19 @@ class RecordStream:
             self.recorder.wait_until_ready()
         if self._observer is not None:
             self._observer.start(str(self._ring.name), self._snapshot, metadata, attachments)
-        self.tell({"event": "recording", "path": None if self._path is None else str(self._path)})
+        self.notify_observer(
+            {"event": "recording", "path": None if self._path is None else str(self._path)}
+        )
 
-    def tell(self, news: Mapping[str, object]) -> None:
+    def notify_observer(self, news: Mapping[str, object]) -> None:
         """Sends news to the observer only; never blocks and never raises."""
         if self._observer is not None:
             self._observer.event(news)
 
-    def makes_room(self, *, may_wait: bool) -> bool:
+    def makes_room(self, *, is_stopping: bool) -> bool:
         """Handles a record refused by a full ring.
 
-        A run that was told to stop must not wait (``may_wait``).
+        A run that was told to stop must not wait (``is_stopping``).
 
         Returns:
             True after a wait in simulated time, to try again. False if the record is counted as
@@ -426,7 +428,7 @@ class RecordStream:
         """
         if self.recorder is None or not self.recorder.is_alive():
             raise RecordingError(_ENDED)
-        if self._is_lossless and may_wait:
+        if self._may_wait and not is_stopping:
             time.sleep(RING_POLL)
             return True
         self.dropped += 1

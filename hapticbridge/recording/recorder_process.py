@@ -173,14 +173,14 @@ class _Session:
             self._live = LiveLine(sys.stderr)
         self._last_time = 0
         self._last_tick = -1
-        self._has_told = False
+        self._has_reported_full = False
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge closes or dies."""
         end = None
         while end is None:
             count = self._drain_once()
-            self._tell_if_full()
+            self._report_if_full()
             end = self._handle(inbox)
             # a process that the bridge forked may hold the pipe open after the bridge's death
             if end is None and os.getppid() != self._parent:
@@ -209,10 +209,10 @@ class _Session:
             self._live.update(rows)
         return int(rows.size)
 
-    def _tell_if_full(self) -> None:
+    def _report_if_full(self) -> None:
         """Reports a full disk once; the reserve holds the data until the bridge ends."""
-        if self._writer is not None and self._writer.is_full and not self._has_told:
-            self._has_told = True
+        if self._writer is not None and self._writer.is_full and not self._has_reported_full:
+            self._has_reported_full = True
             self._write_event({"event": "disk_full", "tick": self._last_tick}, self._last_time)
             _answer(full=True)
 
@@ -275,10 +275,10 @@ def main() -> int:
     """Runs the recorder's process; returns its exit status."""
     _drop_signals_and_priority()
     stream = sys.stdin.buffer
-    given = _configuration(stream)
-    if given is None:
+    received = _configuration(stream)
+    if received is None:
         return 1  # the bridge died before the run began
-    configuration, attachments = given
+    configuration, attachments = received
     try:
         session = _Session(configuration, attachments)
         _answer(ready=True)

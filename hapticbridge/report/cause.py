@@ -18,7 +18,7 @@ from hapticbridge.audit.replay import Resimulator
 from hapticbridge.certificate import (
     DampingCondition,
     delay_ticks,
-    felt_period,
+    device_period,
     required_damping,
     run_conditions,
 )
@@ -90,7 +90,7 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
         for part, unit in zip(("stiffness", "damping"), units, strict=True):
             share = _largest(partial(_holds, evidence, axis, part))
             if share:
-                value = share * getattr(evidence.asked, f"{name}{part}")
+                value = share * getattr(evidence.requested, f"{name}{part}")
                 found.append(f"lower the {axis}{part} to {_round_down(value)} {unit}")
     period = evidence.parameters.period
     slowest = period * FASTEST
@@ -111,13 +111,13 @@ def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
     ``axis`` is a key of ``_SETTING_UNITS``. ``part`` (``stiffness``, ``damping`` or ``period``) is
     reduced to ``share`` of its value.
     """
-    worst, felt, method = evidence.worst, evidence.asked, evidence.method
+    worst, requested, method = evidence.worst, evidence.requested, evidence.method
     period = worst.period * (share if part == "period" else 1.0)
     if part != "period":
         name = f"{axis.replace(' ', '_')}{part}"
-        felt = replace(felt, **{name: share * getattr(felt, name)})
-    used = method.used(felt, period / worst.substeps)
-    changed = replace(worst, coupling=used, period=period)
+        requested = replace(requested, **{name: share * getattr(requested, name)})
+    law = method.law_coupling(requested, period / worst.substeps)
+    changed = replace(worst, coupling=law, period=period)
     kind = "rotation" if axis else "translation"
     conditions = run_conditions(evidence.info, changed, method)
     return all(c.holds is not False for c in conditions if c.axis == kind)
@@ -197,7 +197,7 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
     prompt = worst.scale * worst.force_scale
     prompt *= required_damping(
-        worst.coupling, felt_period(info, worst.period), worst.law_evaluations
+        worst.coupling, device_period(info, worst.period), worst.law_evaluations
     )
     if not late or not failing or own < prompt:
         return None
@@ -212,7 +212,7 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
 def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause:
     """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
-    damper = worst.scale * worst.force_scale * evidence.asked.damping
+    damper = worst.scale * worst.force_scale * evidence.requested.damping
     if failing[0].axis == "translation" and damper >= own:
         return Cause(
             "damping",
@@ -280,8 +280,8 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     )
     if info.friction is not None and info.friction >= rub:
         return ""
-    span = slice(window.start, max(window.stop, int(np.argmax(evidence.unpaid)) + 1))
-    gained = np.diff(evidence.unpaid, prepend=0.0)[span].clip(min=0.0)
+    span = slice(window.start, max(window.stop, int(np.argmax(evidence.excess)) + 1))
+    gained = np.diff(evidence.excess, prepend=0.0)[span].clip(min=0.0)
     steps = _largest_steps(evidence.ticks["device_position"], span) / info.resolution
     total = float(gained.sum())
     share = float(gained[steps <= COUNTED].sum()) / total if total > 0 else 0.0

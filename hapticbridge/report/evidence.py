@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.energy import energy_balances
-from hapticbridge.audit.events import RecordedRun
+from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.state import AuditState
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
-from hapticbridge.recording import Recording, due_times
+from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
+from hapticbridge.recording.timeline import due_times
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.run_description import MODEL_ATTACHMENT, parameters_of
-from hapticbridge.summary import coupling_sentences, was_always_held
+from hapticbridge.summary import coupling_sentences, was_always_implicit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -119,7 +120,7 @@ def draw_recording(recording: Recording) -> Figure:
         method,
         parameters.period,
         parameters.substeps,
-        is_always_held=was_always_held(ticks),
+        is_always_implicit=was_always_implicit(ticks),
     ) or ("no coupling law",)
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control character would break the SVG
@@ -165,8 +166,8 @@ class Evidence:
         time: Due time of each tick in s on the clock of the events, (n,).
         created: Energy that the environment has created so far, (n,) in J.
         allowed: Slack: energy that the environment may have created so far, (n,) in J.
-        unpaid: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
-            (``EnergyBalance.unpaid_energy``).
+        excess: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
+            (``EnergyBalance.excess_device_energy``).
         model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
     """
 
@@ -178,7 +179,7 @@ class Evidence:
     time: Array
     created: Array
     allowed: Array
-    unpaid: Array
+    excess: Array
     model: mujoco.MjModel | None
 
     @property
@@ -192,18 +193,18 @@ class Evidence:
         return self.recording.events
 
     @property
-    def asked(self) -> Coupling:
+    def requested(self) -> Coupling:
         """Smallest requested coupling that leads to ``worst``.
 
         If the law's B' is 0, the method removed all requested damping, which may have had any value
         up to the effective one. It then counts as 0.
         """
-        used, step = self.worst.coupling, self.worst.period / self.worst.substeps
-        asked = self.method.rendered(used, step)
+        law, step = self.worst.coupling, self.worst.period / self.worst.substeps
+        requested = self.method.requested_coupling(law, step)
         return replace(
-            asked,
-            damping=asked.damping if used.damping else 0.0,
-            rotational_damping=asked.rotational_damping if used.rotational_damping else 0.0,
+            requested,
+            damping=requested.damping if law.damping else 0.0,
+            rotational_damping=requested.rotational_damping if law.rotational_damping else 0.0,
         )
 
     @property
@@ -217,7 +218,7 @@ class Evidence:
         The verdict must be ``active``.
         """
         if report.port == "device":
-            return self.unpaid, np.zeros_like(self.unpaid)
+            return self.excess, np.zeros_like(self.excess)
         # a strict audit grants no slack
         is_slack_used_up = report.environment == "active"
         return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
@@ -233,14 +234,17 @@ class Evidence:
         if not len(ticks) or not all((np.abs(ticks[name]) < DRAWABLE).all() for name in fields):
             return None
         try:
-            run = RecordedRun.of(recording)
+            run = AuditedRun.of(recording)
             worst = run.worst
             state = AuditState.at_start(recording, run.parameters)
             # by blocks, because the whole run at once would need much more memory
             blocks = (ticks[begin : begin + BLOCK] for begin in range(0, len(ticks), BLOCK))
             balances = energy_balances(blocks, state, run.events, run.delay)
             energies = np.concatenate(
-                [(each.environment_energy, each.slack, each.unpaid_energy) for _, each in balances],
+                [
+                    (each.environment_energy, each.slack, each.excess_device_energy)
+                    for _, each in balances
+                ],
                 axis=1,
             )
         except HapticBridgeError:
@@ -254,7 +258,7 @@ class Evidence:
             time=due_times(ticks, run.parameters.period),
             created=energies[0],
             allowed=energies[1],
-            unpaid=energies[2],
+            excess=energies[2],
             model=_model(recording),
         )
 

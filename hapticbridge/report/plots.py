@@ -74,7 +74,7 @@ _PORTS = (
 def draw_energies(evidence: Evidence) -> Figure:
     """Draws the energy of each port, and the bounds of environment and device."""
     ticks, time = evidence.ticks, evidence.time
-    is_watched = bool(evidence.unpaid.any())
+    is_watched = bool(evidence.excess.any())
     figure = new_figure(8, 6.6 if is_watched else 4.8)
     panels = figure.subplots(3 if is_watched else 2, 1, sharex=True)
     ports, bound = panels[:2]
@@ -89,7 +89,7 @@ def draw_energies(evidence: Evidence) -> Figure:
     bounded(bound, time, evidence.created, evidence.allowed, "created by the environment")
     if is_watched:
         free = np.zeros_like(time)
-        bounded(panels[2], time, evidence.unpaid, free, "given to the device, beyond what is paid")
+        bounded(panels[2], time, evidence.excess, free, "given to the device, beyond what is paid")
     for axes in panels:
         finish(axes)
     panels[-1].set_xlabel("time (s)")
@@ -112,9 +112,9 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     numbers = evidence.ticks["tick"][around]
     figure = new_figure(8, 6)
     energy, force, apart = figure.subplots(3, 1, sharex=True)
-    given, allowed = evidence.judged(report)
+    judged, allowed = evidence.judged(report)
     label = "given to the device, unpaid" if report.port == "device" else "created in the scene"
-    bounded(energy, numbers, given[around], allowed[around], label)
+    bounded(energy, numbers, judged[around], allowed[around], label)
     stretch = evidence.ticks["handle_position"] - evidence.ticks["tool_position"]
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
         sent = evidence.ticks["wrench_on_device"][around, i]
@@ -173,7 +173,7 @@ FLAGS = (
     (TickFlag.SLEW_LIMITED, "slew limited"),
     (TickFlag.CONTROLLER_ACTIVE, "controller"),
     (TickFlag.CLUTCH, "let go: clutch or dead man"),
-    (TickFlag.RESEATED, "re-seated"),
+    (TickFlag.REANCHORED, "re-anchored"),
     (TickFlag.CONTACT, "contact"),
     (TickFlag.STALE_SAMPLE, "old sample"),
     (TickFlag.OVERRUN, "late tick"),

@@ -80,12 +80,12 @@ def checked_points(points: Iterable[Mapping[str, object]]) -> dict[str, Point]:
     """
     found: dict[str, Point] = {}
     names: list[str] = []
-    for number, given in enumerate(points):
-        if not isinstance(given, Mapping) or not given:
-            raise StudyError(f"point {number} is {given!r:.60}; it must be a mapping of parameters")
+    for number, raw in enumerate(points):
+        if not isinstance(raw, Mapping) or not raw:
+            raise StudyError(f"point {number} is {raw!r:.60}; it must be a mapping of parameters")
         point = {
             name: _parameter(value, f"point {number}: parameter '{name}'")
-            for name, value in given.items()
+            for name, value in raw.items()
         }
         names = names or sorted(point)
         if sorted(point) != names:

@@ -272,9 +272,9 @@ def _name_of(function: Callable[[Any], Any]) -> str:
             another process.
     """
     if isinstance(function, functools.partial):
-        given = [*map(repr, function.args)]
-        given += [f"{name}={value!r}" for name, value in sorted(function.keywords.items())]
-        name = f"{_name_of(function.func)}({', '.join(given)})"
+        arguments = [*map(repr, function.args)]
+        arguments += [f"{name}={value!r}" for name, value in sorted(function.keywords.items())]
+        name = f"{_name_of(function.func)}({', '.join(arguments)})"
     else:
         name = f"{function.__module__}.{getattr(function, '__qualname__', '<object>')}"
         if "<" in name:

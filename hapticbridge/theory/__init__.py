@@ -18,7 +18,7 @@ from hapticbridge.theory.bounds import stiffest_coupling as stiffest_coupling
 from hapticbridge.theory.bounds import worst_frequency as worst_frequency
 from hapticbridge.theory.compensation import effective_damping as effective_damping
 from hapticbridge.theory.compensation import law_damping as law_damping
-from hapticbridge.theory.compensation import needed_for_felt as needed_for_felt
+from hapticbridge.theory.compensation import required_device_damping as required_device_damping
 from hapticbridge.theory.device_limits import QuantizationLimit as QuantizationLimit
 from hapticbridge.theory.device_limits import free_device_damping as free_device_damping
 from hapticbridge.theory.device_limits import free_device_stiffness as free_device_stiffness

@@ -42,32 +42,37 @@ from __future__ import annotations
 
 from hapticbridge.theory.transfer import scalar
 
-IMPLICIT_LAG, MIDPOINT_LAG = 1.0, 0.5
+IMPLICIT_SHARE, MIDPOINT_SHARE = 1.0, 0.5
 """λ: damping that the integration adds, divided by K T, without unit. Fixed by the integration
 rule."""
 
 
-def law_damping(stiffness: float, felt: float, period: float, lag: float) -> float:
-    """Returns B' = max(B − λ K T, 0), the law's damping for an effective damping B (``felt``).
+def law_damping(stiffness: float, effective: float, period: float, share: float) -> float:
+    """Returns B' = max(B − λ K T, 0), the law's damping for an effective damping B (``effective``).
 
     K, B and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
     raised.
     """
-    stiffness, felt = scalar("stiffness", stiffness, "N/m"), scalar("damping", felt, "N s/m")
-    return max(felt - scalar("lag", lag, "") * stiffness * _period(period), 0.0)
+    stiffness, effective = (
+        scalar("stiffness", stiffness, "N/m"),
+        scalar("damping", effective, "N s/m"),
+    )
+    return max(effective - scalar("share", share, "") * stiffness * _period(period), 0.0)
 
 
-def effective_damping(stiffness: float, damping: float, period: float, lag: float) -> float:
+def effective_damping(stiffness: float, damping: float, period: float, share: float) -> float:
     """Returns B' + λ K T, the effective damping of a law with damping B'.
 
     K, B' and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
     raised.
     """
     stiffness, damping = scalar("stiffness", stiffness, "N/m"), scalar("damping", damping, "N s/m")
-    return damping + scalar("lag", lag, "") * stiffness * _period(period)
+    return damping + scalar("share", share, "") * stiffness * _period(period)
 
 
-def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) -> float:
+def required_device_damping(
+    stiffness: float, effective: float, period: float, share: float
+) -> float:
     """Returns the device damping b in N s/m required for K and effective B: K T/2 + B'.
 
     Sufficient for any passive hand and any environment that is discrete-time passive (14).
@@ -77,11 +82,11 @@ def needed_for_felt(stiffness: float, felt: float, period: float, lag: float) ->
     References:
         Brown & Colgate 1997, eq. (6), for the law with B'; derivation in the module docstring.
     """
-    return 0.5 * stiffness * _period(period) + law_damping(stiffness, felt, period, lag)
+    return 0.5 * stiffness * _period(period) + law_damping(stiffness, effective, period, share)
 
 
-def largest_felt_damping(
-    device_damping: float, stiffness: float, period: float, lag: float
+def largest_effective_damping(
+    device_damping: float, stiffness: float, period: float, share: float
 ) -> float:
     """Returns the largest effective B in N s/m beside K on a device of damping b.
 
@@ -93,7 +98,7 @@ def largest_felt_damping(
     per_tick = scalar("stiffness", stiffness, "N/m") * _period(period)
     if per_tick > 2 * available:
         return 0.0
-    return available + (scalar("lag", lag, "") - 0.5) * per_tick
+    return available + (scalar("share", share, "") - 0.5) * per_tick
 
 
 def _period(period: float) -> float:

@@ -63,7 +63,9 @@ def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
     return CouplingLimits(
         info=info,
         method=method,
-        start=method.rendered(parameters.coupling, parameters.period / parameters.substeps),
+        start=method.requested_coupling(
+            parameters.coupling, parameters.period / parameters.substeps
+        ),
         period=parameters.period,
         scale=parameters.scale,
         force_scale=parameters.force_scale,
@@ -128,7 +130,7 @@ class Sliders:
         stiffness, damping = span.gains(span.start)
         self._steps = (
             _step(max(span.max_stiffness(0.0), stiffness)),
-            _step(max(span.most_damping(span.min_stiffness), damping)),
+            _step(max(span.max_damping(span.min_stiffness), damping)),
         )
         least = _up(span.min_stiffness, self._steps[0])
         most = self._ends(stiffness, damping, least)
@@ -183,7 +185,7 @@ class Sliders:
         steps, span = self._steps, self.span
         return (
             max(_down(span.max_stiffness(damping), steps[0]), least + steps[0]),
-            max(_down(span.most_damping(stiffness), steps[1]), steps[1]),
+            max(_down(span.max_damping(stiffness), steps[1]), steps[1]),
         )
 
 
@@ -272,8 +274,10 @@ class Controls:
     def _take_coupling(self, event: Mapping[str, Any]) -> None:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
-        felt = method.rendered(Coupling(**law), allowance.period / allowance.substeps)
-        self._gains = [sliders.span.gains(felt) for sliders in self._sliders]
+        requested = method.requested_coupling(
+            Coupling(**law), allowance.period / allowance.substeps
+        )
+        self._gains = [sliders.span.gains(requested) for sliders in self._sliders]
         is_still = time.monotonic() - self._touched > STILL
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.film_process import force_colour
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import method_named
-from hapticbridge.summary import coupling_sentences, is_always_held
+from hapticbridge.summary import coupling_sentences, is_always_implicit
 from hapticbridge.view.geometry import (
     NOT_DRAWN,
     POINTS,
@@ -429,7 +429,7 @@ def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, 
         method,
         parameters.period,
         parameters.substeps,
-        is_always_held=is_always_held(model, parameters.grip),
+        is_always_implicit=is_always_implicit(model, parameters.grip),
     )
     lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences, NOT_DRAWN]
     return "  \n".join(lines)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
-from hapticbridge.recording import due_times
+from hapticbridge.recording.timeline import due_times
 from hapticbridge.report import DRAWABLE, decimated
 from hapticbridge.report.evidence import BINS, Evidence
 from hapticbridge.report.page import moment_of, write_page

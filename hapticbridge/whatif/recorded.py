@@ -139,22 +139,22 @@ class RecordedRun:
         """True if the device's poses were poses in the scene."""
         p = self.parameters
         is_nowhere = p.device_origin == p.handle_origin == IDENTITY_POSE
-        return is_nowhere and not p.guarding.reseats
+        return is_nowhere and not p.guarding.reanchors_at_start
 
     @property
     def limits(self) -> Limits:
         """Limits of the run, times in s."""
         p, guarding = self.parameters, self.parameters.guarding
         most = p.force_limit * p.period
-        rise = 0.0  # steps are allowed
-        if guarding.force_rise < math.inf:
-            rise = invert_exactly(
-                guarding.force_rise, lambda s: most / s, most / guarding.force_rise
+        slew_time = 0.0  # steps are allowed
+        if guarding.force_slew < math.inf:
+            slew_time = invert_exactly(
+                guarding.force_slew, lambda s: most / s, most / guarding.force_slew
             )
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
-            rise=rise,
+            slew_time=slew_time,
             ramp=p.ramp_ticks * p.period,
             stretch=invert_exactly(
                 guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
@@ -175,14 +175,14 @@ class RecordedRun:
         return _button(self.parameters.guarding.dead_man)
 
     @property
-    def seat(self) -> tuple[float, ...]:
+    def anchor_pose(self) -> tuple[float, ...]:
         """Device pose (7,) that corresponds to the handle's start pose in the first tick.
 
         A device that moved before the first tick re-anchored the coupling, so its earlier motion
         does not appear in the scene.
         """
         first = self.recording.ticks[0]
-        if not int(first["flags"]) & int(TickFlag.RESEATED):
+        if not int(first["flags"]) & int(TickFlag.REANCHORED):
             return self.parameters.device_start
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
 
@@ -219,10 +219,10 @@ class RecordedRun:
 
 def _requested_coupling(used: Coupling, method: Method, step: float) -> Coupling:
     """Returns the requested coupling that a method turns into this law's coupling, to the bit."""
-    felt = method.rendered(used, step)
+    felt = method.requested_coupling(used, step)
 
     def made(name: str, value: float) -> float:
-        return float(getattr(method.used(replace(felt, **{name: value}), step), name))
+        return float(getattr(method.law_coupling(replace(felt, **{name: value}), step), name))
 
     requested = {
         name: invert_exactly(getattr(used, name), partial(made, name), getattr(felt, name))

@@ -43,7 +43,7 @@ class RecordedClock:
     """
 
     name = SimulatedClock.name
-    is_lossless = True
+    may_wait = True
 
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
         deadline = ticks["deadline_ns"]
@@ -422,10 +422,10 @@ class Repetition:
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event
         law = coupling_in(event, self._run.parameters)
-        felt = old.method.rendered(law, self._run.parameters.period / old.substeps)
+        requested = old.method.requested_coupling(law, self._run.parameters.period / old.substeps)
         kept = {name: getattr(new.coupling, name) for name in GAINS[2:]}
-        used = new.method.used(replace(felt, **kept), period / new.substeps)
-        return {**event, **asdict(used), "ticks": tuning_ticks(period)}
+        law = new.method.law_coupling(replace(requested, **kept), period / new.substeps)
+        return {**event, **asdict(law), "ticks": tuning_ticks(period)}
 
 
 Array = NDArray[np.float64]
@@ -480,7 +480,7 @@ class IdentifiedDevice(SimulatedDevice):
         self._start = np.array(start)
         self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
         self._outside = Outside(ticks, period)
-        self._felt = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
+        self._has_axis = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
         self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
@@ -503,7 +503,7 @@ class IdentifiedDevice(SimulatedDevice):
 
     def write(self, wrench: Array) -> None:
         """Implements ``SimulatedDevice.write``; components without a device axis have no effect."""
-        super().write(wrench * self._felt)
+        super().write(wrench * self._has_axis)
 
     def _to_recorded_frame(self, sample: NDArray[np.void]) -> NDArray[np.void]:
         """Moves a sample from coordinates relative to the start to the device's coordinates."""

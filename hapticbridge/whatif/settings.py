@@ -87,24 +87,24 @@ class Settings:
                 f"'{unknown[0]:.60}' cannot be changed; choices: {choices(UNITS)}; of the scene: "
                 f"{choices(self.scene)}"
             )
-        given = {name: _convert(name, value) for name, value in changes.items()}
-        method = method_named(str(given.get("method", self.method.name)))
-        gains = {name: float(given[name]) for name in GAINS if name in given}
-        scale = float(given.get("scale", self.scale))
+        values = {name: _convert(name, value) for name, value in changes.items()}
+        method = method_named(str(values.get("method", self.method.name)))
+        gains = {name: float(values[name]) for name in GAINS if name in values}
+        scale = float(values.get("scale", self.scale))
         is_equal = self.scale == self.force_scale
-        contact = given.get("contact_stiffness", self.contact_stiffness)
-        controller = given.get("controller", self.controller)
-        if method.has_coupling and "contact_stiffness" not in given:
+        contact = values.get("contact_stiffness", self.contact_stiffness)
+        controller = values.get("controller", self.controller)
+        if method.has_coupling and "contact_stiffness" not in values:
             contact = None
         return Settings(
             coupling=replace(self.coupling, **gains),
             method=method,
-            rate=float(given.get("rate", self.rate)),
-            substeps=int(given.get("substeps", self.substeps)),
+            rate=float(values.get("rate", self.rate)),
+            substeps=int(values.get("substeps", self.substeps)),
             scale=scale,
-            force_scale=float(given.get("force_scale", scale if is_equal else self.force_scale)),
+            force_scale=float(values.get("force_scale", scale if is_equal else self.force_scale)),
             contact_stiffness=None if contact is None else float(contact),
-            scene={name: float(given.get(name, was)) for name, was in self.scene.items()},
+            scene={name: float(values.get(name, was)) for name, was in self.scene.items()},
             controller=None if controller is None else str(controller),
         )
 

@@ -139,8 +139,8 @@ def what_if(
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
         HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
-    tell = progress or _silent
-    tell(0, 4, "auditing what was recorded")
+    progress = progress or _silent
+    progress(0, 4, "auditing what was recorded")
     report = audit(path, strict=strict)
     if report.verdict == "invalid":
         raise RecordingError(f"an invalid recording cannot be simulated again: {report.reason}")
@@ -148,7 +148,7 @@ def what_if(
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
         run = RecordedRun.of(recording, folder / "scene")
-        return _Experiment(run, report, folder, tell, strict=strict).changed(changes)
+        return _Experiment(run, report, folder, progress, strict=strict).changed(changes)
 
 
 class _Experiment:
@@ -159,11 +159,11 @@ class _Experiment:
         run: RecordedRun,
         report: AuditReport,
         folder: Path,
-        tell: Callable[[int, int, str], None],
+        progress: Callable[[int, int, str], None],
         *,
         strict: bool,
     ) -> None:
-        self._run, self._report, self._folder, self._tell = run, report, folder, tell
+        self._run, self._report, self._folder, self._progress = run, report, folder, progress
         self._strict = strict
         self._ticks, self._period = run.recording.ticks, run.parameters.period
         if len(self._ticks) < 3:
@@ -184,7 +184,7 @@ class _Experiment:
                 "after loading, or it was compiled elsewhere; these runs lack that change"
             )
         runs = [self._as_recorded()]
-        self._tell(1, 4, "the recorded motion")
+        self._progress(1, 4, "the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
@@ -195,10 +195,10 @@ class _Experiment:
         if missing := missing_for_closed_loop(run.info):
             notes.append(f"no closed loop: {missing}")
         else:
-            self._tell(2, 4, "the model hand, nothing changed")
+            self._progress(2, 4, "the model hand, nothing changed")
             same = self._closed(settings)
             hand_error = self._hand_error(same)
-            self._tell(3, 4, "the model hand")
+            self._progress(3, 4, "the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
@@ -229,7 +229,7 @@ class _Experiment:
         run = self._run
         scene = run.scene(settings)
         hand = scene_hand(scene.model, scene.path)
-        device = IdentifiedDevice(run.info, hand, self._ticks, self._period, run.seat)
+        device = IdentifiedDevice(run.info, hand, self._ticks, self._period, run.anchor_pose)
         return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
     def _hand_error(self, same: WhatIfRun) -> float:

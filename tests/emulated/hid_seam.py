@@ -145,7 +145,7 @@ class DrivingClock:
     """
 
     name = "simulated"
-    is_lossless = True
+    may_wait = True
 
     def __init__(self, seam: Timed) -> None:
         self._seam = seam

@@ -114,7 +114,7 @@ class VirtualClock:
     """
 
     name = "simulated"
-    is_lossless = True
+    may_wait = True
 
     def __init__(self, time: VirtualTime, drift: float = 0.0) -> None:
         self._time, self._drift = time, drift

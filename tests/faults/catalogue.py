@@ -328,7 +328,7 @@ def _full_ring(rig: Rig) -> None:
             keep_up(bridge)
 
     rig.around, rig.on_tick, rig.duration = around, act, 3.0
-    rig.clock.is_lossless = False
+    rig.clock.may_wait = False
 
 
 def can_mount() -> bool:

@@ -41,7 +41,7 @@ def motion_of(points: tuple[tuple[float, float], ...]) -> Motion:
 class FaultClock(SimulatedClock):
     """Simulated time in which a tick may take long, and which may be set back."""
 
-    is_lossless = True
+    may_wait = True
 
     def __init__(self) -> None:
         super().__init__()

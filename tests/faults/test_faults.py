@@ -62,7 +62,7 @@ def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path:
         assert outcome.events[-2:] == ["trip", "stop"]
     elif fault.ends in ("fades", "re-seats", "goes on"):
         assert not outcome.error
-        assert outcome.has_flag(TickFlag.RESEATED) == (fault.ends != "goes on")
+        assert outcome.has_flag(TickFlag.REANCHORED) == (fault.ends != "goes on")
     if fault.ends == "re-seats":
         assert at_cause(outcome) < 0.1 * LIMIT
 

@@ -14,7 +14,7 @@ from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.discovery import plugged_devices
-from hapticbridge.device.family import FoundDevice
+from hapticbridge.device.driver import FoundDevice
 from hapticbridge.scene import load_scene
 
 MASS, DAMPING, FRICTION = 0.5, 5.0, 0.3

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import USUAL_TORQUE_LIMIT, DeviceInfo, checked_period, stated_numbers
+from hapticbridge.device.driver import Driver, Notify, UsbId, ignore_message, select_device
 from hapticbridge.device.falcon.kinematics import (
     BELIEVED,
     FORCE_LIMIT,
@@ -51,7 +52,6 @@ from hapticbridge.device.falcon.protocol import (
     send_question,
     silent,
 )
-from hapticbridge.device.family import Driver, Notify, UsbId, ignore_message, select_device
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import UsbLink, find
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector
@@ -154,7 +154,7 @@ class FalconDevice:
         name: Name of the device in messages.
         firmware: Firmware file for a device without firmware; None if it has its firmware.
         mass, damping, friction: Values at the grip in kg, N s/m and N, or None.
-        tell: Receives messages for the user.
+        notify: Receives messages for the user.
 
     Raises:
         DeviceError: The device has no firmware and no file was named, it refuses the firmware, or
@@ -170,14 +170,14 @@ class FalconDevice:
         mass: float | None = None,
         damping: float | None = None,
         friction: float | None = None,
-        tell: Notify = ignore_message,
+        notify: Notify = ignore_message,
     ) -> None:
         self._link, self._name = link, name
         self._stream = ReplyStream()
         self._is_open, self._is_started = True, False
         try:
-            bring_up(link, self._stream, name, firmware, tell)
-            home(link, self._stream, name, tell)
+            bring_up(link, self._stream, name, firmware, notify)
+            home(link, self._stream, name, notify)
             rate, delay = measured_timing(link, self._stream, name)
             self.info = DeviceInfo(
                 name="falcon",
@@ -298,25 +298,25 @@ class FalconDevice:
 # Discovery of a Falcon
 
 
-def open_falcon(options: Mapping[str, object], tell: Notify, backend: Any = None) -> FalconDevice:
-    """Finds and opens a Falcon; ``options`` are those of ``FAMILY``."""
+def open_falcon(options: Mapping[str, object], notify: Notify, backend: Any = None) -> FalconDevice:
+    """Finds and opens a Falcon; ``options`` are those of ``DRIVER``."""
     numbers = stated_numbers(options, _NUMBERS)
     firmware = str(options["firmware"]) if options.get("firmware") else None
     if firmware is not None:
         read_firmware(firmware)  # report a wrong file name before anything moves
-    plugged = select_device(FAMILY, find(FAMILY, backend), options.get("serial"))
-    log = HexLog.asked(options)
+    plugged = select_device(DRIVER, find(DRIVER, backend), options.get("serial"))
+    log = HexLog.from_options(options)
     link = UsbLink.open(
-        plugged, FAMILY, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
+        plugged, DRIVER, read_from=READ_FROM, write_to=WRITE_TO, backend=backend, log=log
     )
-    device = FalconDevice(link, name=str(plugged), firmware=firmware, tell=tell, **numbers)
+    device = FalconDevice(link, name=str(plugged), firmware=firmware, notify=notify, **numbers)
     device.info = replace(device.info, serial=plugged.serial)
     return device
 
 
 _NUMBERS = ("mass", "damping", "friction")
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="falcon",
     about="Novint Falcon",
     ids=(UsbId(0x0403, 0xCB48, "Novint Falcon"),),
@@ -324,7 +324,7 @@ FAMILY = Driver(
     axes="x, y, z",
     force="8 N",
     rate="1 kHz",
-    options=("serial", "firmware", *_NUMBERS, "log"),
+    options={"serial": str, "firmware": str, **dict.fromkeys(_NUMBERS, float), "log": str},
     open=open_falcon,
     on_stall="the last force stays on: no watchdog is known, so keep a hand on its power switch",
 )

@@ -28,7 +28,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.family import Notify
+from hapticbridge.device.driver import Notify
 from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import compiled
@@ -291,11 +291,11 @@ def speaks(link: Link, stream: ReplyStream) -> bool:
     return any(ask(link, stream, 0, PROBE_TIME) for _ in range(PROBES))
 
 
-def upload(link: Link, image: bytes, name: str, tell: Notify) -> None:
+def upload(link: Link, image: bytes, name: str, notify: Notify) -> None:
     """Loads the firmware into a Falcon, which loses it without power.
 
     At 9600 baud the loader is greeted. At 140000 baud it receives the firmware in pieces and
-    returns each, which is the only check. ``tell`` receives the progress at every quarter.
+    returns each, which is the only check. ``notify`` receives the progress at every quarter.
 
     Raises:
         DeviceError: The loader does not answer, or returned other bytes than it received.
@@ -319,7 +319,7 @@ def upload(link: Link, image: bytes, name: str, tell: Notify) -> None:
         done = 4 * (start + len(piece)) // len(image)
         if done > quarter:
             quarter = done
-            tell(f"{name}: firmware {25 * quarter} % loaded")
+            notify(f"{name}: firmware {25 * quarter} % loaded")
 
 
 def _greet(link: Link, name: str) -> None:
@@ -412,15 +412,15 @@ def ask_anew(link: Link, stream: ReplyStream, name: str) -> float:
     Raises:
         DeviceLost: The device is gone or silent.
     """
-    asked = link.now()
+    requested_at = link.now()
     for _ in range(2):  # the first reply may answer a request of the loop
         if not ask(link, stream, Request.GREEN, SILENCE):
             raise silent(name)
-    return asked
+    return requested_at
 
 
 def bring_up(
-    link: Link, stream: ReplyStream, name: str, firmware: str | None, tell: Notify
+    link: Link, stream: ReplyStream, name: str, firmware: str | None, notify: Notify
 ) -> None:
     """Brings a Falcon into run mode, and loads its firmware if it does not answer.
 
@@ -437,7 +437,7 @@ def bring_up(
             f"{name}: has no firmware (it loses it without power); name the maker's firmware "
             "file: falcon:firmware=FILE"
         )
-    upload(link, image, name, tell)
+    upload(link, image, name, notify)
     enter_run_mode(link)
     stream.clear()
     if not speaks(link, stream):
@@ -446,8 +446,8 @@ def bring_up(
         )
 
 
-def home(link: Link, stream: ReplyStream, name: str, tell: Notify) -> None:
-    """Waits until the user, instructed by ``tell``, has moved every encoder through its zero.
+def home(link: Link, stream: ReplyStream, name: str, notify: Notify) -> None:
+    """Waits until the user, instructed by ``notify``, has moved every encoder through its zero.
 
     Raises:
         DeviceError: The grip was not moved within ``HOMING_TIME``.
@@ -460,13 +460,13 @@ def home(link: Link, stream: ReplyStream, name: str, tell: Notify) -> None:
             last_reply = link.now()
             if stream.reply["homed"][0] == _ALL:
                 if is_prompted:
-                    tell(f"{name}: homed")
+                    notify(f"{name}: homed")
                 return
         elif link.now() - last_reply > 2 * SILENCE:
             raise silent(name)
         if not is_prompted:
             is_prompted = True
-            tell(f"{name}: pull the grip all the way out and push it back in, slowly")
+            notify(f"{name}: pull the grip all the way out and push it back in, slowly")
     raise DeviceError(
         f"{name}: was not homed within {HOMING_TIME:g} s; open it again and move the "
         "grip all the way out and in"

@@ -31,7 +31,7 @@ from hapticbridge.device.base import (
     checked_period,
     stated_numbers,
 )
-from hapticbridge.device.family import (
+from hapticbridge.device.driver import (
     Driver,
     FoundDevice,
     Notify,
@@ -78,7 +78,7 @@ class ForceDimensionDevice:
         index: Number of the device in the library, from 0.
         gravity: True to enable the maker's gravity compensation.
         numbers: Numbers of the data sheet, by name.
-        tell: Receives a description of the device and its settings.
+        notify: Receives a description of the device and its settings.
 
     Attributes:
         effector_mass: Mass carried by gravity compensation in kg; None if unknown.
@@ -96,7 +96,7 @@ class ForceDimensionDevice:
         *,
         gravity: bool = True,
         numbers: Mapping[str, float] | None = None,
-        tell: Notify = ignore_message,
+        notify: Notify = ignore_message,
     ) -> None:
         self._dhd = dhd
         what = f"Force Dimension device {index} cannot be opened"
@@ -142,12 +142,12 @@ class ForceDimensionDevice:
             self.close()
             raise
         carried = "unknown" if self.effector_mass is None else f"{self.effector_mass:g} kg"
-        tell(
+        notify(
             f"{self._name}: limits {limits[0]:g} N"
             + (f" and {limits[1]:g} N m" if self._turns else "")
             + f"; gravity compensation {'on' if gravity else 'off'}, end effector {carried}"
         )
-        self._tell = tell
+        self._notify = notify
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
         self._watch = SilenceDetector(dhd.now())
@@ -168,7 +168,7 @@ class ForceDimensionDevice:
             )
         steps = min(math.ceil(watchdog_time(period) / WATCHDOG_STEP), MAX_WATCHDOG)
         if not self._dhd.has_watchdog(self._id, steps):
-            self._tell(
+            self._notify(
                 f"{self._name} has no watchdog ({self._dhd.last_error()}): its last force would "
                 "remain if the program hangs"
             )
@@ -258,7 +258,7 @@ class ForceDimensionDevice:
 _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 
 
-def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDimensionDevice:
+def open_forcedimension(options: Mapping[str, object], notify: Notify) -> ForceDimensionDevice:
     """Loads the library and opens one of its devices.
 
     The options are ``library`` (its file), ``serial``, ``gravity`` (1 or 0), and numbers of the
@@ -273,9 +273,9 @@ def open_forcedimension(options: Mapping[str, object], tell: Notify) -> ForceDim
     if gravity not in (0, 1):
         raise DeviceError(f"gravity = {gravity!r}: must be 1 (compensated) or 0")
     dhd = Dhd(located(options.get("library")))
-    device = select_device(FAMILY, _listed(dhd), options.get("serial"))
+    device = select_device(DRIVER, _listed(dhd), options.get("serial"))
     return ForceDimensionDevice(
-        dhd, int(device.path), gravity=bool(gravity), numbers=numbers, tell=tell
+        dhd, int(device.path), gravity=bool(gravity), numbers=numbers, notify=notify
     )
 
 
@@ -284,7 +284,7 @@ def find() -> list[FoundDevice]:
     try:
         return _listed(Dhd(located()))
     except DeviceError as error:
-        return [replace(device, problem=str(error)) for device in usb_search.find(FAMILY)]
+        return [replace(device, problem=str(error)) for device in usb_search.find(DRIVER)]
 
 
 def medium() -> str:
@@ -298,7 +298,7 @@ def medium() -> str:
 def _listed(dhd: Dhd) -> list[FoundDevice]:
     return [
         FoundDevice(
-            family="forcedimension",
+            driver="forcedimension",
             name="Force Dimension device",
             serial="",
             path=str(index),
@@ -311,7 +311,7 @@ def _listed(dhd: Dhd) -> list[FoundDevice]:
     ]
 
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="forcedimension",
     about="Force Dimension omega, delta, sigma and lambda through the maker's library (DHD)",
     ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
@@ -321,11 +321,11 @@ FAMILY = Driver(
     rate="4 kHz, as stated by the maker",
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
     "one is reported at its start",
-    options=("library", "serial", "gravity", *_NUMBERS),
+    options={"library": str, "serial": str, **dict.fromkeys(("gravity", *_NUMBERS), float)},
     open=open_forcedimension,
     find=find,
     medium=medium,
-    sought="a device of Force Dimension's library",
+    products="a device of Force Dimension's library",
 )
 """Driver of Force Dimension's devices. Not all of their USB ids are known, so the library finds
 them."""

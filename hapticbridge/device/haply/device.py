@@ -31,7 +31,7 @@ from hapticbridge.device.base import (
     checked_period,
     stated_numbers,
 )
-from hapticbridge.device.family import Driver, FoundDevice, Notify, ignore_message, select_device
+from hapticbridge.device.driver import Driver, FoundDevice, Notify, ignore_message, select_device
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.messages import SERVICE, Listed
 from hapticbridge.device.transport.trace import HexLog
@@ -134,7 +134,7 @@ class HaplyDevice:
         listed: The device.
         force_gate: Gain of the service's force gate, without unit, >= 0.
         numbers: Numbers of the data sheet, by name.
-        tell: Receives a description of the service's force filters.
+        notify: Receives a description of the service's force filters.
 
     Attributes:
         held_back: Number of forces dropped because the service was slower than the loop.
@@ -151,7 +151,7 @@ class HaplyDevice:
         *,
         force_gate: float = 0.0,
         numbers: Mapping[str, float] | None = None,
-        tell: Notify = ignore_message,
+        notify: Notify = ignore_message,
     ) -> None:
         self._link, self._listed = link, listed
         self._name = f"{listed.kind} {listed.device_id}"
@@ -164,7 +164,7 @@ class HaplyDevice:
         }  # fmt: skip
         try:
             messages.refuse_scaled(listed)
-            tell(messages.told_filters(listed, force_gate))
+            notify(messages.describe_filters(listed, force_gate))
             self._exchange(messages.first_message(listed, force_gate))
             rate, delay = measured_timing(
                 link, messages.force_message(listed, (0.0, 0.0, 0.0)), self._name
@@ -311,7 +311,7 @@ PLACE = ("localhost", 10001)
 _NUMBERS = ("mass", "damping", "friction", "resolution", "force_limit")
 
 
-def open_haply(options: Mapping[str, object], tell: Notify) -> HaplyDevice:
+def open_haply(options: Mapping[str, object], notify: Notify) -> HaplyDevice:
     """Connects to the service and opens one of its devices.
 
     The options are ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
@@ -322,22 +322,22 @@ def open_haply(options: Mapping[str, object], tell: Notify) -> HaplyDevice:
         DeviceLost: The service is gone.
     """
     host, port = _place(options.get("service"))
-    link = WebSocketLink.open(host, port, SERVICE, HexLog.asked(options))
-    return opened(link, options, tell)
+    link = WebSocketLink.open(host, port, SERVICE, HexLog.from_options(options))
+    return opened(link, options, notify)
 
 
-def opened(link: Link, options: Mapping[str, object], tell: Notify) -> HaplyDevice:
+def opened(link: Link, options: Mapping[str, object], notify: Notify) -> HaplyDevice:
     """Opens a device of a connected service; arguments as for ``open_haply``."""
     try:
         numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
         devices = _devices(link)
-        serial = select_device(FAMILY, [_plugged(d) for d in devices], options.get("serial")).serial
+        serial = select_device(DRIVER, [_plugged(d) for d in devices], options.get("serial")).serial
         listed = next(device for device in devices if device.device_id == serial)
     except BaseException:
         link.close()
         raise
-    return HaplyDevice(link, listed, force_gate=force_gate, numbers=numbers, tell=tell)
+    return HaplyDevice(link, listed, force_gate=force_gate, numbers=numbers, notify=notify)
 
 
 def find(place: tuple[str, int] = PLACE) -> list[FoundDevice]:
@@ -374,7 +374,7 @@ def _devices(link: Link) -> list[Listed]:
 
 def _plugged(device: Listed) -> FoundDevice:
     return FoundDevice(
-        family="haply",
+        driver="haply",
         name=device.kind,
         serial=device.device_id,
         path=SERVICE,
@@ -399,7 +399,7 @@ def _place(service: object) -> tuple[str, int]:
     return str(host) or PLACE[0], number
 
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="haply",
     about="Haply Inverse3, Inverse3x and Minverse through the maker's Inverse Service",
     ids=(),
@@ -408,9 +408,14 @@ FAMILY = Driver(
     force=f"{FORCE_LIMIT:g} N, or more with force_limit",
     rate="1 kHz",
     on_stall="the maker's service ends the force; the time until then is not documented",
-    options=("service", "serial", "force_gate", *_NUMBERS, "log"),
+    options={
+        "service": str,
+        "serial": str,
+        **dict.fromkeys(("force_gate", *_NUMBERS), float),
+        "log": str,
+    },
     open=open_haply,
     find=find,
     medium=medium,
-    sought="a device of the Inverse Service",
+    products="a device of the Inverse Service",
 )

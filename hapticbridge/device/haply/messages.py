@@ -111,7 +111,7 @@ def refuse_scaled(listed: Listed) -> None:
         )
 
 
-def told_filters(listed: Listed, gate_gain: float) -> str:
+def describe_filters(listed: Listed, gate_gain: float) -> str:
     """Returns a sentence for the user on the service's force filters."""
     if listed.filters is None:
         return (

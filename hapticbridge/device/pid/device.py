@@ -17,7 +17,7 @@ from hapticbridge.device.base import (
     checked_number,
     checked_period,
 )
-from hapticbridge.device.family import Driver, Notify, select_device
+from hapticbridge.device.driver import Driver, Notify, select_device
 from hapticbridge.device.pid.reports import (
     DISABLE,
     ENABLE,
@@ -220,7 +220,7 @@ class Scale:
 
 
 def scale_of(
-    options: Mapping[str, object], serial: str, model: str, tell: Notify
+    options: Mapping[str, object], serial: str, model: str, notify: Notify
 ) -> tuple[Scale, dict[str, object]]:
     """Returns the scale, and the options for the data sheet.
 
@@ -233,7 +233,7 @@ def scale_of(
         options: Options of ``open_device``.
         serial: Serial number of the unit.
         model: Name that the stick reports; the profile of another model is not used.
-        tell: Receives the message about an assumed scale.
+        notify: Receives the message about an assumed scale.
 
     Raises:
         DeviceError: A number is out of range, contradicts the profile, or is stated without the
@@ -256,7 +256,7 @@ def scale_of(
             f"state {' and '.join(missing)} too"
         )
     if missing:
-        tell(
+        notify(
             f"the strength or the travel of this stick is unknown: {ASSUMED_NEWTONS:g} N at full "
             f"scale and a travel of {1e3 * ASSUMED_TRAVEL:g} mm are assumed unless stated; "
             f"{' and '.join(missing)} state it"
@@ -567,20 +567,20 @@ class PidDevice:
         sample["buttons"] = self._stick.buttons
 
 
-def open_pid(options: Mapping[str, object], tell: Notify, api: HidApi | None = None) -> PidDevice:
+def open_pid(options: Mapping[str, object], notify: Notify, api: HidApi | None = None) -> PidDevice:
     """Finds and opens a force-feedback stick.
 
     The options are ``serial``, ``log``, ``newtons``, ``travel``, ``reverse``, ``profile``, and the
-    numbers ``CHANGES`` of the data sheet. ``tell`` receives a message about assumed values. With a
-    substitute of hidapi, ``api``, reports are sent without a thread.
+    numbers ``CHANGES`` of the data sheet. ``notify`` receives a message about assumed values. With
+    a substitute of hidapi, ``api``, reports are sent without a thread.
 
     Raises:
         DeviceError: No stick is found, it cannot be opened, or it lacks a required capability.
     """
-    plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
-    scale, known = scale_of(options, plugged.serial, str(plugged), tell)
+    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
+    scale, known = scale_of(options, plugged.serial, str(plugged), notify)
     link = HidLink.open(
-        plugged, api, is_overlapped=api is None, log=HexLog.asked(options), slots=SLOTS
+        plugged, api, is_overlapped=api is None, log=HexLog.from_options(options), slots=SLOTS
     )
     try:
         device = PidDevice(
@@ -599,7 +599,7 @@ def open_pid(options: Mapping[str, object], tell: Notify, api: HidApi | None = N
     return device
 
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="pid",
     about="USB force-feedback sticks of the class PID, any maker's",
     ids=(),
@@ -608,7 +608,15 @@ FAMILY = Driver(
     force="a share of full scale, which newtons= states",
     rate="125 Hz to 1 kHz, one axis at a time",
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
-    options=("serial", "log", "newtons", "travel", "reverse", "profile", *CHANGES),
+    options={
+        "serial": str,
+        "log": str,
+        "newtons": float,
+        "travel": float,
+        "reverse": str,
+        "profile": str,
+        **dict.fromkeys(CHANGES, float),
+    },
     open=open_pid,
     recognises=has_force_feedback,
 )

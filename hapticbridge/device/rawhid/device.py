@@ -18,7 +18,7 @@ from hapticbridge.device.base import (
     DeviceInfo,
     checked_period,
 )
-from hapticbridge.device.family import Driver, Notify, UsbId, select_device
+from hapticbridge.device.driver import Driver, Notify, UsbId, select_device
 from hapticbridge.device.rawhid.protocol import (
     LARGEST,
     LONGEST_WATCHDOG_MS,
@@ -70,7 +70,7 @@ CHANGES = (
 """Numbers of the data sheet that the user may replace."""
 
 
-def asked(link: Link, name: str) -> tuple[Numbers, str]:
+def request_sheet(link: Link, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
     Raises:
@@ -231,7 +231,7 @@ class RawHidDevice:
         self._link, self._name, self._now = link, name, now
         self._sequence = 0
         self.states = StateStream(name)
-        self.info = data_sheet(name, *asked(link, name), dict(changes or {}))
+        self.info = data_sheet(name, *request_sheet(link, name), dict(changes or {}))
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._watch = SilenceDetector(now())
@@ -360,7 +360,7 @@ class RawHidDevice:
 
 def open_rawhid(
     options: Mapping[str, object],
-    _tell: Notify,
+    _notify: Notify,
     api: HidApi | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> RawHidDevice:
@@ -372,8 +372,8 @@ def open_rawhid(
     Raises:
         DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
-    plugged = select_device(FAMILY, find(FAMILY, api), options.get("serial"))
-    link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.asked(options))
+    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
+    link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.from_options(options))
     changes = {key: value for key, value in options.items() if key in CHANGES}
     try:
         device = RawHidDevice(link, str(plugged), changes, now)
@@ -387,7 +387,7 @@ def open_rawhid(
     return device
 
 
-FAMILY = Driver(
+DRIVER = Driver(
     name="rawhid",
     about="home-made devices with the protocol hapticbridge/device/rawhid.md (as on Teensy)",
     ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
@@ -395,7 +395,7 @@ FAMILY = Driver(
     axes="1 to 6, as built",
     force="as built",
     rate="to 1 kHz, as built",
-    options=("serial", "log", *CHANGES),
+    options={"serial": str, "log": str, **dict.fromkeys(CHANGES, float)},
     open=open_rawhid,
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
     "to the protocol",

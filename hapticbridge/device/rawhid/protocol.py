@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticbridge.device.base import AXES
-from hapticbridge.device.family import printable
+from hapticbridge.device.driver import printable
 
 FRAME_BYTES = 64
 """Bytes per frame: the limit of a full-speed interrupt transfer and of Teensy's raw HID report."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from hapticbridge.device.family import Driver, FoundDevice, access_problem
+from hapticbridge.device.driver import Driver, FoundDevice, access_problem
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -29,7 +29,7 @@ CLASS = Path("/sys/class/hidraw")
 """Folder in which Linux shows HID devices to all users; absent on other systems."""
 
 CONTROLLERS = frozenset({(0x01, 0x04), (0x01, 0x05), (0x0F, 0x01)})
-"""Usage page and usage of joysticks, game pads and physical interface devices. A family without a
+"""Usage page and usage of joysticks, game pads and physical interface devices. A driver without a
 list of products inspects only these; others, such as keyboards, are not opened."""
 
 _INTERVAL, _UNITS = re.compile(r"(\d+)(ms|us)"), {"ms": 1e-3, "us": 1e-6}
@@ -90,8 +90,8 @@ def hid_api() -> HidApi | None:
     return None
 
 
-def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
-    """Lists the family's connected devices, with the reason if one cannot be opened.
+def find(driver: Driver, api: HidApi | None = None) -> list[FoundDevice]:
+    """Lists the driver's connected devices, with the reason if one cannot be opened.
 
     Without a substitute of hidapi, ``api``, the USB bus is searched too, for devices without a
     hidraw node, and for all of them without hidapi.
@@ -104,19 +104,19 @@ def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
         raw = entry["path"]
         path = raw.decode(errors="replace") if isinstance(raw, bytes) else str(raw)
         # hidapi lists a node once per top-level collection
-        if path in found or family.usage not in (None, usage):
+        if path in found or driver.usage not in (None, usage):
             continue
-        if family.recognises is None:
-            model = family.model(vendor, product)
-        elif usage in CONTROLLERS and family.recognises(report_descriptor(path, module)):
-            model = family.about
+        if driver.recognises is None:
+            model = driver.model(vendor, product)
+        elif usage in CONTROLLERS and driver.recognises(report_descriptor(path, module)):
+            model = driver.about
         else:
             model = None
         if model is None:
             continue
         is_node = api is None and path.startswith("/")
         found[path] = FoundDevice(
-            family=family.name,
+            driver=driver.name,
             name=entry.get("product_string") or model,
             serial=entry.get("serial_number") or "",
             path=path,
@@ -129,7 +129,7 @@ def find(family: Driver, api: HidApi | None = None) -> list[FoundDevice]:
         return list(found.values())
     unlisted = (d for d in on_the_bus() if module is None or not d.has_hidraw)
     problem = NO_NODE if module is not None else NO_HIDAPI
-    return [*found.values(), *members(family, unlisted, lambda _: problem)]
+    return [*found.values(), *members(driver, unlisted, lambda _: problem)]
 
 
 def report_descriptor(path: str, api: HidApi | None) -> bytes:

@@ -44,7 +44,7 @@ class HexLog:
                 pass
 
     @classmethod
-    def asked(cls, options: Mapping[str, object]) -> HexLog:
+    def from_options(cls, options: Mapping[str, object]) -> HexLog:
         """Returns the log named by a device's option ``log``, or else by the variable."""
         named = options.get("log")
         return cls(None if named is None else str(named))

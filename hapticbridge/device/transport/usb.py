@@ -20,7 +20,7 @@ import usb.backend.libusb1 as pyusb
 import usb.core
 import usb.util
 
-from hapticbridge.device.family import Driver, FoundDevice, access_problem, permission_problem
+from hapticbridge.device.driver import Driver, FoundDevice, access_problem, permission_problem
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
@@ -89,22 +89,22 @@ def on_the_bus(bus: Path | None = None) -> list[OnTheBus]:
 
 
 def members(
-    family: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
+    driver: Driver, devices: Iterable[OnTheBus], problem: Callable[[OnTheBus], str | None]
 ) -> list[FoundDevice]:
-    """Returns the devices of a family; ``problem`` returns why one cannot be opened, or None."""
+    """Returns the devices of a driver; ``problem`` returns why one cannot be opened, or None."""
     return [
         FoundDevice(
-            family=family.name,
+            driver=driver.name,
             name=device.name or model,
             serial=device.serial,
             path=str(device.node),
             vendor=device.vendor,
             product=device.product,
-            transport=family.transport,
+            transport=driver.transport,
             problem=problem(device),
         )
         for device in devices
-        if (model := family.model(device.vendor, device.product)) is not None
+        if (model := driver.model(device.vendor, device.product)) is not None
     ]
 
 
@@ -221,15 +221,15 @@ def libusb() -> Any:
     return None
 
 
-def find(family: Driver, backend: Any = None) -> list[FoundDevice]:
-    """Lists the family's connected devices, with the reason if one cannot be opened.
+def find(driver: Driver, backend: Any = None) -> list[FoundDevice]:
+    """Lists the driver's connected devices, with the reason if one cannot be opened.
 
     On Linux the kernel's list is used, because opening a device would disturb a running loop. On
     other systems libusb is used. Devices are in the order of their bus positions.
     """
-    listed = [] if backend is not None else members(family, on_the_bus(), _problem)
+    listed = [] if backend is not None else members(driver, on_the_bus(), _problem)
     source = libusb() if backend is None and not listed else backend
-    return listed if source is None else [_described(family, d) for d in devices_of(family, source)]
+    return listed if source is None else [_described(driver, d) for d in devices_of(driver, source)]
 
 
 def _problem(device: OnTheBus) -> str | None:
@@ -238,11 +238,11 @@ def _problem(device: OnTheBus) -> str | None:
     return access_problem(str(device.node))
 
 
-def devices_of(family: Driver, backend: Any) -> list[Any]:
-    """Returns pyusb's devices of a family, in the order of their bus positions."""
+def devices_of(driver: Driver, backend: Any) -> list[Any]:
+    """Returns pyusb's devices of a driver, in the order of their bus positions."""
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
-        known = [d for d in devices if family.model(d.idVendor, d.idProduct) is not None]
+        known = [d for d in devices if driver.model(d.idVendor, d.idProduct) is not None]
     except (usb.core.USBError, NotImplementedError):  # pyusb's errors if libusb cannot list them
         return []
     return sorted(known, key=node_of)
@@ -253,7 +253,7 @@ def node_of(device: Any) -> str:
     return str(NODES / f"{device.bus or 0:03d}" / f"{device.address or 0:03d}")
 
 
-def _described(family: Driver, device: Any) -> FoundDevice:
+def _described(driver: Driver, device: Any) -> FoundDevice:
     node, problem, texts = node_of(device), None, ["", ""]
     try:
         device.get_active_configuration()  # opens the device; get_string would hide the error
@@ -268,8 +268,8 @@ def _described(family: Driver, device: Any) -> FoundDevice:
     finally:
         usb.util.dispose_resources(device)
     return FoundDevice(
-        family=family.name,
-        name=texts[0] or family.model(device.idVendor, device.idProduct) or family.name,
+        driver=driver.name,
+        name=texts[0] or driver.model(device.idVendor, device.idProduct) or driver.name,
         serial=texts[1],
         path=node,
         vendor=device.idVendor,
@@ -337,7 +337,7 @@ class UsbLink:
     def open(
         cls,
         plugged: FoundDevice,
-        family: Driver,
+        driver: Driver,
         *,
         read_from: int,
         write_to: int,
@@ -352,7 +352,7 @@ class UsbLink:
         source = libusb() if backend is None else backend
         if plugged.problem is not None or source is None:
             raise DeviceError(f"{plugged}: {plugged.problem or 'libusb cannot be loaded'}")
-        for device in devices_of(family, source):
+        for device in devices_of(driver, source):
             if node_of(device) == plugged.path:
                 break
         else:

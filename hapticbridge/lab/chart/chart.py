@@ -180,7 +180,7 @@ class Measurement:
 
         An error below the distance between the methods' references cannot be compared.
         """
-        return not self.score.felt < self.limit_apart
+        return not self.score.jnd < self.limit_apart
 
     @property
     def is_sound(self) -> bool:
@@ -197,7 +197,7 @@ class Measurement:
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
         """Returns the row of a table with every choice and every number."""
         setting, method = self.setting, self.setting.method
-        used = method.used(coupling, setting.timestep)
+        used = method.law_coupling(coupling, setting.timestep)
         return {
             "workload": workload,
             "panel": self.panel,
@@ -279,7 +279,7 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:
     """
     series: dict[str, list[tuple[float, float]]] = {}
     for each in points:
-        felt = each.score.felt
+        felt = each.score.jnd
         if each.is_usual and math.isfinite(felt) and felt >= RESOLVED:
             series.setdefault(who(each.setting), []).append((each.setting.period, felt))
     return {name: _order(sorted(values)[:3]) for name, values in series.items() if len(values) > 2}
@@ -333,7 +333,7 @@ class Chart:
             if each.is_sound and each.is_comparable and each.setting.method.has_law
         ]
         chosen = pareto_front(
-            [each.cost.median for each in points], [each.score.felt for each in points]
+            [each.cost.median for each in points], [each.score.jnd for each in points]
         )
         return [points[index] for index in chosen]
 
@@ -365,7 +365,7 @@ def measure_chart(
     """
     total = len(settings) * (1 + repeats)
 
-    def tell(done: int) -> None:
+    def report_progress(done: int) -> None:
         if progress is not None:
             progress(min(done, total), total)
 
@@ -375,7 +375,7 @@ def measure_chart(
     # the chart reports every run that diverges; MuJoCo's warnings would repeat it
     with quiet(), one_core() as core:
         for index, setting in enumerate(settings):
-            tell(index)
+            report_progress(index)
             try:
                 run = _opened(workload, setting, peer_work)
                 runs.append((setting, run, dict(run.scores())))
@@ -394,10 +394,10 @@ def measure_chart(
             [run for _, run, _ in runs],
             baseline,
             repeats=repeats,
-            progress=lambda done: tell(len(settings) + done),
+            progress=lambda done: report_progress(len(settings) + done),
         )
         where = machine(core)
-    tell(total)
+    report_progress(total)
     apart = {} if workload.references is None else workload.references.disagreement()
     measurements = tuple(
         Measurement(

@@ -386,7 +386,7 @@ class RodImpact(Staged):
         has_touched = all(np.any(take.records["contacts"] > 0) for take in takes)
         return {
             ROD_PANEL.key: Score(
-                felt=float(np.sqrt(np.mean((error / (WEBER * exact)) ** 2))),
+                jnd=float(np.sqrt(np.mean((error / (WEBER * exact)) ** 2))),
                 energy=float(np.max(np.abs(kinetic - before - self._rigid.energy_change))),
                 created=created,
                 verdict=_worst(takes) if has_touched else "lost contact",

@@ -265,4 +265,4 @@ class SpinningBody(Staged):
         )
         torque = FELT_STIFFNESS * tool_angles(self._reference, records)
         turned = float(np.sqrt(np.mean(torque**2))) / (LEVER * FORCE_FLOOR)
-        return {SPINNING_PANEL.key: replace(score, felt=max(score.felt, turned))}
+        return {SPINNING_PANEL.key: replace(score, jnd=max(score.jnd, turned))}

@@ -64,9 +64,9 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
     fit = [each for each in fit if is_borne_out(each, points)] or fit
     cheapest = min(fit, key=lambda each: each.cost.median)
     alike = [each for each in fit if each.cost.low <= cheapest.cost.high]
-    least = min(each.score.felt for each in alike)
-    best = [each for each in alike if each.score.felt <= (1 + ALIKE) * least]
-    return min(best, key=lambda each: (not each.is_usual, each.score.felt, each.cost.median))
+    least = min(each.score.jnd for each in alike)
+    best = [each for each in alike if each.score.jnd <= (1 + ALIKE) * least]
+    return min(best, key=lambda each: (not each.is_usual, each.score.jnd, each.cost.median))
 
 
 def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
@@ -85,10 +85,10 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
         return f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
-    fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.felt)]
+    fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.jnd)]
     if not fast:
         return f"{goal}, nothing was tried that runs at this rate."
-    nearest = min(fast, key=lambda each: (len(_objections(each, points)), each.score.felt))
+    nearest = min(fast, key=lambda each: (len(_objections(each, points)), each.score.jnd))
     return (
         f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
         f"but {' and '.join(_objections(nearest, points))}."
@@ -106,7 +106,7 @@ def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
         return setting.method.name, setting.engine, setting.contact, setting.iterations
 
     return any(
-        other.score.felt < JND
+        other.score.jnd < JND
         and other.setting.timestep != each.setting.timestep
         and settings_but_steps(other) == settings_but_steps(each)
         for other in points
@@ -124,20 +124,20 @@ def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
     """
     setting = each.setting
     alike = [
-        other.score.felt
+        other.score.jnd
         for other in points
         if (other is each or other.setting.period < setting.period)
         and replace(other.setting, period=setting.period) == setting
     ]
-    return max(alike, default=each.score.felt)
+    return max(alike, default=each.score.jnd)
 
 
 def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     """Returns the faults of a point in words."""
     found = []
     steady = steady_error(each, points)
-    if not each.score.felt < JND:
-        found.append(f"its error is {each.score.felt:.2g} JND")
+    if not each.score.jnd < JND:
+        found.append(f"its error is {each.score.jnd:.2g} JND")
     elif not steady < JND:
         found.append(f"its error grows to {steady:.2g} JND at a smaller step, so it is luck")
     if not each.is_comparable:
@@ -160,7 +160,7 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
 def _numbers(each: Measurement) -> str:
     tick = 1e6 * each.cost.median * each.setting.period
     return (
-        f"an error of {each.score.felt:.2g} JND at {tick:.3g} µs a tick, "
+        f"an error of {each.score.jnd:.2g} JND at {tick:.3g} µs a tick, "
         f"{100 * each.cost.median:.2g} % of a core"
     )
 
@@ -205,7 +205,7 @@ def colours_of(chart: Chart) -> dict[str, Any]:
 
 def drawn_error(each: Measurement) -> float:
     """Returns the ordinate of a point in JND, clipped to the picture's edges."""
-    felt = each.score.felt
+    felt = each.score.jnd
     return float(np.clip(felt, FLOOR, CEILING)) if np.isfinite(felt) else CEILING
 
 
@@ -300,19 +300,19 @@ def _named(name: str, points: Sequence[Measurement], order: Order | None) -> str
 
 def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list[str]:
     """Returns the legends of marks and edges that a panel contains."""
-    said = []
+    facts = []
     if any(order.is_level for order in orders):
-        said.append("level: smaller steps gain nothing")
+        facts.append("level: smaller steps gain nothing")
     if not all(order.is_settled for order in orders):
-        said.append("order ?: not settled at these steps")
+        facts.append("order ?: not settled at these steps")
     if not all(each.is_comparable for each in points):
-        said.append(
+        facts.append(
             "pale: nearer to its own limit than\n"
             "that is to most others' (off, in JND):\nnot comparable"
         )
-    if any(each.score.felt < FLOOR for each in points):
-        said.append(f"at the lower edge: {FLOOR:g} JND or less")
-    return said
+    if any(each.score.jnd < FLOOR for each in points):
+        facts.append(f"at the lower edge: {FLOOR:g} JND or less")
+    return facts
 
 
 def _draw_point(axes: Axes, each: Measurement, place: float, colour: Any) -> None:
@@ -354,11 +354,11 @@ class ChartFiles:
 
     Attributes:
         paths: Paths by ending, of ``ENDINGS``.
-        said: Content of the JSON file.
+        facts: Content of the JSON file.
     """
 
     paths: Mapping[str, Path]
-    said: Mapping[str, Any]
+    facts: Mapping[str, Any]
 
 
 def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) -> dict[str, Path]:
@@ -393,13 +393,13 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
     Raises:
         HapticBridgeError: A file cannot be written.
     """
-    said = summary_of(chart)
+    facts = summary_of(chart)
     texts = {
         "csv": table_of(chart),  # the table first: computing it took the time
-        "json": json.dumps(said, indent=2, allow_nan=False) + "\n",
+        "json": json.dumps(facts, indent=2, allow_nan=False) + "\n",
     }
     write_files(paths, texts, draw_chart(chart))
-    return ChartFiles(dict(paths), said)
+    return ChartFiles(dict(paths), facts)
 
 
 def write_files(paths: Mapping[str, Path], texts: Mapping[str, str], figure: Figure) -> None:
@@ -455,7 +455,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
                 {
                     "setting": each.setting.label,
                     "cost": each.cost.median,
-                    "error": each.score.felt,
+                    "error": each.score.jnd,
                     "verdict": each.score.verdict,
                 }
                 for each in chart.front(panel)
@@ -470,7 +470,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
     points = [
         each.cells(chart.workload.name, chart.workload.coupling) for each in chart.measurements
     ]
-    said = {
+    facts = {
         "workload": chart.workload.name,
         "about": chart.workload.about,
         "machine": chart.machine,
@@ -488,5 +488,5 @@ def summary_of(chart: Chart) -> dict[str, Any]:
         "panels": panels,
         "points": points,
     }
-    found: dict[str, Any] = finite_or_null(said)
+    found: dict[str, Any] = finite_or_null(facts)
     return found

@@ -277,12 +277,12 @@ class OwnReferences:
     def score(self, take: Take) -> Score:
         """Compares the first part of a take with its method's reference."""
         if take.setting.engine != OWN:
-            return Score(felt=NAN)  # the method is not on the chart
+            return Score(jnd=NAN)  # the method is not on the chart
         reference = self.of(take.setting.method)
         if take.has_diverged:
             return diverged(take.created, take.ended)
         if reference is None:
-            return Score(felt=NAN, created=take.created, verdict=take.environment)
+            return Score(jnd=NAN, created=take.created, verdict=take.environment)
         records = take.at(self._grid)[: self._count]
         touches = reference.records["contacts"] > 0
         has_lost = touches.any() and np.mean(records["contacts"][touches] > 0) < TOUCHING
@@ -303,7 +303,7 @@ class OwnReferences:
         found = {name: each.records for name, each in self._found.items() if each is not None}
         centers = [name for name in found if METHODS[name].has_law] or list(found)
         apart = [
-            {name: felt_error(found[center], each).felt for name, each in found.items()}
+            {name: felt_error(found[center], each).jnd for name, each in found.items()}
             for center in centers
         ]
         return min(apart, key=lambda row: float(np.median(list(row.values()))), default={})

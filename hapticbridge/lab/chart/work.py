@@ -520,18 +520,18 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
 
 def paragraph(chart: WorkChart) -> str:
     """States the growth of a tick's time, and the largest scenes that fit into a tick at 1 kHz."""
-    said = []
+    facts = []
     for family in FAMILIES:
         for variant in chart.variants(family):
             points = chart.of(family, variant)
             first, last = points[0], points[-1]
             most = max((each.size for each in points if each.rate >= RATE), default=0)
-            said.append(
+            facts.append(
                 f"{family.unit.capitalize()}, {variant.name}: {1e6 * first.time.median:.3g} µs a "
                 f"tick for {first.size}, {1e6 * last.time.median:.3g} µs for {last.size}; up to "
                 f"{most} hold 1 kHz"
             )
-    return ". ".join([*said, HOLDS]) + "."
+    return ". ".join([*facts, HOLDS]) + "."
 
 
 def _power(growth: Growth) -> str:
@@ -557,15 +557,15 @@ def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:
         }
         for family in FAMILIES
     }
-    said = {
+    facts = {
         "machine": chart.machine,
         "paragraph": paragraph(chart),
         "growth": growths,
         "points": rows,
     }
-    texts = {"csv": csv_text(rows), "json": json.dumps(said, indent=2, allow_nan=False) + "\n"}
+    texts = {"csv": csv_text(rows), "json": json.dumps(facts, indent=2, allow_nan=False) + "\n"}
     write_files(paths, texts, draw_work(chart))
-    return said
+    return facts
 
 
 def _row(each: Work) -> dict[str, object]:

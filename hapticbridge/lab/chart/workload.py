@@ -31,7 +31,7 @@ class Score:
     """Errors of one run against a reference; nan where a number has no meaning for it.
 
     Attributes:
-        felt: The chart's error in just noticeable differences, no unit; inf where it diverged.
+        jnd: The chart's error in just noticeable differences, no unit; inf where it diverged.
         force_rms: RMS of the force's error in N.
         force_peak: Largest error of the force in N.
         torque_rms: RMS of the torque's error in N m.
@@ -44,7 +44,7 @@ class Score:
         reason: Reason of an early end, in words; else empty.
     """
 
-    felt: float
+    jnd: float
     force_rms: float = NAN
     force_peak: float = NAN
     torque_rms: float = NAN
@@ -81,7 +81,7 @@ def score_of(
     """
     error = felt_error(reference, records)
     return Score(
-        felt=error.felt,
+        jnd=error.jnd,
         force_rms=error.force_rms,
         force_peak=error.force_peak,
         torque_rms=error.torque_rms,
@@ -96,7 +96,7 @@ def score_of(
 
 def diverged(created: float = INF, reason: str = "") -> Score:
     """Returns the score of a run that diverged."""
-    return Score(felt=INF, created=created, verdict="diverged", reason=reason)
+    return Score(jnd=INF, created=created, verdict="diverged", reason=reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -68,10 +68,10 @@ class PybulletEngine:
         """Takes its name, options of ``setPhysicsEngineParameter`` and the solver's name."""
         self.name = name
         self._parameters = dict(parameters)
-        given = {key: base.Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
+        raw = {key: base.Setting(f"{value:g}", _PARAMETERS) for key, value in parameters.items()}
         self.settings: Mapping[str, base.Setting] = {
             **_SHARED,
-            **given,
+            **raw,
             "constraintSolverType": base.Setting(solver, _PARAMETERS),
         }
 

@@ -109,11 +109,11 @@ class StabilityMap:
 
 def paragraph(sentences: Sentences) -> str:
     """Fills numbers into sentences; a sentence is left out if its number is missing."""
-    said = []
+    facts = []
     for text, numbers in sentences:
         with contextlib.suppress(KeyError, TypeError):
-            said.append(text.format_map(numbers))
-    return ". ".join(said) + "."
+            facts.append(text.format_map(numbers))
+    return ". ".join(facts) + "."
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ def run_map(
     failed = int(table.failed.sum())
     finding = stability_map.read(table)
     write_picture(finding.figure, files["png"])
-    said = {
+    facts = {
         "map": name,
         "about": stability_map.about,
         "points": len(table),
@@ -190,7 +190,7 @@ def run_map(
         "paragraph": finding.paragraph,
         "boundary": finding.boundary,
     }
-    text = json.dumps(finite_or_null(said), indent=2, allow_nan=False)
+    text = json.dumps(finite_or_null(facts), indent=2, allow_nan=False)
     try:
         files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:
@@ -280,15 +280,15 @@ def used_damping(
 ) -> NDArray[np.float64]:
     """Returns B' in N s/m, the damping of a method's law: max(B − a K T, 0).
 
-    It is ``Method.used`` over arrays; the method's integration adds a K T again.
+    It is ``Method.law_coupling`` over arrays; the method's integration adds a K T again.
 
     Args:
-        name: The method; a is its ``lag``.
+        name: The method; a is its ``compensated_share``.
         stiffness: K in N/m.
         damping: Requested B in N s/m; broadcasts with K.
         period: T in s.
     """
-    taken = METHODS[name].lag * period * np.asarray(stiffness, dtype=np.float64)
+    taken = METHODS[name].compensated_share * period * np.asarray(stiffness, dtype=np.float64)
     return np.asarray(np.maximum(np.asarray(damping, dtype=np.float64) - taken, 0.0))
 
 
@@ -299,7 +299,7 @@ def law_in_words(name: str, subscript: str = "") -> str:
         name: The method.
         subscript: Subscript of K and B: empty, or ``_r`` in rotation.
     """
-    lag = METHODS[name].lag
+    lag = METHODS[name].compensated_share
     taken = {0.0: "", 0.5: f" − K{subscript} T/2"}.get(lag, f" − K{subscript} T")
     return f"B{subscript}′ = B{subscript}{taken}"
 
@@ -320,7 +320,7 @@ def limit_by_6(
     That is 2 (b − B)/T without a lag. With a lag of ½ or 1 it is 2b/T: there B' is 0, and below it
     K T/2 + B' stays below b.
     """
-    spent = np.asarray(damping, dtype=np.float64) * (METHODS[name].lag == 0.0)
+    spent = np.asarray(damping, dtype=np.float64) * (METHODS[name].compensated_share == 0.0)
     return np.asarray(maximum_stiffness(device_damping, period, spent))
 
 

@@ -209,11 +209,11 @@ def method_runs(
             FELT_DAMPING * stiffness * PERIOD,
             contact_rigs.PEG_ROTATION[0] * stiffness,
         )
-        felt = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
-        coupling = felt
+        requested = Coupling(stiffness, damping, turning, FELT_DAMPING * turning * PERIOD)
+        coupling = requested
         if same_law:
-            law = METHODS["lossless"].used(felt, PERIOD)
-            coupling = METHODS[method].rendered(law, PERIOD)
+            law = METHODS["lossless"].law_coupling(requested, PERIOD)
+            coupling = METHODS[method].requested_coupling(law, PERIOD)
         if rig == "taps":
             loop = base.loop_in("virtual_wall", "contact")
             path, holder = contact_rigs.random_taps(hand)
@@ -222,7 +222,7 @@ def method_runs(
             path, holder = contact_rigs.recorded() if hand == 0 else contact_rigs.random_push(hand)
         treatment.apply(loop.scene.model, friction)
         contact_rigs.set_mass(loop, "tool" if rig == "taps" else "peg", mass)
-        device = contact_rigs.firm_device(felt, path, holder)
+        device = contact_rigs.firm_device(requested, path, holder)
         records, run = contact_rigs.run_once(
             loop, device, coupling, treatment, contact_rigs.ticks_of(device)
         )

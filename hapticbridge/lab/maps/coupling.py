@@ -16,7 +16,7 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
-from hapticbridge.lab.maps.tool_mass import felt, worst_angle
+from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -142,13 +142,13 @@ def _coupling(stiffness: float, damping: float) -> Coupling:
 
 def _worst_hand(name: str, coupling: Coupling, mass: float | None) -> LoopOutcome:
     """Runs the worst hand of a method on a wall (no mass) or with a free tool."""
-    used = METHODS[name].used(coupling, PERIOD)
+    used = METHODS[name].law_coupling(coupling, PERIOD)
     k, b = used.stiffness, used.damping
     if mass is None:  # at Nyquist, where the damper alone is the worst hand
         hand, loop = WorstHand(DEVICE_DAMPING, np.pi / PERIOD, PERIOD), _wall()
     else:
         angle, _ = worst_angle(THEORIES[name], k, b, mass, PERIOD)
-        response = complex(felt(THEORIES[name], k, b, mass, PERIOD, angle))
+        response = complex(effective_response(THEORIES[name], k, b, mass, PERIOD, angle))
         hand, loop = WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response), _tool()
     return loop.run(
         SimulatedDevice(hand=hand), coupling, METHODS[name], period=PERIOD, ticks=TICKS, knock=KNOCK
@@ -236,7 +236,7 @@ def _note(name: str) -> str:
     method = METHODS[name]
     if not method.has_law:
         return ": free, and tapping"
-    return f", {base.law_in_words(name)}" if method.lag else ""
+    return f", {base.law_in_words(name)}" if method.compensated_share else ""
 
 
 def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
@@ -246,7 +246,7 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
         fine = np.linspace(*DAMPING, FINE), np.geomspace(*STIFFNESS, FINE)
         by_6 = base.needed_by_6(name, fine[1][:, None], fine[0], PERIOD)
         axes.contour(*fine, by_6, levels=[b], colors="black", linewidths=1.8)
-    if has_wall and METHODS[name].lag == 0.0:
+    if has_wall and METHODS[name].compensated_share == 0.0:
         # (7) as θ → 0: (K T)² = 2 b (K T + 2 B)
         damping = np.linspace(*DAMPING, FINE)
         low = (b + np.sqrt(b**2 + 4 * b * damping)) / PERIOD
@@ -264,8 +264,10 @@ def _draw_theory(axes: Axes, name: str, *, has_wall: bool) -> None:
 
 def _first_alike(name: str) -> str:
     """Returns the first method with an equal bound of the free tool, computed once."""
-    selected = THEORIES[name], METHODS[name].lag
-    return next(each for each in THEORIES if (THEORIES[each], METHODS[each].lag) == selected)
+    selected = THEORIES[name], METHODS[name].compensated_share
+    return next(
+        each for each in THEORIES if (THEORIES[each], METHODS[each].compensated_share) == selected
+    )
 
 
 @cache

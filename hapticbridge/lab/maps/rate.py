@@ -171,10 +171,10 @@ def _timing(what: str, share: float, seed: int) -> Timing:
 def worst_hand(name: str, stiffness: float, period: float, delay: int) -> LoopOutcome:
     """Runs the worst hand of a method's law on a wall whose force arrives whole samples late."""
     coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
-    theory = SampledLoop(METHODS[name].used(coupling, period), period, delay=delay)
+    theory = SampledLoop(METHODS[name].law_coupling(coupling, period), period, delay=delay)
     frequency = theory.worst_frequency()
-    felt = complex(theory.response(frequency))
-    hand = WorstHand(DEVICE_DAMPING, frequency, period, felt)
+    response = complex(theory.response(frequency))
+    hand = WorstHand(DEVICE_DAMPING, frequency, period, response)
     device = SimulatedDevice(damping=DEVICE_DAMPING, hand=hand, delay=delay)
     swing = 2 * np.pi / (frequency * period)
     return _run(name, device, coupling, period, ticks=max(TICKS, round(SWINGS * swing)))
@@ -217,7 +217,7 @@ def wall_limit(name: str, period: float, delay: int) -> float:
 
     def is_enough(stiffness: float) -> bool:
         coupling = Coupling(stiffness, DAMPING, 0.0, 0.0)
-        used = METHODS[name].used(coupling, period)
+        used = METHODS[name].law_coupling(coupling, period)
         return minimum_damping(used, period, delay=delay) < DEVICE_DAMPING
 
     return base.largest_stable(is_enough, *SEARCHED, THEORY_WIDTH).middle

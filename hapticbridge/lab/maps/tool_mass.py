@@ -71,7 +71,7 @@ def min_mass(method: str, stiffness: float, damping: float, period: float) -> fl
     return b * period / 2 * (2 * b + kt) / (2 * b - kt) if 2 * b > kt else float("inf")
 
 
-def felt(
+def effective_response(
     method: str, stiffness: float, damping: float, mass: float, period: float, angle: ArrayLike
 ) -> NDArray[np.complex128]:
     """Returns the transfer function of a free tool, force per displacement of the handle.
@@ -126,7 +126,7 @@ def worst_angle(
     References:
         Colgate & Schenkel 1997.
     """
-    response = felt(method, stiffness, damping, mass, period, ANGLES)
+    response = effective_response(method, stiffness, damping, mass, period, ANGLES)
     needed = needed_for_fixed_environment(response, period, ANGLES)
     place = int(np.flatnonzero(needed >= needed.max() - 1e-12 * abs(needed.max()))[-1])
     is_stable = mass > min_mass(method, stiffness, damping, period)
@@ -243,7 +243,7 @@ def hand_worst_for(name: str, stiffness: float, mass: float) -> WorstHand:
     """Returns the hand that needs most damping for this method, mass and stiffness."""
     law = THEORIES[name], stiffness, law_damping(name, stiffness), mass, PERIOD
     angle, _ = worst_angle(*law)
-    response = complex(felt(*law, angle))
+    response = complex(effective_response(*law, angle))
     return WorstHand(DEVICE_DAMPING, angle / PERIOD, PERIOD, response)
 
 

@@ -131,11 +131,11 @@ def drive(mass: ImplicitMass, handle: _Array) -> NDArray[np.void]:
     return rows
 
 
-def hold(felt: Callable[[float], float], hand: WorstHand, ticks: int) -> _Array:
+def hold(respond: Callable[[float], float], hand: WorstHand, ticks: int) -> _Array:
     """Runs an environment with the worst hand, from a displaced handle.
 
     Args:
-        felt: Returns the force on the tool in N for the handle's next position in m.
+        respond: Returns the force on the tool in N for the handle's next position in m.
         hand: Device and hand.
         ticks: Number of ticks; fewer where the force exceeds a million newtons.
 
@@ -146,7 +146,7 @@ def hold(felt: Callable[[float], float], hand: WorstHand, ticks: int) -> _Array:
     force = np.zeros(ticks)
     handle, velocity, last = KICK, 0.0, 0.0
     for k in range(ticks):
-        force[k] = felt(handle)
+        force[k] = respond(handle)
         if abs(force[k]) > DIVERGED:
             return force[: k + 1]
         velocity = carried * velocity - now * force[k] + before * last
@@ -165,14 +165,14 @@ def decays(force: _Array, ticks: int) -> bool:
 
 
 def limit_of(
-    felt: Callable[[], Callable[[float], float]], hand: Callable[[float], WorstHand]
+    make_environment: Callable[[], Callable[[float], float]], hand: Callable[[float], WorstHand]
 ) -> float:
     """Finds the smallest device damping at which a loop is stable.
 
     Powers of ten from 1 N s/m on enclose it, so that no bound of the theory enters the search.
 
     Args:
-        felt: Makes a new environment.
+        make_environment: Makes a new environment.
         hand: The worst hand for a device damping in N s/m.
 
     Returns:
@@ -180,7 +180,7 @@ def limit_of(
     """
 
     def is_stable(damping: float) -> bool:
-        return decays(hold(felt(), hand(damping), TICKS), TICKS)
+        return decays(hold(make_environment(), hand(damping), TICKS), TICKS)
 
     return threshold(is_stable, 1.0, TOLERANCE)
 

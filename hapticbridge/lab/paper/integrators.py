@@ -509,11 +509,11 @@ def _in_mujoco(mass: float, integrator: Integrator) -> float:
     def hand(damping: float) -> WorstHand:
         return WorstHand(damping, frequency, PERIOD, response)
 
-    def felt() -> Callable[[float], float]:
+    def make_environment() -> Callable[[float], float]:
         kind = ImplicitMass if integrator == "implicit" else AppliedForceMass
         return kind(MASS_COUPLING, PERIOD, mass).force
 
-    return limit_of(felt, hand)
+    return limit_of(make_environment, hand)
 
 
 def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:

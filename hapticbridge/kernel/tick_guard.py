@@ -32,7 +32,7 @@ from hapticbridge.kernel.codes import (
     GAVE_ENERGY,
     JUMPED,
     RAMPING,
-    RESEATED,
+    REANCHORED,
     SLEW_LIMITED,
     STALE_SAMPLE,
     STRETCHED,
@@ -40,7 +40,7 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
-from hapticbridge.kernel.coupling import releasable_energy
+from hapticbridge.kernel.law import releasable_energy
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
     Vector,
@@ -59,9 +59,9 @@ _FROM_PARAMETERS = (
     "fade_ticks",
     "clutch",
     "dead_man",
-    "reseats",
-    "force_rise",
-    "torque_rise",
+    "reanchors_at_start",
+    "force_slew",
+    "torque_slew",
     "longest_stall",
     "reach",
     "ramp_energy",
@@ -75,8 +75,8 @@ GUARD_DTYPE = np.dtype(
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),
-        ("is_released", "<i8"),
-        ("is_anchor_requested", "<i8"),
+        ("is_clutched", "<i8"),
+        ("is_reanchoring_requested", "<i8"),
         ("consecutive_stale", "<i8"),
         ("fade_ticks_elapsed", "<i8"),
         ("time_since_sample", "<f8"),
@@ -117,7 +117,7 @@ def bind_guard(guard: Part, parameters: RunParameters) -> None:
         guard[f"max_{name}"] = getattr(limits, name)
     guard["ramp_length"] = parameters.ramp_ticks
     # before the first tick, a device with a dead-man button counts as released
-    guard["is_released"] = limits.dead_man != 0
+    guard["is_clutched"] = limits.dead_man != 0
 
 
 def restart_ramp(guard: Part, tick: int, length: int) -> None:
@@ -126,9 +126,9 @@ def restart_ramp(guard: Part, tick: int, length: int) -> None:
     guard["limited_wrench"] = 0.0
 
 
-def request_anchor(guard: Part) -> None:
+def request_reanchoring(guard: Part) -> None:
     """Re-anchors the handle at the next tick in which it follows the device."""
-    guard["is_anchor_requested"] = 1
+    guard["is_reanchoring_requested"] = 1
 
 
 def set_commanded(guard: Part, bits: int) -> None:
@@ -161,7 +161,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
     if norm(rotation_between(tool, handle)) > guard.max_angle:
         return TWISTED
-    return GAVE_ENERGY if s.observer.excess_energy_to_device > guard.max_energy else 0
+    return GAVE_ENERGY if s.observer.excess_device_energy > guard.max_energy else 0
 
 
 @compiled
@@ -173,10 +173,10 @@ def follow(
     The handle stays while a clutch is held (by a button or by command), while a dead-man button is
     not held, and while the device is beyond ``reach``, at the edge of its workspace. The wrench
     then fades. It also fades after ``stale_ticks`` ticks without a new sample, and while the force
-    is off by command. Afterwards, and after a stall, the handle is re-anchored (flag ``RESEATED``):
-    it is placed at the tool, the device's pose belongs to it from then on, and the wrench rises
-    within ``fade_ticks``. A coupling that stayed stretched would release energy that no hand
-    supplied.
+    is off by command. Afterwards, and after a stall, the handle is re-anchored (flag
+    ``REANCHORED``): it is placed at the tool, the device's pose belongs to it from then on, and the
+    wrench rises within ``fade_ticks``. A coupling that stayed stretched would release energy that
+    no hand supplied.
 
     Args:
         s: The bound state.
@@ -192,31 +192,33 @@ def follow(
     guard, flags = s.guard, s.loop.external_flags
     guard.flags = 0
     is_stale = (flags & STALE_SAMPLE) != 0
-    was_silent = guard.fade_ticks_elapsed > 0
+    was_force_off = guard.fade_ticks_elapsed > 0
     guard.consecutive_stale = guard.consecutive_stale + 1 if is_stale else 0
     waited = guard.time_since_sample + max(elapsed, s.run.period)
     guard.time_since_sample = waited if is_stale else 0.0
-    was_released = guard.is_released != 0
-    is_released = (buttons & (guard.clutch | CLUTCHED)) != 0
-    is_released = is_released or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
-    is_released = is_released or norm(position) > guard.reach
-    guard.is_released = is_released
-    is_silent = is_released or (buttons & FORCE_OFF) != 0
-    is_silent = is_silent or (guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks)
-    guard.fade_ticks_elapsed = guard.fade_ticks_elapsed + 1 if is_silent else 0
-    if is_released:
+    was_clutched = guard.is_clutched != 0
+    is_clutched = (buttons & (guard.clutch | CLUTCHED)) != 0
+    is_clutched = is_clutched or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
+    is_clutched = is_clutched or norm(position) > guard.reach
+    guard.is_clutched = is_clutched
+    is_force_off = is_clutched or (buttons & FORCE_OFF) != 0
+    is_force_off = is_force_off or (
+        guard.stale_ticks > 0 and guard.consecutive_stale > guard.stale_ticks
+    )
+    guard.fade_ticks_elapsed = guard.fade_ticks_elapsed + 1 if is_force_off else 0
+    if is_clutched:
         guard.flags = CLUTCH
         return False
     is_first = s.loop.tick == guard.ramp_start
     has_stalled = elapsed > guard.longest_stall and not is_first
     has_moved = norm(moved) > STILL or norm(turned) > STILL_TURN
-    has_strayed = is_first and guard.reseats and has_moved
+    has_strayed = is_first and guard.reanchors_at_start and has_moved
     # after a reset, or in the re-simulation of a recorded run
-    is_requested = guard.is_anchor_requested != 0 or (flags & RESEATED) != 0
-    guard.is_anchor_requested = 0
-    is_heard_again = was_silent and not is_silent
-    if was_released or is_heard_again or has_stalled or has_strayed or is_requested:
-        guard.flags |= RESEATED
+    is_requested = guard.is_reanchoring_requested != 0 or (flags & REANCHORED) != 0
+    guard.is_reanchoring_requested = 0
+    is_force_on_again = was_force_off and not is_force_off
+    if was_clutched or is_force_on_again or has_stalled or has_strayed or is_requested:
+        guard.flags |= REANCHORED
         if not is_first:
             guard.ramp_length = guard.fade_ticks
         guard.ramp_start, guard.ramp_progress = s.loop.tick, 0.0
@@ -286,8 +288,8 @@ def limit_wrench(
     if is_limited or is_torque_limited:
         guard.flags |= FORCE_LIMITED
     last, last_torque = vector_of(guard.limited_wrench), vector_of(guard.limited_wrench[3:6])
-    force, is_slewed = _slew_limited(force, last, guard.force_rise)
-    torque, is_torque_slewed = _slew_limited(torque, last_torque, guard.torque_rise)
+    force, is_slewed = _slew_limited(force, last, guard.force_slew)
+    torque, is_torque_slewed = _slew_limited(torque, last_torque, guard.torque_slew)
     if is_slewed or is_torque_slewed:
         guard.flags |= SLEW_LIMITED
     store_vector(guard.limited_wrench[0:3], force)

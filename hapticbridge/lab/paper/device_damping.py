@@ -249,8 +249,8 @@ def _needed_behind(stiffness: NDArray[np.float64]) -> NDArray[np.float64]:
     k, b = np.asarray(BEHIND.stiffness), np.asarray(BEHIND.damping)
     coupling = coupling_transfer(k, b, PERIOD, theta, "backward", 0.0)
     spring = stiffness[:, None]
-    felt = coupling * spring / (coupling + spring)
-    return np.asarray(needed_for_fixed_environment(felt, PERIOD, theta).max(axis=1))
+    in_series = coupling * spring / (coupling + spring)
+    return np.asarray(needed_for_fixed_environment(in_series, PERIOD, theta).max(axis=1))
 
 
 def direct_section() -> Section:

@@ -94,7 +94,7 @@ class AuditedBlock:
     ) -> AuditedBlock:
         """Evaluates consecutive records, at least one."""
         parameters, motion = events.parameters, Motion.of(ticks, state, events)
-        is_first, is_anchored = events.is_first(ticks), has_flag(ticks, TickFlag.RESEATED)
+        is_first, is_anchored = events.is_first(ticks), has_flag(ticks, TickFlag.REANCHORED)
         lengths = np.where(is_first, parameters.ramp_ticks, parameters.guarding.fade_ticks)
         start, anchoring = _newest(is_first | is_anchored), _newest(is_anchored)
         axes = np.array(parameters.axes).reshape(3, 3)
@@ -199,8 +199,8 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
     guarding = parameters.guarding
     for name, most in (
-        ("injected_damping", guarding.most_damping),
-        ("injected_rotational_damping", guarding.most_rotational_damping),
+        ("injected_damping", guarding.max_damping),
+        ("injected_rotational_damping", guarding.max_rotational_damping),
     ):
         damping, unit = ticks[name], UNITS[name]
         yield Deviation(name, np.where(is_active, 0.0, np.abs(damping)), 0.0, unit, "flags")
@@ -262,8 +262,8 @@ def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviati
     before = np.divide(before, share_before, out=np.zeros_like(before), where=is_rising)
     expected, beyond = np.zeros_like(sent), np.full(len(sent), -np.inf)
     for part, limit, most in (
-        (_FORCE, parameters.force_limit, parameters.guarding.force_rise),
-        (_TORQUE, parameters.torque_limit, parameters.guarding.torque_rise),
+        (_FORCE, parameters.force_limit, parameters.guarding.force_slew),
+        (_TORQUE, parameters.torque_limit, parameters.guarding.torque_slew),
     ):
         rise = min(most, 2 * limit)  # finite also without a slew limit
         change = _shortened(block.limited[:, part] - before[:, part], rise)

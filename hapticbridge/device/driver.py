@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from hapticbridge.device.base import Device
 from hapticbridge.errors import DeviceError, choices
@@ -14,6 +14,10 @@ from hapticbridge.errors import DeviceError, choices
 Notify = Callable[[str], None]
 """Receives a message for the user while a device is opened or started: an instruction or
 progress."""
+
+Options = Mapping[str, type[Any]]
+"""Options of a device by name, with the type of each value: ``float``, ``int``, ``str`` for text
+up to the next comma (a serial number may have leading zeros), ``Path`` for all remaining text."""
 
 RULES_COMMAND = "hapticbridge devices --udev-rules"
 """Command that prints the udev rules; messages about a missing permission name it."""
@@ -48,7 +52,7 @@ class Driver:
     Attributes:
         name: Name in ``open_device``.
         about: Description, in a few words.
-        ids: Every product of the family; empty for a device class.
+        ids: Every product of the driver; empty for a device class.
         transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (the maker's background program)
             or ``library`` (the maker's library).
         axes: Axes in words, because they may differ between units.
@@ -56,14 +60,14 @@ class Driver:
         rate: Rate of reports, in words.
         on_stall: Fate of the force while the host is stalled, in words; empty without force. The
             host cannot act then, only the device itself.
-        options: Options of ``open``.
+        options: Options of ``open``, with their types.
         open: Finds and opens the device; its arguments are the options and a receiver of messages.
         usage: Usage page and usage of the HID collection with the protocol, if a product has
             several; None if any fits.
         find: Lists the connected devices if neither hidapi nor pyusb can.
         medium: Returns a sentence on whether the service or library is present.
-        sought: Description of the devices looked for, if USB ids do not describe them.
-        recognises: Recognises a device class by its HID report descriptor; None for families with a
+        products: Description of the devices looked for, if USB ids do not describe them.
+        recognises: Recognises a device class by its HID report descriptor; None for drivers with a
             list of products.
     """
 
@@ -74,17 +78,17 @@ class Driver:
     axes: str
     force: str
     rate: str
-    options: tuple[str, ...]
+    options: Options
     open: Callable[[Mapping[str, object], Notify], Device]
     on_stall: str = ""
     usage: tuple[int, int] | None = None
     find: Callable[[], list[FoundDevice]] | None = None
     medium: Callable[[], str] | None = None
-    sought: str = ""
+    products: str = ""
     recognises: Callable[[bytes], bool] | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
-        """Returns the model with these ids, or None if it is not of the family."""
+        """Returns the model with these ids, or None if it is not of the driver."""
         for usb_id in self.ids:
             if (usb_id.vendor, usb_id.product) == (vendor, product):
                 return usb_id.model
@@ -96,17 +100,17 @@ class FoundDevice:
     """A connected device.
 
     Attributes:
-        family: Name of the family.
+        driver: Name of the driver.
         name: Name that the device reports, else the model's name; printable, as is the serial.
         serial: Serial number; empty if it has none or does not report it.
         path: Device node by which it is opened.
         vendor: USB vendor id; 0 if unknown.
         product: USB product id; 0 if unknown.
-        transport: Transport of the family.
+        transport: Transport of the driver.
         problem: Reason why it cannot be opened, with the remedy, in one sentence; None if it can.
     """
 
-    family: str
+    driver: str
     name: str
     serial: str
     path: str
@@ -148,12 +152,12 @@ def access_problem(path: str) -> str | None:
 
 
 def select_device(
-    family: Driver, plugged: Sequence[FoundDevice], serial: object = None
+    driver: Driver, plugged: Sequence[FoundDevice], serial: object = None
 ) -> FoundDevice:
     """Returns the device to open.
 
     Args:
-        family: The family that was looked for.
+        driver: The driver that was looked for.
         plugged: Its connected devices.
         serial: Serial number or path; None: exactly one device must be connected.
 
@@ -162,22 +166,22 @@ def select_device(
             opened. The message names the remedy.
     """
     if not plugged:
-        vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in family.ids}))
-        description = f"{len(family.ids)} products of {vendors}"
-        if len(family.ids) == 1:
-            description = str(family.ids[0])
-        elif family.recognises is not None:
+        vendors = ", ".join(sorted({f"{usb_id.vendor:04x}" for usb_id in driver.ids}))
+        description = f"{len(driver.ids)} products of {vendors}"
+        if len(driver.ids) == 1:
+            description = str(driver.ids[0])
+        elif driver.recognises is not None:
             description = "any product, by the capabilities that it reports"
-        description = family.sought or description
+        description = driver.products or description
         raise DeviceError(
-            f"no device '{family.name}' is plugged in (looked for {description}); 'hapticbridge "
+            f"no device '{driver.name}' is plugged in (looked for {description}); 'hapticbridge "
             "devices' lists connected devices and missing permissions"
         )
     names = choices(device.serial or device.path for device in plugged)
     if serial is None:
         if len(plugged) > 1:
             raise DeviceError(
-                f"{len(plugged)} devices '{family.name}' are plugged in; choose one with "
+                f"{len(plugged)} devices '{driver.name}' are plugged in; choose one with "
                 f"serial=, one of {names}"
             )
         device = plugged[0]
@@ -185,7 +189,7 @@ def select_device(
         matching = [d for d in plugged if str(serial) in (d.serial, d.path)]
         if not matching:
             raise DeviceError(
-                f"no device '{family.name}' has serial '{serial}'; plugged in: {names}"
+                f"no device '{driver.name}' has serial '{serial}'; plugged in: {names}"
             )
         device = matching[0]
     if device.problem is not None:
