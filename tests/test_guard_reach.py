@@ -15,7 +15,7 @@ from bridge_runs import fast
 
 from hapticbridge.audit import audit
 from hapticbridge.device import DeviceInfo
-from hapticbridge.device.profile import SHIPPED, Profile, profile_named, profiles
+from hapticbridge.device.profile import SHIPPED, profile_named, profiles
 from hapticbridge.errors import DeviceError
 from hapticbridge.guard import Limits
 from hapticbridge.options import Workspace
@@ -90,17 +90,12 @@ def test_a_profile_tells_a_device_its_reach() -> None:
         replace(info, reach=0)
 
 
-def shipped() -> dict[str, Profile]:
-    return {
-        name: profile_named(name) for name, path in profiles().items() if path.parent == SHIPPED
-    }
-
-
 def test_no_shipped_reach_cuts_what_the_maker_calls_the_workspace() -> None:
     """A ball that holds the corners of the box; only where the frame begins in its middle."""
-    told = {name: p for name, p in shipped().items() if "reach" in p.quantities}
-    assert {p.device for p in told.values()} == {"falcon", "forcedimension"}
-    for profile in told.values():
+    shipped = [profile_named(name) for name, path in profiles().items() if path.parent == SHIPPED]
+    told = [profile for profile in shipped if "reach" in profile.quantities]
+    assert {profile.device for profile in told} == {"falcon", "forcedimension"}
+    for profile in told:
         reach, box = profile.quantities["reach"].value, profile.quantities["workspace"].value
         assert isinstance(reach, float) and isinstance(box, tuple)
         assert 0 <= reach - 0.5 * math.hypot(*box) < 1e-4
