@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from falcon_cases import Bench
+from device_benches import FalconBench
 from report_runs import ANVIL
 
 from hapticbridge.audit import AuditReport, audit
@@ -35,13 +35,11 @@ def held_to_an_anvil(
     """Returns the verdict, and how far the grip swings at the end in m; b = 2 N s/m, 1 kHz."""
     scene, path = folder / "anvil.xml", folder / "run.mcap"
     scene.write_text(ANVIL)
-    bench = Bench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
+    bench = FalconBench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
     device = bench.opened(damping=2.0)
     if delay is not None:
         device.info = dataclasses.replace(device.info, delay=delay)
-    coupling = Coupling(
-        stiffness=stiffness, damping=0.05, rotational_stiffness=0.1, rotational_damping=1e-4
-    )
+    coupling = Coupling(stiffness, 0.05, 0.1, 1e-4)
     clock = bench.clock(2e-4)
     with Bridge(scene, device, coupling, recording=path, clock=clock) as bridge:
         bridge.run(duration=2.5)

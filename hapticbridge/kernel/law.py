@@ -20,9 +20,12 @@ the line needs more than the larger end.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
+from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.handle import (
@@ -58,6 +61,15 @@ Gains = tuple[float, float, float]
 """Gains of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m. For
 rotation: factor, N m/rad, N m s/rad."""
 
+GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
+"""Gains of the coupling's actuators, for forces and for torques, by the law's coupling and MuJoCo's
+time step in s."""
+
+SLACK_SHARE = 0.5
+"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack with n > 1 evaluations of the law per tick; no
+unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
+environment counts as active sooner."""
+
 TUNED = (
     "stiffness",
     "damping",
@@ -86,11 +98,47 @@ COUPLING_DTYPE = np.dtype(
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
 
+def implicit_gains(coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
+    """Returns the gains of actuators that evaluate the whole law inside MuJoCo's step."""
+    k, b = coupling.stiffness, coupling.damping
+    kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+    return (b, k, b), (br, kr, br)
+
+
+def no_gains(_coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
+    """Returns the gains of actuators without effect."""
+    return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+
+def slack_gains(parameters: RunParameters) -> tuple[float, float]:
+    """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
+
+    g = K + B/T with one evaluation of the law per tick, and half of K/n + B/T with n > 1. Zero
+    without a coupling law (a weld, a tool without mass), because the proof of a slack needs
+    one. With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device
+    damping at B = 0; half of it does not (``certificate.required_damping``). The records hold
+    the sum of the motions δx_i alone, and uniform motion gives the least slack for a sum.
+    """
+    if not parameters.has_law:
+        return 0.0, 0.0
+    coupling = parameters.coupling
+    share = 1.0 if parameters.law_evaluations == 1 else SLACK_SHARE
+    return (
+        share
+        * (coupling.stiffness / parameters.law_evaluations + coupling.damping / parameters.period),
+        share
+        * (
+            coupling.rotational_stiffness / parameters.law_evaluations
+            + coupling.rotational_damping / parameters.period
+        ),
+    )
+
+
 def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
     """Returns the numbers of ``TUNED`` for a coupling; all are linear in it."""
     coupling = parameters.coupling
     law = (getattr(coupling, name) for name in TUNED[:4])
-    return (*law, *parameters.slack_gains())
+    return (*law, *slack_gains(parameters))
 
 
 def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float, ...]) -> None:
@@ -225,20 +273,22 @@ def applied_wrench(s: State, share: float) -> tuple[Vector, Vector]:
         s: The bound state after a step of the integrator ``discrete``.
         share: Share of the gains, as given to ``set_gains``.
     """
-    mj = s.mj
-    h = s.run.timestep
-    first = mj.coupling_output_adr
-    forces = floats(mj.actuator_force, first + 6)
-    f = np.empty(6)
-    for axis in range(6):
-        row = 0 if axis < 3 else 3
-        part = share * s.level.share[0 if axis < 3 else 1]
-        stiffness, damping = s.coupling.gains[row + 1], s.coupling.gains[row + 2]
-        end = moment_dot(s, first + axis, mj.qvel)
-        change = moment_dot(s, first + axis, mj.qacc)
-        in_position, in_velocity = part * h * stiffness, part * h * (h * stiffness + damping)
-        f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
-    return vector_of(f), vector_of(f[3:6])
+    force = (_applied(s, 0, share), _applied(s, 1, share), _applied(s, 2, share))
+    torque = (_applied(s, 3, share), _applied(s, 4, share), _applied(s, 5, share))
+    return force, torque
+
+
+@compiled
+def _applied(s: State, axis: int, share: float) -> float:
+    mj, h = s.mj, s.run.timestep
+    actuator, row = mj.coupling_output_adr + axis, 0 if axis < 3 else 3
+    part = share * s.level.share[0 if axis < 3 else 1]
+    stiffness, damping = s.coupling.gains[row + 1], s.coupling.gains[row + 2]
+    end = moment_dot(s, actuator, mj.qvel)
+    change = moment_dot(s, actuator, mj.qacc)
+    in_position, in_velocity = part * h * stiffness, part * h * (h * stiffness + damping)
+    force = floats(mj.actuator_force, actuator + 1)[actuator]
+    return float(force - in_position * (end - h * change) - in_velocity * change)
 
 
 @compiled
@@ -338,9 +388,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     stretch, twist = pulled(s)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
         length, k.owed[0] = _paid(k.stiffness, norm(stretch), s.level.level[0], k.owed[0])
-        angle, k.owed[1] = _paid(
-            k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1]
-        )
+        angle, k.owed[1] = _paid(k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1])
         max_stretch, max_twist = min(max_stretch, length), min(max_twist, angle)
     new, new_twist = _within(stretch, max_stretch), _within(twist, max_twist)
     if k.has_passive:

@@ -557,14 +557,18 @@ def bind_lossless(
     return owned | {"user_forces": owned["last_written"].copy()}
 
 
+@compiled
 def restart_lossless(s: State) -> None:
     """Starts in the implicit form again after the scene was reset; nothing is carried over."""
-    lossless, nv = s["lossless"], int(s["mj"]["nv"])
-    lossless["is_midpoint"] = lossless["is_near"] = lossless["holdoff"] = 0
-    forces = floats(int(lossless["qfrc_written"]), nv)
-    floats(int(s["mj"]["qfrc_applied"]), nv)[:] = forces
-    floats(int(lossless["last_written"]), nv)[:] = forces
-    floats(int(lossless["carried_force"]), nv)[:] = 0.0
+    mj, lossless = s.mj, s.lossless
+    lossless.is_midpoint = 0
+    lossless.is_near = 0
+    lossless.holdoff = 0
+    written, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)
+    last, carried = floats(lossless.last_written, mj.nv), floats(lossless.carried_force, mj.nv)
+    for i in range(mj.nv):
+        users[i] = last[i] = written[i]
+        carried[i] = 0.0
     set_gains(s, 1.0)
     note_twist(s)
 

@@ -1,0 +1,171 @@
+"""``hapticbridge audit``: exit codes, pictures, and pages of recordings with hostile text."""
+
+from __future__ import annotations
+
+import json
+import os
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from audit_cases import rewritten
+from cli_cases import Called, one_sentence
+
+from hapticbridge.audit import audit
+from hapticbridge.recording import Recording, read_recording
+
+
+def test_active_and_invalid_recordings_are_exit_code_1(
+    call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    recording = read_recording(run_file)
+    ticks = recording.ticks.copy()
+    ticks["kinetic"][50] *= 1.1
+    other = rewritten(recording, tmp_path / "other.mcap", ticks=ticks)
+    code, out, _ = call("audit", other)
+    assert code == 1
+    assert "invalid" in out and "tick 50" in out
+    code, out, _ = call("audit", run_file, other, "--json")
+    assert code == 1
+    reports = json.loads(out)
+    assert [report["verdict"] for report in reports] == ["invalid", "passive"]  # worst first
+    assert reports[0]["tick"] == 50
+
+
+def test_strict_is_passed_on(call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def judged(path: Path, *, strict: bool) -> Any:
+        seen.append(strict)
+        return audit(path, strict=strict)
+
+    monkeypatch.setattr("hapticbridge.cli.audit.audit", judged)
+    call("audit", run_file, "--strict")
+    call("audit", run_file)
+    assert seen == [True, False]
+
+
+def test_file_without_permission_is_refused(
+    call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: Path, *_mode: object, **_options: object) -> bytes:
+        raise PermissionError(13, os.strerror(13))
+
+    monkeypatch.setattr(Path, "open", refuse)  # root may read everything
+    code, _, err = call("audit", run_file)
+    assert code == 2
+    assert "Permission denied" in one_sentence(err)
+
+
+def test_jobs_for_one_recording_are_said_to_have_no_effect(call: Called, run_file: Path) -> None:
+    """Not refused: a pattern that the shell resolves may fit one file today, and many tomorrow."""
+    code, out, err = call("audit", run_file, "--jobs", 2)
+    assert (code, "passive" in out) == (0, True)
+    assert "--jobs and --scheduler are for several recordings" in err
+    assert "--jobs" not in call("audit", run_file)[2]
+
+
+HOSTILE = "--><script>alert('x')</script>[/b] ${y} $\\frac$ & \x1b[31m"
+
+
+@pytest.fixture
+def hostile(tmp_path: Path, run_file: Path) -> Recording:
+    recording = read_recording(run_file)
+    meta = dict.fromkeys(("scene", "started", "clock"), HOSTILE)
+    meta["versions"] = json.dumps({"mujoco": HOSTILE})
+    event = {"event": HOSTILE, "reason": HOSTILE, "tick": HOSTILE, "time_ns": 0}
+    path = rewritten(
+        recording, tmp_path / "hostile.mcap", meta=meta, events=[*recording.events, event]
+    )
+    return read_recording(path)
+
+
+class Page(HTMLParser):
+    """Gathers what a page would run or fetch, and whether its tags match."""
+
+    VOID = ("meta", "br", "hr", "img", "link", "input")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.scripts = 0
+        self.fetched: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open += [tag] * (tag not in self.VOID)
+        self.scripts += tag in ("script", "iframe", "object", "embed")
+        for name, value in attrs:
+            self.scripts += name.startswith("on")
+            if name in ("src", "href", "xlink:href", "data") and not (value or "").startswith("#"):
+                self.fetched.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert tag in self.VOID or self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_page_is_whole_fetches_nothing_and_runs_nothing(
+    hostile: Recording, call: Called, tmp_path: Path
+) -> None:
+    target = tmp_path / "page.html"
+    picture_file = tmp_path / "picture.svg"
+    code, out, _ = call("audit", hostile.path, "--report", target, "--plot", picture_file)
+    assert code == 0
+    assert "<script>alert('x')</script>[/b] ${y}" in out  # printed, not taken as markup
+    assert "\x1b" not in out
+    text = target.read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert not page.open
+    assert not page.scripts
+    assert not page.fetched
+    assert "url(http" not in text and "@import" not in text
+    assert "alert('x')" in page.text
+    for told in ("passive", "2400 N/m", "unknown", "not re-simulated"):
+        assert told in page.text
+    picture = text[text.index("<svg") : text.index("</svg>") + 6]
+    ET.fromstring(picture)
+    assert "purl.org" not in picture  # matplotlib's own metadata
+
+
+@pytest.mark.parametrize("ending", ["PNG", "svg", "pdf"])
+def test_picture_is_written_in_the_format_of_its_ending(
+    ending: str, call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    target = tmp_path / f"picture.{ending}"
+    code, _, err = call("audit", run_file, "--plot", target)
+    assert code == 0
+    assert f"wrote {target}" in err
+    magic = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[ending.lower()]
+    assert target.read_bytes().startswith(magic)
+
+
+@pytest.mark.parametrize(
+    ("count", "kinetic", "meta"),
+    [
+        (201, 0.0, {}),
+        (0, 0.0, {}),
+        (201, 0.0, {"period_s": "0"}),
+        (201, 1e300, {}),
+        (201, 0.0, {"device": "[1, 2", "versions": "3"}),
+    ],
+)
+def test_page_of_an_invalid_recording_is_written_all_the_same(
+    count: int, kinetic: float, meta: dict[str, str], call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    recording, page = read_recording(run_file), tmp_path / "page.html"
+    ticks = recording.ticks[: count and None].copy()
+    ticks["kinetic"][5:6] += kinetic
+    path = rewritten(recording, tmp_path / "bad.mcap", ticks=ticks, meta=meta)
+    is_honest = (count, kinetic, meta) == (201, 0.0, {})
+    code, _, err = call("audit", path, "--report", page)
+    assert code == (0 if is_honest else 1), err
+    text = page.read_text(encoding="utf-8")
+    assert ("passive" if is_honest else "invalid") in text
+    assert ("<svg" in text) == (is_honest or "device" in meta)

@@ -1,0 +1,270 @@
+"""The command line: imports of a command, its entry in the table, refusals, and its end."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+from cli_cases import Called, one_sentence
+
+from hapticbridge.cli import main
+from hapticbridge.cli.main import COMMANDS
+from hapticbridge.signals import leaving_on_interrupt
+
+HEAVY = frozenset(
+    {"numpy", "mujoco", "numba", "llvmlite", "scipy", "matplotlib", "tyro", "rich", "mcap"}
+)
+"""Packages that neither the version nor the top-level help needs."""
+
+NOT_FOR_A_RUN = frozenset(
+    [
+        "numba",
+        "matplotlib",
+        "scipy.signal",
+        "scipy.spatial",
+        "scipy.stats",
+        "scipy.optimize",
+        "jinja2",
+        "PIL",
+        "viser",
+        "websockets",
+        "usb",
+        "hid",
+        "dask",
+        "pyarrow",
+        "h5py",
+        "http.cookies",
+        "hapticbridge.device.discovery",
+        "hapticbridge.device.falcon",
+        "hapticbridge.device.force_dimension",
+        "hapticbridge.device.haply",
+        "hapticbridge.device.pid",
+        "hapticbridge.device.rawhid",
+        "hapticbridge.device.spacemouse",
+        "hapticbridge.device.transport",
+        "hapticbridge.audit.report",
+        "hapticbridge.check",
+        "hapticbridge.realtime.doctor",
+        "hapticbridge.film",
+        "hapticbridge.identify",
+        "hapticbridge.theory_plots",
+        "hapticbridge.plotting",
+        "hapticbridge.report",
+        "hapticbridge.lab",
+        "hapticbridge.view",
+        "hapticbridge.whatif",
+    ]
+)
+"""Packages and modules that a run with the simulated device, without view, does not need."""
+
+LOADED = """
+import sys
+from hapticbridge.cli import main
+try:
+    code = main(sys.argv[1:])
+finally:
+    print("loaded:", *sys.modules, file=sys.stderr)
+sys.exit(code)
+"""
+"""Runs a command and lists the modules that are imported by its end."""
+
+INTERRUPTED = """
+import builtins, os, signal, sys
+
+from hapticbridge.cli import main
+
+usual = builtins.__import__
+
+
+def interrupting(name, *rest):
+    if name == "mujoco":
+        os.kill(os.getpid(), signal.SIGINT)
+    return usual(name, *rest)
+
+
+builtins.__import__ = interrupting
+sys.exit(main(["scenes"]))
+"""
+"""Ctrl-C in the middle of the imports."""
+
+
+def loaded_by(*arguments: str) -> set[str]:
+    """Returns the modules that a command imports."""
+    command = [sys.executable, "-c", LOADED, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stderr.split("loaded:")[1].split())
+
+
+def command_class(name: str) -> Any:
+    module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
+    return getattr(module, name.capitalize())
+
+
+@pytest.mark.parametrize("flag", ["--version", "--help"])
+def test_version_and_help_import_nothing_heavy(flag: str) -> None:
+    assert not HEAVY & loaded_by(flag)
+
+
+def test_a_run_imports_nothing_that_it_does_not_use() -> None:
+    for _ in range(2):  # the first run on a machine compiles
+        loaded = loaded_by("run", "point_mass", "--fast", "--duration", "0.01")
+    assert "hapticbridge.bridge" in loaded
+    assert not NOT_FOR_A_RUN & loaded
+
+
+@pytest.mark.parametrize("name", sorted(NOT_FOR_A_RUN - {"viser", "dask", "hid"}))
+def test_what_a_run_must_not_import_exists(name: str) -> None:
+    """A module that was renamed would no longer be watched."""
+    assert importlib.util.find_spec(name) is not None
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_has_the_summary_of_the_table_and_a_dozen_first_options(name: str) -> None:
+    documentation = inspect.getdoc(command_class(name))
+    assert documentation is not None
+    assert documentation.splitlines()[0] == COMMANDS[name].summary
+    options = [field.name for field in fields(command_class(name))]
+    first = getattr(command_class(name), "FIRST_OPTIONS", options)
+    assert set(first) <= set(options)
+    assert len(first) <= 12
+
+
+def test_the_top_level_help_fits_one_screen(call: Called) -> None:
+    code, out, _ = call("--help")
+    lines = out.splitlines()
+    assert code == 0
+    assert len(lines) < 24  # the prompt has the last line
+    assert max(map(len, lines)) < 80
+    for name, entry in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", out, flags=re.MULTILINE)
+
+
+def test_a_long_help_has_two_parts(call: Called) -> None:
+    code, out, _ = call("run", "--help")
+    assert code == 0
+    assert "--record PATH" in out and "--clutch" not in out
+    more = re.search(r"(\d+) more options: hapticbridge run --help-all", out)
+    assert more is not None
+    code, every, _ = call("run", "--help-all")
+    assert code == 0
+    assert "--record PATH" in every and "--clutch INT" in every and "more options" not in every
+    flags = [set(re.findall(r"^. (--[a-z-]+)", text, flags=re.MULTILINE)) for text in (out, every)]
+    assert flags[0] < flags[1]
+    assert len(flags[1]) - len(flags[0]) == int(more[1])
+
+
+@pytest.mark.parametrize("value", ["nonsense", "[red]\n"])
+def test_a_renderer_that_mujoco_does_not_know_is_one_sentence(value: str) -> None:
+    command = [sys.executable, "-m", "hapticbridge", "scenes"]
+    environment = os.environ | {"MUJOCO_GL": value}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: the environment variable MUJOCO_GL is {value!r}")
+    assert "'disable'" in line
+
+
+def test_ctrl_c_while_it_imports_is_silence_and_exit_code_130() -> None:
+    command = [sys.executable, "-c", INTERRUPTED]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_a_handler_of_sigint_that_is_not_pythons_own_is_kept() -> None:
+    def kept(_number: int, _frame: object) -> None: ...
+
+    before = signal.signal(signal.SIGINT, kept)
+    try:
+        with leaving_on_interrupt(130):
+            assert signal.getsignal(signal.SIGINT) is kept
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        with leaving_on_interrupt(130):
+            assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
+def test_ctrl_c_is_one_word_and_exit_code_130(
+    where: str, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_arguments: object, **_named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(where, interrupted)
+    code, out, err = call("stability", "rate")
+    assert (code, out, err.strip()) == (130, "", "interrupted")
+
+
+def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:
+    import warnings
+
+    before = warnings.showwarning
+    call("scenes")
+    assert warnings.showwarning is before
+
+
+def test_version_names_the_package_and_mujoco(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert f"MuJoCo {mujoco.mj_versionString()}" in capsys.readouterr().out
+
+
+def test_a_name_that_is_too_long_for_the_system_is_refused(call: Called) -> None:
+    for command in (("run", "point_mass", "--fast", "--record"), ("repair", "x.mcap")):
+        code, _, err = call(*command, "x" * 300 + ".mcap")
+        assert code == 2
+        one_sentence(err)
+
+
+def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "bound", "--stiffness", "100"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
+
+
+@pytest.mark.parametrize("content", [None, b"", b"hello"])
+def test_what_is_no_recording_is_refused_in_one_sentence(
+    content: bytes | None, call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "[red]what.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    for command in (("audit", path), ("repair", path, tmp_path / "out.mcap")):
+        code, out, err = call(*command)
+        assert (code, out) == (2, "")
+        assert "[red]what.mcap" in one_sentence(err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(), ("frobnicate",), ("run",), ("run", "point_mass", "--bogus"), ("audit", "x", "--bogus")],
+)
+def test_wrong_usage_is_exit_code_2_without_a_traceback(
+    arguments: tuple[str, ...], call: Called
+) -> None:
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert err and "Traceback" not in err
+
+
+def test_help_into_a_reader_that_went_away_ends_without_a_traceback() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "--help"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert told == b""
