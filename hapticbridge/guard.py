@@ -223,9 +223,9 @@ def refuse_implausible_pose(info: DeviceInfo, sample: NDArray[np.void]) -> None:
     distance = float(np.linalg.norm(position))
     if not distance <= reach:
         raise DeviceError(
-            f"the device '{info.name}' reports {np.round(position, 4).tolist()} m, {distance:.3g} m "
-            f"from the middle of its workspace; it reaches {reach:.3g} m: home or calibrate it, and "
-            "check the unit of its poses"
+            f"the device '{info.name}' reports {np.round(position, 4).tolist()} m, "
+            f"{distance:.3g} m from the middle of its workspace; it reaches {reach:.3g} m: home or "
+            "calibrate it, and check the unit of its poses"
         )
 
 

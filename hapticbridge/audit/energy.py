@@ -159,30 +159,6 @@ def _summed(values: Array, before: float) -> Array:
     return np.cumsum(np.concatenate([[before], values]))[1:]
 
 
-def _coupling_energies(
-    block: AuditedBlock, events: RunEvents, works: tuple[Array, Array]
-) -> tuple[Array, Array, Array]:
-    """Returns the work of commands, the energy that coupling and tool keep, and r V(e), (n,) each.
-
-    All are 0 without a coupling law. ``works`` are the coupling's in translation and rotation.
-    """
-    ticks, motion, parameters = block.ticks, block.motion, events.parameters
-    if not parameters.has_law:
-        none = np.zeros(len(ticks))
-        return none, none, none
-    shares, stretched = transmitted_shares(ticks, parameters), motion.stretched
-    paths = (
-        SpringPath(motion.pulled, motion.stretch, stretched[0], works[0], shares[0]),
-        SpringPath(motion.turned, motion.twist, stretched[1], works[1], shares[1]),
-    )
-    before, gains = events.gains(ticks["tick"] - 1), events.gains(ticks["tick"])
-    commanded = work_of_commands(parameters, before, gains, paths, block.share_before)
-    parts, held = stored_in_coupling(
-        parameters, gains, paths, block.is_start, block.share, block.share_before
-    )
-    return commanded, parts - commanded, held
-
-
 def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict[str, Array]:
     """Returns cumulative energies at the device port, by name, (n,) each in J."""
     ticks, parameters, before = block.ticks, events.parameters, block.state.sums

@@ -4,8 +4,8 @@ Each tick follows from its record and the previous one:
 
     h_k = h_{k−1} + r_{k−1} scale A δp_k,    w_k = −r_k s Aᵀ f_k,    f_k = P_F(u_k)
 
-r is the recorded share, δp the device's motion, A the device's axes, f the wrench on the tool, u the
-coupling's law at the recorded poses, F the force level, w the wrench on the device and s
+r is the recorded share, δp the device's motion, A the device's axes, f the wrench on the tool, u
+the coupling's law at the recorded poses, F the force level, w the wrench on the device and s
 ``force_scale`` (divided by ``scale`` for torque). Where the record says so, the handle slipped
 toward the tool, and its spring must not have gained. While the passivity controller acts, only the
 norm is checked; the re-simulation checks the rest.

@@ -361,7 +361,7 @@ def charge_lateness(s: State, interval: float) -> None:
 
 @compiled
 def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[float, float]:
-    """Returns the length at which a spring has paid what it owes, and the rest that it still owes."""
+    """Returns the length at which a spring has paid what it owes, and what is left to pay."""
     energy = _spring_energy(stiffness, length, limit)
     if stiffness <= 0.0 or owed <= 0.0:
         return np.inf, 0.0
@@ -372,9 +372,10 @@ def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[f
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 
-    Four things make it slip. A late sample is charged (``charge_lateness``). A raised gain must not raise the spring's energy. Along an axis
-    without motor the coupling holds up to ``hold`` and then slips. While the hand is let go it
-    relaxes to ``idle``. Each only shortens the spring, so energy is lost and none is gained.
+    Four things make it slip. A late sample is charged (``charge_lateness``). A raised gain must not
+    raise the spring's energy. Along an axis without motor the coupling holds up to ``hold`` and
+    then slips. While the hand is let go it relaxes to ``idle``. Each only shortens the spring, so
+    energy is lost and none is gained.
 
     Args:
         s: The bound state, with the handle's new and the tool's old pose.

@@ -193,8 +193,9 @@ class BoundKernel:
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
 
-        The handle is placed at its start, and the device's pose belongs to it from the next tick on. The change of the scene's storage is work of the external port.
-        Energy that the device received before is not forgotten.
+        The handle is placed at its start, and the device's pose belongs to it from the next tick
+        on. The change of the scene's storage is work of the external port. Energy that the device
+        received before is not forgotten.
         """
         s = self._record
         before = float(s["energy"]["kinetic"] + s["energy"]["potential"])
