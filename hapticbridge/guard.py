@@ -25,6 +25,9 @@ from hapticbridge.record import SAMPLE_DTYPE
 LONGEST_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""
 
+USUAL_RAMP = 0.5
+"""Time in s in which the force rises at the start. A shorter one surprises the hand."""
+
 USUAL_HOLD_FORCE, USUAL_HOLD_TORQUE = 1.0, 0.05
 """Force in N and torque in N m with which the coupling holds the tool along axes that a device
 lacks. They keep a tool of 0.1 kg upright against light touches; on a wrench of 0.15 m the torque
@@ -57,7 +60,8 @@ class Limits:
             device lacks, > 0; beyond it the handle slips. The tool's own weight comes on top.
         hold_torque: Largest torque in N m about axes that the device lacks, > 0.
         ramp: Time in s of the linear rise at the start, 0 to 60. The handle follows the device by
-            the share of the force that is sent.
+            the share of the force that is sent. None takes 0.5 s on a real device, and 0 on a
+            simulated one, whose hand a sudden force does not surprise.
         stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
             this and the next two limits the run is stopped.
         angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
@@ -74,7 +78,7 @@ class Limits:
     torque: float
     hold_force: float = USUAL_HOLD_FORCE
     hold_torque: float = USUAL_HOLD_TORQUE
-    ramp: float = 0.5
+    ramp: float | None = None
     stretch: float = USUAL_STRETCH
     angle: float = USUAL_ANGLE
     energy: float = USUAL_ENERGY
@@ -85,7 +89,7 @@ class Limits:
             value = getattr(self, name)
             if not math.isfinite(value) or value <= 0:
                 raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
-        if not 0 <= self.ramp <= LONGEST_RAMP:
+        if self.ramp is not None and not 0 <= self.ramp <= LONGEST_RAMP:
             raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
         for name, unit in (
             ("stretch", "m"),
@@ -110,9 +114,11 @@ class Limits:
         own = math.inf if info.reach is None else info.reach
         return own if self.reach is None else self.reach
 
-    def ramp_ticks(self, period: float) -> int:
-        """Returns the length of the ramp in ticks of ``period`` seconds."""
-        return round(self.ramp / period)
+    def ramp_ticks(self, info: DeviceInfo, period: float) -> int:
+        """Returns the length of the ramp in ticks of ``period`` seconds; 0 without a hand."""
+        usual = USUAL_RAMP if info.is_real else 0.0
+        ramp = usual if self.ramp is None else self.ramp
+        return 0 if info.is_prescribed else round(ramp / period)
 
 
 UNLIMITED = Limits(

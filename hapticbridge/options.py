@@ -402,8 +402,7 @@ class RunSetup:
             axes=self.workspace.rotation,
             force_limit=self.limits.force,
             torque_limit=self.limits.torque,
-            # a prescribed motion has no hand that a ramp would protect
-            ramp_ticks=0 if self.info.is_prescribed else self.limits.ramp_ticks(self.period),
+            ramp_ticks=self.limits.ramp_ticks(self.info, self.period),
             device_origin=IDENTITY_POSE if is_absolute else pose,
             handle_origin=handle_origin,
             device_start=pose,

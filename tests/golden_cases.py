@@ -332,9 +332,8 @@ def _held(first: int, last: int, button: int = 0) -> Callable[[int], int]:
 def _guard_runs() -> Iterator[tuple[str, Run]]:
     """Yields the cases of the guard and of the bridge's options, by name."""
     yield "force limit", Run(PEG, Scripted, {"limits": {"force": 1.0, "torque": 0.02}})
-    yield "slew limit", Run(PEG, Scripted, {"limits": {"slew_time": 0.2}})
     yield "long ramp", Run(PEG, Scripted, {"limits": {"ramp": 0.3}})
-    yield "no ramp", Run(PEG, Scripted, {"limits": {"ramp": 0.0, "slew_time": 0.0}})
+    yield "no ramp", Run(PEG, Scripted, {"limits": {"ramp": 0.0}})
     yield "clutch", Run(PEG, lambda: Scripted(buttons=_held(100, 200)), {"clutch": 0})
     yield "dead man", Run(PEG, lambda: Scripted(buttons=_held(50, 250, 1)), {"dead_man": 1})
     yield "reach", Run(PEG, Scripted, {"limits": {"reach": 0.012}})

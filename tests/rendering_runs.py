@@ -119,7 +119,7 @@ COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 
 
 FREE = Limits(
-    force=100.0, torque=10.0, slew_time=0.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
+    force=100.0, torque=10.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
 )
 
 

@@ -334,7 +334,6 @@ def drift(step: float) -> Callable[[int], tuple[float, ...]]:
 EVERY_LIMIT = Limits(
     force=3.0,
     torque=0.2,
-    slew_time=0.05,
     ramp=0.02,
     stretch=0.1,
     angle=1.0,

@@ -23,7 +23,13 @@ from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import USUAL_ENERGY, USUAL_STRETCH, Limits, refuse_simulated_time
+from hapticbridge.guard import (
+    USUAL_ENERGY,
+    USUAL_HOLD_TORQUE,
+    USUAL_STRETCH,
+    Limits,
+    refuse_simulated_time,
+)
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
@@ -255,9 +261,11 @@ class Run:
     """Largest force on the device in N; by default the device's own."""
     torque_limit: float | None = None
     """Largest torque on the device in N m; by default the device's own."""
-    ramp: float = 0.5
-    """Seconds over which the force rises at the start; longer while the coupling is held stretched,
-    because a force that rises behind a hand would be given to it."""
+    hold_torque: float = USUAL_HOLD_TORQUE
+    """Torque in N m with which the tool keeps its orientation where the device cannot turn it."""
+    ramp: float | None = None
+    """Seconds over which the force rises at the start, and the handle begins to follow the device;
+    by default 0.5 on a real device."""
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
     port: int | None = None
@@ -364,6 +372,7 @@ class Run:
                 force=info.force_limit if self.force_limit is None else self.force_limit,
                 torque=info.torque_limit if self.torque_limit is None else self.torque_limit,
                 ramp=self.ramp,
+                hold_torque=self.hold_torque,
                 stretch=self.stretch_limit,
                 energy=self.energy_limit,
                 reach=self.reach_limit,
