@@ -94,7 +94,7 @@ def stored_in_coupling(
 ) -> tuple[Array, Array]:
     """Returns the energy stored in coupling and tool from the handle, in J of the scene.
 
-        Σ c_k w_k + r_k V(e_k) − Σ (r_k − r_{k−1}) (V(e_k) + ½‖δe_k‖²_{B/T}) − Σ W_k
+        Σ c_k w_k + r_k V(e_k) − Σ (r_k − r_{k−1}) (V(e_k) + ½ (B/T) ‖δe_k‖²) − Σ W_k
 
     V is the energy of a spring whose force stops growing at the limit, ½ K e² below it. Let E be
     the energy given to the device minus its dissipation plus this result. With b >= K T/2 + B and
@@ -165,7 +165,7 @@ class EnergyBalance:
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
-        slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
+        slack: Σ ½ (K + B/T) ‖δx‖² + ½ (K_r + B_r/T) ‖δφ‖², (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation and the energy
             released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
             per tick. With a coupling law, energy created by the environment is not included; it

@@ -30,7 +30,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.scene import SceneSource
 
-# Judgement of one version of a scene.
+# Judgement of one version of a scene
 
 MIN_SAVING = 0.05
 """Share of the cost that a simplification must save, without unit. On a busy machine a scene

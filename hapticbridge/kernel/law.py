@@ -9,13 +9,13 @@ tool in m, δ their steps within the time T in s. The six actuators of the scene
 inside MuJoCo's step; the functions here evaluate it afterwards, at the poses that resulted.
 
 A change of the gains during a run does work. With gains that change from tick to tick, the identity
-behind BC97 (6) becomes
+behind eq. (6) of Brown & Colgate (1997) becomes
 
-    Σ f_k·d_{k+1} + Σ ‖d_k‖²_{b/T} = Σ f_k·δx_k + Σ (terms >= 0) + ½‖p_{N+1}‖²_{K_N}
-                                     − ½‖p_1‖²_{K_1} − Σ W_k,
-    W_k = ½‖p_k‖²_{K_k − K_{k−1}},    p_k = h_k − x_{k−1} = e_{k−1} + d_k
+    Σ f_k·d_{k+1} + Σ (b/T) ‖d_k‖² = Σ f_k·δx_k + Σ (terms >= 0) + ½ K_N ‖p_{N+1}‖²
+                                     − ½ K_1 ‖p_1‖² − Σ W_k,
+    W_k = ½ (K_k − K_{k−1}) ‖p_k‖²,    p_k = h_k − x_{k−1} = e_{k−1} + d_k
 
-with d the steps of the handle. It holds if b ⪰ K_k T/2 + B_k in every tick. W_k is the energy by
+with d the steps of the handle. It holds if b >= K_k T/2 + B_k in every tick. W_k is the energy by
 which the spring grows between the steps of handle and tool. The command gives it to the device;
 softening the coupling takes it away. A change of B does no work, and the environment's balance (14)
 does not contain the gains. W is booked as ``energy.tuning_work``.

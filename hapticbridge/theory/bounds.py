@@ -23,7 +23,7 @@ from hapticbridge.theory.transfer import (
     together,
 )
 
-# Stability limit of a delayed coupling.
+# Stability limit of a delayed coupling
 
 
 def coupled_stability_limit(

@@ -15,7 +15,7 @@ from hapticbridge.errors import MechanicsError
 from hapticbridge.jit import compiled
 from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
 
-# Argument checks of the reference mechanics.
+# Argument checks of the reference mechanics
 
 MAX_STEPS = 10**8
 """Largest length of a run in steps: a day at 1 kHz, which still fits into memory."""

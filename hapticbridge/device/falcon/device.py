@@ -59,7 +59,7 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Measured timing of a Falcon.
+# Measured timing of a Falcon
 
 TIME = 0.1
 """Length of each of the two measurements in s."""

@@ -26,7 +26,7 @@ from hapticbridge.device.base import USUAL_TORQUE_LIMIT
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
-# Device types of Force Dimension's library.
+# Device types of Force Dimension's library
 
 ROTATION_ERROR = 1e-3
 """Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to

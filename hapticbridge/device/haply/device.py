@@ -40,7 +40,7 @@ from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Measured timing of the service.
+# Measured timing of the service
 
 TIME = 0.1
 """Length of each of the two measurements in s."""
