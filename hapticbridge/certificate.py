@@ -12,7 +12,8 @@ import numpy as np
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.parameters import SLACK_SHARE, RunParameters, checked_substeps
+from hapticbridge.kernel.law import SLACK_SHARE
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
 

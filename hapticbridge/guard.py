@@ -14,10 +14,10 @@ from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.registry import DRIVERS
 from hapticbridge.errors import DeviceError
+from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
-from hapticbridge.kernel.handle import handle_pose
+from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
-from hapticbridge.pose import canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
 # Limits of the wrench and of the run
@@ -234,10 +234,7 @@ def refuse_stretched_start(
         DeviceError: The message names the handle's distance from the grip, and the grip's position.
     """
     pose = state["pose"][0]
-    x, y, z = sample["position"][0].tolist()
-    quaternion = canonical(tuple(sample["quaternion"][0].tolist()))
-    handle, _ = handle_pose(state["run"][0], pose, (x, y, z), quaternion)
-    distance = float(np.linalg.norm(np.subtract(handle, pose["tool_position"])))
+    distance = direct(stretch_at, state[0], sample)(state[0], sample)
     force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
         raise DeviceError(

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
+import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property, update_wrapper
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
-import numba
+import llvmlite
+import mujoco
+import numpy as np
 import platformdirs
+
+from hapticbridge import machine_code
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 
@@ -27,18 +36,117 @@ def cache_folder() -> str:
         source = path.read_bytes()
         if b"hapticbridge.jit import" in source or path.parent.name == "kernel":
             digest.update(source)
-    base = numba.config.CACHE_DIR or platformdirs.user_cache_dir("hapticbridge", appauthor=False)
-    return str(Path(base) / digest.hexdigest()[:16])
+    usual = platformdirs.user_cache_dir("hapticbridge", appauthor=False)
+    return str(Path(os.environ.get("NUMBA_CACHE_DIR") or usual) / digest.hexdigest()[:16])
 
 
-def _compiled(function: _Function, *, nogil: bool) -> _Function:
-    outside = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = cache_folder()
-    try:
-        decorate = numba.njit(cache=True, nogil=nogil, error_model="numpy")
-        return cast(_Function, decorate(function))
-    finally:
-        numba.config.CACHE_DIR = outside
+@cache
+def _environment() -> str:
+    """Returns the rest of what decides a function's machine code, as text."""
+    numba = find_spec("numba")  # the version without an import
+    assert numba is not None and numba.origin is not None
+    files = Path(numba.origin).with_name("_version.py"), Path(machine_code.__file__)
+    versions = llvmlite.__version__, mujoco.__version__, np.__version__, sys.version
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    contents = tuple(file.read_bytes() for file in files)
+    return repr((contents, versions, settings, machine_code.processor()))
+
+
+class Deferred:
+    """Object of numba that is built when numba compiles its first caller, or Python calls it.
+
+    Args:
+        build: Returns the object.
+    """
+
+    def __init__(self, build: Callable[[], Any]) -> None:
+        self._build = build
+
+    @cached_property
+    def built(self) -> Any:
+        """The object of numba."""
+        return self._build()
+
+    @cached_property
+    def _numba_type_(self) -> Any:
+        """Type that numba sees in a caller: that of the object which was built."""
+        context = import_module("numba.core.registry").cpu_target.typing_context
+        built = self.built
+        context.refresh()  # building an intrinsic has registered it
+        return context.resolve_value_type(built)
+
+    def __call__(self, *arguments: object) -> Any:
+        """Calls the object of numba."""
+        return self.built(*arguments)
+
+
+class Compiled(Deferred):
+    """Function that numba compiles, or that was compiled before and is on disk.
+
+    Args:
+        function: The function in Python.
+        nogil: True to release the interpreter lock in calls from Python.
+    """
+
+    def __init__(self, function: Callable[..., object], *, nogil: bool) -> None:
+        super().__init__(lambda: self._decorated(is_cached=True))
+        update_wrapper(self, function)
+        self._function, self._nogil = function, nogil
+        self._direct: dict[tuple[machine_code.Kind, ...], Callable[..., Any]] = {}
+
+    def direct(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
+        """Returns the machine code for arguments of these types (``jit.direct``)."""
+        found = [machine_code.kind_of(argument) for argument in arguments]
+        kinds = tuple(kind for kind in found if kind is not None)
+        # the linker's rules for other systems are untested
+        if len(kinds) < len(found) or self._nogil or sys.platform != "linux":
+            return self._by_numba(arguments)
+        if kinds not in self._direct:
+            self._direct[kinds] = self._loaded(kinds, arguments) or self._by_numba(arguments)
+        return self._direct[kinds]
+
+    def _by_numba(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
+        return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
+
+    def _loaded(
+        self, kinds: tuple[machine_code.Kind, ...], arguments: tuple[object, ...]
+    ) -> Callable[..., Any] | None:
+        function = self._function
+        names = (function.__module__, function.__qualname__, *map(machine_code.name_of, kinds))
+        digest = hashlib.sha256(repr((names, _environment())).encode()).hexdigest()[:16]
+        path = Path(cache_folder()) / f"{function.__name__}-{digest}.o"
+        code = machine_code.read(path)
+        if code is None:
+            signature = _signature(arguments)
+            dispatcher = self._decorated(is_cached=False)  # a cached one prints no code
+            dispatcher.compile(signature)
+            found, ir = dispatcher.overloads[signature], dispatcher.inspect_llvm(signature)
+            result = str(found.signature.return_type)
+            code = machine_code.object_code(ir, found.fndesc.llvm_func_name, kinds, result)
+            machine_code.write(path, code)
+        try:
+            return machine_code.load(code, function.__name__) if code else None
+        except RuntimeError:
+            return None
+
+    def _decorated(self, *, is_cached: bool) -> Any:
+        numba = import_module("numba")
+        decorate = numba.njit(cache=is_cached, nogil=self._nogil, error_model="numpy")
+        with _decorating:
+            outside = numba.config.CACHE_DIR
+            numba.config.CACHE_DIR = cache_folder()
+            try:
+                return decorate(self._function)
+            finally:
+                numba.config.CACHE_DIR = outside
+
+
+_decorating = threading.Lock()
+"""Held while numba's setting of the cache folder is another one."""
+
+
+def _signature(arguments: tuple[object, ...]) -> tuple[Any, ...]:
+    return tuple(map(import_module("numba").typeof, arguments))
 
 
 def compiled(function: _Function) -> _Function:
@@ -50,25 +158,40 @@ def compiled(function: _Function) -> _Function:
     trips the guard. The lock is held because a tick that releases it for a microsecond may wait
     milliseconds to regain it.
     """
-    return _compiled(function, nogil=False)
+    return cast(_Function, Compiled(function, nogil=False))
 
 
 def compiled_for_threads(function: _Function) -> _Function:
     """Compiles like ``compiled``, but releases the interpreter lock: for whole runs in threads."""
-    return _compiled(function, nogil=True)
+    return cast(_Function, Compiled(function, nogil=True))
+
+
+def intrinsic(function: Callable[..., Any]) -> Any:
+    """Declares a function that writes LLVM code (``numba.extending.intrinsic``)."""
+    return Deferred(lambda: import_module("numba.extending").intrinsic(function))
+
+
+def external(symbol: str, signature: str) -> Any:
+    """Declares a C function for compiled callers, with a signature such as "void(intp, intp)"."""
+
+    def build() -> Any:
+        sigutils = import_module("numba.core.sigutils")
+        arguments, result = sigutils.normalize_signature(signature)
+        return import_module("numba.core.types").ExternalFunction(symbol, result(*arguments))
+
+    return Deferred(build)
 
 
 def direct(function: _Function, *arguments: object) -> _Function:
     """Returns a compiled function's machine code for arguments of these types, without calling it.
 
     It skips the dispatcher, which checks the types of all arguments in every call: 0.6 µs with
-    three structured arrays, while the call itself takes 0.2 µs.
+    three structured arrays, while the call itself takes 0.2 µs. If the machine code is on disk,
+    numba is not imported (``machine_code``).
 
     Args:
         function: Function from ``compiled``.
         *arguments: Examples of the arguments, for their types. The result must never be called with
             other types; nothing checks them.
     """
-    dispatcher = cast(numba.core.dispatcher.Dispatcher, function)
-    signature = tuple(numba.typeof(argument) for argument in arguments)
-    return cast(_Function, dispatcher.compile(signature))
+    return cast(_Function, cast(Compiled, function).direct(arguments))

@@ -13,14 +13,14 @@ import mujoco
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, SceneError, choices
-from hapticbridge.kernel.codes import WELD_NAME, Scheme, has_law, law_evaluations
-from hapticbridge.kernel.law import Gains
+from hapticbridge.kernel.codes import WELD_NAME, Scheme
+from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.scene import Scene
-from hapticbridge.scene.checks import check_massless_tool, check_metered
+from hapticbridge.scene.checks import check_metered
 from hapticbridge.scene.contacts import warn_of_contacts
-from hapticbridge.scene.handle import check_weldable, measured_weld
+from hapticbridge.scene.handle import measured_weld
 from hapticbridge.theory.compensation import (
     IMPLICIT_SHARE,
     MIDPOINT_SHARE,
@@ -31,7 +31,7 @@ from hapticbridge.theory.compensation import (
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A rendering method.
+    """A rendering method: all of it besides the steps of its scheme in the kernel.
 
     Attributes:
         name: Name for ``--method`` and the recording's metadata.
@@ -42,8 +42,11 @@ class Method:
         integrator: MuJoCo's integrator by its MJCF name.
         discretization: Discretisation of the coupling's damper in the bounds; ``none`` without a
             law.
-        has_extra_damping: True if the actuators get K h of extra damping, h the time step. It turns
-            the implicit integration of velocity into one of position too.
+        gains: Gains of the coupling's actuators.
+        check: Refuses a scene that the method cannot render, by model and name of the grip; None if
+            it renders any.
+        reach: Distance in m between surfaces at which a contact exists before it acts.
+        warns: True to warn of contacts that may create energy; False if the coupling does too.
         compensated_share: Share of K h that is subtracted from the requested damping because the
             integration adds it; no unit.
         added_share: Share of K h that the integration adds to the damping, subtracted or not; None
@@ -56,7 +59,10 @@ class Method:
     scheme: Scheme
     integrator: str
     discretization: str = "backward"
-    has_extra_damping: bool = False
+    gains: GainRule = implicit_gains
+    check: Callable[[mujoco.MjModel, str], None] | None = None
+    reach: float = 0.0
+    warns: bool = True
     compensated_share: float = 0.0
     added_share: float | None = None
 
@@ -73,33 +79,27 @@ class Method:
 
     def law_evaluations(self, substeps: int) -> int:
         """Returns the evaluations of the tool's wrench per tick."""
-        return law_evaluations(self.scheme, substeps)
+        return self.scheme.properties.law_evaluations(substeps)
 
     @property
     def has_law(self) -> bool:
         """True if the coupling law gives the wrench, so that the device condition proves safety."""
-        return has_law(self.scheme)
+        return self.scheme.properties.has_law
 
     @property
     def meters_inputs(self) -> bool:
         """True if the work of applied forces and moved mocap bodies is metered."""
-        return self.integrator != "RK4" and self.scheme != Scheme.MASSLESS
+        return self.integrator != "RK4" and self.has_coupling
 
     @property
     def has_coupling(self) -> bool:
         """True if an elastic coupling lies between handle and tool."""
-        return self.scheme != Scheme.MASSLESS
+        return self.scheme.properties.has_tool_mass
 
-    def gains(self, coupling: Coupling, timestep: float) -> tuple[Gains, Gains]:
-        """Returns the gains of the coupling's actuators, for forces and for torques."""
-        if self.scheme == Scheme.ZERO_ORDER_HOLD:
-            return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
-        if self.scheme not in (Scheme.IMPLICIT, Scheme.MIDPOINT):
-            return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        more = timestep if self.has_extra_damping else 0.0
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return (b, k, b + k * more), (br, kr, br + kr * more)
+    @property
+    def is_weld(self) -> bool:
+        """True if an equality constraint of MuJoCo is the coupling."""
+        return self.scheme == Scheme.WELD
 
     def law_coupling(self, coupling: Coupling, timestep: float) -> Coupling:
         """Returns the law's coupling for a requested one: B' = max(B − compensated_share K h, 0).
@@ -177,6 +177,7 @@ LOSSLESS_COUPLING = Method(
     hazard="",
     scheme=Scheme.MIDPOINT,
     integrator="discrete",
+    reach=REACH,
     compensated_share=MIDPOINT_SHARE,
     added_share=MIDPOINT_SHARE,
 )
@@ -264,10 +265,8 @@ def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
     Raises:
         SceneError: The message names the obstacle in the scene.
     """
-    if method.scheme == Scheme.MASSLESS:
-        check_massless_tool(model, grip, method.name)
-    if method.scheme == Scheme.WELD:
-        check_weldable(model, grip)
+    if method.check is not None:
+        method.check(model, grip)
     check_metered(model, method.integrator, method.name)
 
 
@@ -302,15 +301,15 @@ def prepare(
     for item in fields(Coupling):
         _ARGUMENTS.number(f"coupling {item.name.replace('_', ' ')}", getattr(coupling, item.name))
     check_scene(scene.model, scene.grip, method)
-    scene.set_weld(coupling if method.scheme == Scheme.WELD else None)
+    scene.set_weld(coupling if method.is_weld else None)
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
-    scene.set_reach(REACH if method.scheme == Scheme.MIDPOINT else 0.0)
-    if warns and method.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT):
+    scene.set_reach(method.reach)
+    if warns and method.warns:
         warn_of_contacts(scene.model, scene.grip, scene.path)
     step = period / substeps
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
-    effective = measured_weld(scene.model, scene.grip) if method.scheme == Scheme.WELD else None
+    effective = measured_weld(scene.model, scene.grip) if method.is_weld else None
     scene.reset()
     return effective
 
@@ -325,10 +324,9 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
         raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
-    if has_weld != (method.scheme == Scheme.WELD):
+    if has_weld != method.is_weld:
         raise SceneError(
-            f"method '{method.name}' requires {'a' if method.scheme == Scheme.WELD else 'no'} "
-            "weld to the handle"
+            f"method '{method.name}' requires {'a' if method.is_weld else 'no'} weld to the handle"
         )
     if has_weld:
         gains = -model.eq_solref[model.equality(WELD_NAME).id]

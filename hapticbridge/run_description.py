@@ -22,7 +22,6 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.recording import Attachment
@@ -244,7 +243,7 @@ def describe_run(
 
 def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
     """Returns a weld's measured coupling; None for other methods."""
-    if method.scheme != Scheme.WELD:
+    if not method.is_weld:
         return None
     return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
 

@@ -22,15 +22,13 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
 from hapticbridge.run_description import MODEL_ATTACHMENT
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
 
-COUPLING = Coupling(
-    stiffness=2400.0, damping=0.5, rotational_stiffness=2.4, rotational_damping=5e-4
-)
+COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 
 FLOAT_FIELDS = tuple(name for name in TICK_DTYPE.names or () if TICK_DTYPE[name].base.kind == "f")
 
@@ -134,53 +132,65 @@ def without_share(recording: Recording) -> NDArray[np.void]:
     return ticks
 
 
+SHEET = DeviceInfo(
+    name="scripted",
+    axes=AXES,
+    mass=0.1,
+    damping=2.0,
+    rotational_inertia=1e-4,
+    rotational_damping=2e-3,
+    force_limit=10.0,
+    torque_limit=0.5,
+    speed_limit=5.0,
+    delay=0.0,
+    is_real=False,
+)
+
+
 class ScriptedDevice:
-    """A device whose poses come from a function of the tick, and which keeps what it is sent."""
+    """A device whose poses, buttons and gaps come from its tick, and which keeps what it is sent.
+
+    Args:
+        pose: Position in m and quaternion (w, x, y, z) by tick.
+        buttons: Button bits by tick.
+        is_stale: Tells of a tick that has no new sample.
+        on_write: Called with the number of wrenches written, after each.
+        on_close: Called when it is closed.
+        strength: Force limit in N; the torque limit in N m is a twentieth of it.
+        sheet: Fields of the data sheet that differ from ``SHEET``.
+    """
 
     def __init__(
         self,
         pose: Callable[[int], Sequence[float]],
         *,
+        buttons: Callable[[int], int] = lambda _: 0,
+        is_stale: Callable[[int], bool] = lambda _: False,
         on_write: Callable[[int], None] | None = None,
         on_close: Callable[[], None] | None = None,
         strength: float = 10.0,
-        damping: float = 2.0,
+        **sheet: Any,
     ) -> None:
-        self.info = DeviceInfo(
-            name="scripted",
-            axes=AXES,
-            mass=0.1,
-            damping=damping,
-            rotational_inertia=1e-4,
-            rotational_damping=2e-3,
-            friction=None,
-            resolution=None,
-            force_limit=strength,
-            torque_limit=0.05 * strength,
-            speed_limit=5.0,
-            rate=None,
-            delay=0.0,
-            is_prescribed=False,
-            is_real=False,
-            duration=None,
-        )
+        limits = {"force_limit": strength, "torque_limit": 0.05 * strength}
+        self.info = replace(SHEET, **{**limits, **sheet})
         self.writes: list[NDArray[np.float64]] = []
         self.is_closed = False
-        self._pose = pose
-        self._on_write = on_write
-        self._on_close = on_close
-        self._tick = 0
+        self.tick = 0
+        self._pose, self._buttons, self._is_stale = pose, buttons, is_stale
+        self._on_write, self._on_close = on_write, on_close
 
     def start(self, period: float) -> NDArray[np.void]:
-        self._tick = 0
+        self.tick = 0
         sample = np.zeros(1, SAMPLE_DTYPE)
-        self._report(sample, 0)
+        self.report(sample, 0)
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        tick = self._tick
-        self._tick += 1
-        self._report(sample, tick)
+        tick = self.tick
+        self.tick += 1
+        if self._is_stale(tick):
+            return int(TickFlag.STALE_SAMPLE)
+        self.report(sample, tick)
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -193,11 +203,12 @@ class ScriptedDevice:
         if self._on_close is not None:
             self._on_close()
 
-    def _report(self, sample: NDArray[np.void], tick: int) -> None:
+    def report(self, sample: NDArray[np.void], tick: int) -> None:
+        """Writes the pose and the buttons of a tick."""
         pose = self._pose(tick)
         sample["position"][0] = pose[:3]
         sample["quaternion"][0] = pose[3:]
-        sample["buttons"] = 0
+        sample["buttons"] = self._buttons(tick)
 
 
 class SlowClock(SimulatedClock):

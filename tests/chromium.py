@@ -70,6 +70,11 @@ class Tab:
             time.sleep(0.1)
         return found
 
+    def press(self, key: str) -> None:
+        """Presses a key and lets it go."""
+        for kind in ("keyDown", "keyUp"):
+            self._ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
     def picture(self, path: Path) -> None:
         """Writes what the page shows, as PNG."""
         path.write_bytes(base64.b64decode(self._ask("Page.captureScreenshot")["data"]))

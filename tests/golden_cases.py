@@ -14,7 +14,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -22,12 +22,15 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from audit_cases import rewritten
+from audit_cases import ScriptedDevice, SlowClock, rewritten
 from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main, terminal
+from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
+from hapticbridge.device.force_dimension.dhd import VARIABLE
+from hapticbridge.device.transport import hid, usb
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -36,9 +39,6 @@ RUNS, AUDITS, MACHINE = (GOLDEN / f"{name}.json" for name in ("runs", "audits", 
 
 Pose = tuple[float, ...]
 Json = dict[str, Any]
-
-STALE_SAMPLE = 256
-"""Bit of a record's ``flags``, and what a device's ``read`` returns without a new sample."""
 
 DIGITS = 12
 """Hexadecimal digits of a digest: 48 bits. Two of some thousand differing columns collide with a
@@ -165,81 +165,21 @@ def broken(tick: int) -> Pose:
     return (x if tick < 150 else math.nan, *rest)
 
 
-class Scripted:
-    """A device whose poses, buttons and gaps come from its tick.
-
-    Args:
-        pose: Position in m and quaternion (w, x, y, z) by tick.
-        buttons: Button bits by tick.
-        stale: Whether a tick has no new sample.
-        lost: Tick from which the device is gone; None for never.
-        changes: Fields of the data sheet that differ from the simulated device's.
-    """
-
-    def __init__(
-        self,
-        pose: Callable[[int], Pose] = sway,
-        *,
-        buttons: Callable[[int], int] = lambda _: 0,
-        stale: Callable[[int], bool] = lambda _: False,
-        lost: int | None = None,
-        **changes: Any,
-    ) -> None:
-        self._inner = hb.open_device("simulated")
-        self.info = replace(self._inner.info, name="scripted", duration=None, **changes)
-        self._pose, self._buttons, self._stale, self._lost = pose, buttons, stale, lost
-        self._tick = 0
-        self.writes: list[NDArray[np.float64]] = []
-
-    def start(self, period: float) -> NDArray[np.void]:
-        sample = self._inner.start(period)
-        self._report(sample, 0)
-        return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        tick = self._tick
-        self._tick += 1
-        if self._lost is not None and tick >= self._lost:
-            raise hb.DeviceError("the device is gone")
-        if self._stale(tick):
-            return STALE_SAMPLE
-        self._report(sample, tick)
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.writes.append(wrench.copy())
-
-    def close(self) -> None:
-        self._inner.close()
-
-    def _report(self, sample: NDArray[np.void], tick: int) -> None:
-        pose = self._pose(tick)
-        sample["position"][0] = pose[:3]
-        sample["quaternion"][0] = pose[3:]
-        sample["buttons"] = self._buttons(tick)
+def lost(tick: int) -> Pose:
+    """As ``sway``, until the device is gone."""
+    if tick >= 150:
+        raise hb.DeviceError("the device is gone")
+    return sway(tick)
 
 
-class StallingClock(hb.SimulatedClock):
-    """Simulated time that skips deadlines before certain ticks."""
+class Scripted(ScriptedDevice):
+    """A scripted device with the simulated device's data sheet, but for what is changed in it."""
 
-    def __init__(self, stalls: Mapping[int, int]) -> None:
-        super().__init__()
-        self._stalls, self._count, self._step = stalls, 0, 0
-        self._late = 0
-
-    def start(self, period_ns: int) -> None:
-        super().start(period_ns)
-        self._step = period_ns
-
-    def wait(self) -> tuple[int, int, int]:
-        deadline, _, _ = super().wait()
-        skipped = self._stalls.get(self._count, 0)
-        self._count += 1
-        self._late += skipped * self._step
-        return deadline + self._late, self.now(), skipped
-
-    def now(self) -> int:
-        return super().now() + self._late
+    def __init__(self, pose: Callable[[int], Pose] = sway, **options: Any) -> None:
+        functions = {name: options.pop(name) for name in ("buttons", "is_stale") if name in options}
+        super().__init__(pose, **functions)
+        sheet = hb.open_device("simulated").info
+        self.info = replace(sheet, name="scripted", duration=None, **options)
 
 
 def command(bridge: hb.Bridge, asked: Command) -> None:
@@ -398,8 +338,8 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
     yield "clutch", Run(PEG, lambda: Scripted(buttons=_held(100, 200)), {"clutch": 0})
     yield "dead man", Run(PEG, lambda: Scripted(buttons=_held(50, 250, 1)), {"dead_man": 1})
     yield "reach", Run(PEG, Scripted, {"limits": {"reach": 0.012}})
-    yield "stale samples", Run(PEG, lambda: Scripted(stale=lambda tick: tick % 7 in (2, 3)))
-    yield "silence", Run(PEG, lambda: Scripted(stale=lambda tick: 100 <= tick < 250))
+    yield "stale samples", Run(PEG, lambda: Scripted(is_stale=lambda tick: tick % 7 in (2, 3)))
+    yield "silence", Run(PEG, lambda: Scripted(is_stale=lambda tick: 100 <= tick < 250))
     yield "leap of the device", Run(PEG, lambda: Scripted(jump))
     yield "trip: stretch", Run(WALL, lambda: Scripted(leave), {"limits": {"stretch": 0.05}})
     yield "trip: angle", Run("drawer", lambda: Scripted(turn), {"limits": {"angle": 1.0}})
@@ -412,10 +352,10 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
         ),
     )
     yield "trip: not a number", Run(PEG, lambda: Scripted(broken))
-    yield "trip: device lost", Run(PEG, lambda: Scripted(lost=150))
+    yield "trip: device lost", Run(PEG, lambda: Scripted(lost))
     yield (
         "skipped deadlines",
-        Run(PEG, Scripted, {"clock": lambda: StallingClock({60: 1, 120: 3, 200: 80})}),
+        Run(PEG, Scripted, {"clock": lambda: SlowClock({60: 1, 120: 3, 200: 80})}),
     )
     for method in METHODS:
         for is_ahead in (False, True):
@@ -511,7 +451,7 @@ TAMPERED = "commands, lossless"
 TICK = 120
 """The record that is changed."""
 
-NUMBERS = (
+NUMBERS = [
     "stiffness",
     "damping",
     "rotational_stiffness",
@@ -525,7 +465,7 @@ NUMBERS = (
     "ramp_ticks",
     "start_kinetic",
     "start_potential",
-)
+]
 """Metadata that are a number."""
 
 LISTS = ("axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start")
@@ -647,25 +587,7 @@ def audits(folder: Path) -> Json:
     }
 
 
-COMMANDS = (
-    "",
-    "run",
-    "audit",
-    "render",
-    "view",
-    "scenes",
-    "devices",
-    "check",
-    "stability",
-    "chart",
-    "doctor",
-    "export",
-    "compare",
-    "repair",
-    "zwidth",
-    "bound",
-    "identify",
-)
+COMMANDS = ("", *TABLE)
 """Commands whose help is frozen; the empty one is the program itself."""
 
 
@@ -682,51 +604,10 @@ def help_text(name: str) -> str:
     return "\n".join(line.rstrip() for line in words.getvalue().splitlines()) + "\n"
 
 
-_SHORT = "run point_mass --fast --duration 0.1"
-_ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5"
-SESSIONS = {
-    "run": (
-        f"{_SHORT} --record FOLDER/run.mcap",
-        f"{_SHORT} --stiffness 2000 --damping 1.5",
-        f"{_SHORT} --damping 0.5",
-        f"{_SHORT} --damping 3",
-        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
-        f"{_SHORT} --substeps 2",
-        f"{_SHORT} --method compensated",
-        f"{_SHORT} --method implicit",
-        f"{_SHORT} --method explicit",
-        f"{_SHORT} --method weld --stiffness 1000",
-        "run peg_in_hole --fast --duration 0.1 --method direct --contact-stiffness 5000",
-        "run drawer --fast --duration 0.1",
-        "run hammer --fast --duration 0.1",
-    ),
-    "audit": (
-        "run virtual_wall --fast --duration 0.2 --record FOLDER/wall.mcap",
-        f"{_SHORT} --stiffness 5000 --record FOLDER/stiff.mcap",
-        "audit FOLDER/wall.mcap",
-        "audit FOLDER/stiff.mcap",
-        "audit FOLDER/wall.mcap FOLDER/stiff.mcap FOLDER/missing.mcap",
-        "compare FOLDER/wall.mcap FOLDER/wall.mcap",
-        "export FOLDER/wall.mcap --format csv --out FOLDER/wall.csv",
-    ),
-    "zwidth": (
-        _ZWIDTH,
-        "zwidth --damping 2 --mass 1e9",
-        "zwidth --damping 2 --friction 0 --resolution 1e-5 --delay 1",
-        "zwidth --damping 2 --filter-time 0.001",
-    ),
-    "bound": (
-        "bound --stiffness 2000",
-        "bound --stiffness 2000 --damping 1",
-        "bound --stiffness 2000 --damping 0.5 --device-damping 2",
-        "bound --stiffness 2000 --damping 1.5 --device-damping 2",
-        "bound --stiffness 2400 --damping 3 --device-damping 2",
-        "bound --stiffness 5000 --damping 1 --device-damping 2",
-        "bound --stiffness 5000 --damping 3 --device-damping 2",
-    ),
-    "scenes": ("scenes", "scenes planar_peg", "scenes virtual_wall"),
-}
-"""Commands of each golden session, in order; FOLDER is a folder of its own."""
+SESSIONS = sorted(path.stem for path in (GOLDEN / "sessions").glob("*.txt"))
+"""Names of the golden sessions: commands in order, what they print, and their exit codes."""
+
+_PROMPT = "$ hapticbridge "
 
 
 def session_file(name: str) -> Path:
@@ -749,19 +630,30 @@ def consoles_of(width: int) -> Iterator[None]:
 
 
 def session_text(name: str, folder: Path) -> str:
-    """Returns a session as a terminal of 100 columns shows it, with exit codes, paths masked."""
-    shown, plain = [], {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    """Returns what the commands of a session's file print now, paths masked.
+
+    They run in a folder of their own, FOLDER, on a machine without devices, and a terminal of 100
+    columns shows them.
+    """
+    lines = session_file(name).read_text(encoding="utf-8").splitlines()
+    commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
+    plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb", VARIABLE: "/no/such.so"}
+    shown = []
     models = str(Path(hb.__file__).parents[1])
-    for command in SESSIONS[name]:
+    for command in commands:
         out, err = io.StringIO(), io.StringIO()
         with (
             consoles_of(100),
+            chdir(folder),
             patch.dict(os.environ, plain),
+            patch.object(usb, "on_the_bus", list),
+            patch.object(usb, "libusb", lambda: None),
+            patch.object(hid, "hid_api", lambda: None),
             redirect_stdout(out),
             redirect_stderr(err),
         ):
             code = main(command.replace("FOLDER", str(folder)).split())
         words = err.getvalue() + out.getvalue()
         words = words.replace(str(folder), "FOLDER").replace(models, "HOME")
-        shown += [f"$ hapticbridge {command}", *map(str.rstrip, words.splitlines()), f"({code})"]
+        shown += [_PROMPT + command, *map(str.rstrip, words.splitlines()), f"({code})"]
     return "\n".join(shown) + "\n"

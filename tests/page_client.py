@@ -68,16 +68,17 @@ class Hand:
 
     def send(self, label: str, **updates: Any) -> None:
         """Sends what a browser sends when an element is changed; unlike one, anything."""
-        self._say(type="GuiUpdateMessage", uuid=self.find(label)["uuid"], updates=updates)
+        self.say(type="GuiUpdateMessage", uuid=self.find(label)["uuid"], updates=updates)
 
     def introduce(self) -> None:
         """Sends the camera; before that a page listens to nobody."""
         zero, one = (0.0, 0.0, 0.0), {"fov": 1.0, "near": 0.01, "far": 10.0}
         pose = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": zero, "look_at": zero}
         size = {"image_height": 100, "image_width": 100, "up_direction": (0.0, 0.0, 1.0)}
-        self._say(type="ViewerCameraMessage", **one, **pose, **size)
+        self.say(type="ViewerCameraMessage", **one, **pose, **size)
 
-    def _say(self, **message: Any) -> None:
+    def say(self, **message: Any) -> None:
+        """Sends any message."""
         self.socket.send(msgspec.msgpack.encode(message))
 
 

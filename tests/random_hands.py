@@ -16,6 +16,32 @@ SINES, SLOWEST, FASTEST = 6, 0.2, 1.5  # per axis; Hz: what a hand does without 
 FADE = 0.5  # s
 
 
+HAND_RANGES = {
+    "mass": (0.05, 2.0),
+    "damping": (0.5, 50.0),
+    "stiffness": (10.0, 2000.0),
+    "rotational_inertia": (1e-4, 1e-2),
+    "rotational_damping": (2e-3, 0.2),
+    "rotational_stiffness": (0.1, 10.0),
+}
+"""Ranges of random hands in the units of ``Hand``: from two fingers that hardly hold to an arm that
+grips hard, around the measured arm of the defaults. Every hand in them is passive."""
+
+
+def random_hand(seed: int) -> Hand:
+    """Returns a random passive hand that depends only on the seed.
+
+    Every value is drawn independently, evenly in its logarithm, from its ``HAND_RANGES``.
+    """
+    generator = np.random.default_rng(seed)
+    return Hand(
+        **{
+            name: float(np.exp(generator.uniform(np.log(least), np.log(most))))
+            for name, (least, most) in HAND_RANGES.items()
+        }
+    )
+
+
 def smooth(phase: np.ndarray) -> np.ndarray:
     s = np.clip(phase, 0.0, 1.0)
     return np.asarray(s**3 * (10 - 15 * s + 6 * s**2))

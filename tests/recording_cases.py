@@ -53,12 +53,16 @@ def same(a: NDArray[np.void], b: NDArray[np.void]) -> bool:
     return a.dtype == b.dtype and a.tobytes() == b.tobytes()
 
 
-def chunk_ends(path: Path) -> list[tuple[int, int]]:
-    """End of each chunk record in the file, and the messages of all chunks up to it."""
+def chunks(path: Path) -> list[tuple[int, int, int]]:
+    """Start and end of each chunk record in the file, and its uncompressed size in bytes."""
     with path.open("rb") as stream:
         summary = SeekingReader(stream).get_summary()
     assert summary is not None
     return [
-        (index.chunk_start_offset + index.chunk_length, index.uncompressed_size)
-        for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
+        (
+            each.chunk_start_offset,
+            each.chunk_start_offset + each.chunk_length,
+            each.uncompressed_size,
+        )
+        for each in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset)
     ]

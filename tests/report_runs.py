@@ -20,7 +20,7 @@ from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
 
-LOOSE = Coupling(stiffness=2000, damping=0.2, rotational_stiffness=2, rotational_damping=5e-4)
+LOOSE = Coupling(2000, 0.2, 2, 5e-4)
 
 HARD_FLOOR = """<mujoco model="floor">
   <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0">

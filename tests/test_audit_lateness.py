@@ -39,9 +39,7 @@ def held_to_an_anvil(
     device = bench.opened(damping=2.0)
     if delay is not None:
         device.info = dataclasses.replace(device.info, delay=delay)
-    coupling = Coupling(
-        stiffness=stiffness, damping=0.05, rotational_stiffness=0.1, rotational_damping=1e-4
-    )
+    coupling = Coupling(stiffness, 0.05, 0.1, 1e-4)
     clock = bench.clock(2e-4)
     with Bridge(scene, device, coupling, recording=path, clock=clock) as bridge:
         bridge.run(duration=2.5)

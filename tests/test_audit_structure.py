@@ -11,10 +11,9 @@ from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.errors import RecordingError
 from hapticbridge.export import export
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
-from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.recording import Recording, read_recording
 from hapticbridge.scene.load import scene_path
 
 
@@ -70,34 +69,6 @@ def test_a_flag_that_its_record_contradicts_is_found_without_a_simulation(
     assert f"flag '{str(flag.name).lower()}' of tick 80" in report.reason
 
 
-def test_cut_file_is_judged_on_what_it_holds_and_says_so(tmp_path: Path) -> None:
-    whole, cut, mended = (tmp_path / name for name in ("whole.mcap", "cut.mcap", "mended.mcap"))
-    recorded(whole, "virtual_wall", duration=2.0)
-    content = whole.read_bytes()
-    cut.write_bytes(content[: int(len(content) * 0.9)])
-    report = audit(cut)
-    assert report.is_cut
-    assert report.verdict == "passive"
-    assert 0 < report.ticks < 2000
-    assert report.resimulation == "bit for bit"
-    repair(cut, mended)
-    after = audit(mended)
-    assert (after.verdict, after.is_cut, after.ticks) == ("passive", False, report.ticks)
-    assert after.events["repaired"] == 1
-
-
-def test_recording_without_a_tick_is_invalid(tap: Recording, folder: Path) -> None:
-    report = verdict_of(tap, folder, ticks=tap.ticks[:0])
-    assert (report.verdict, report.reason) == ("invalid", "the recording holds no tick")
-
-
-def test_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_text("hello")
-    with pytest.raises(RecordingError, match=r"x\.mcap is not an MCAP file"):
-        audit(path)
-
-
 def test_changed_input_event_is_found(tmp_path: Path) -> None:
     scene = tmp_path / "scene.xml"
     text = scene_path("point_mass").read_text()
@@ -141,12 +112,6 @@ def test_clock_times_are_free_as_long_as_they_run_forwards(tap: Recording, folde
     ticks["wake_ns"][7] += 1
     report = verdict_of(tap, folder, ticks=ticks)
     assert (report.verdict, report.tick, report.port) == ("invalid", 7, "wake_ns")
-
-
-def test_records_that_are_missing_before_the_stop_are_noticed(tap: Recording, folder: Path) -> None:
-    report = verdict_of(tap, folder, ticks=tap.ticks[:-10])
-    assert report.verdict == "invalid"
-    assert "the last record is of" in report.reason
 
 
 def test_a_recording_of_an_earlier_version_that_begins_in_mid_run_is_refused_in_one_sentence(

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from audit_cases import COMPONENTS, rewritten, verdict_of, without_model, without_share
+from golden_cases import LISTS, NUMBERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -100,22 +101,7 @@ def test_no_changed_count_or_flag_is_missed(
     assert verdict_of(tap, folder, ticks=ticks).verdict == "invalid"
 
 
-META_NUMBERS = (
-    "stiffness",
-    "damping",
-    "rotational_stiffness",
-    "rotational_damping",
-    "period_s",
-    "scale",
-    "force_scale",
-    "substeps",
-    "ramp_ticks",
-    "start_kinetic",
-    "start_potential",
-)
-
-
-@pytest.mark.parametrize("name", META_NUMBERS)
+@pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("factor", [1 + 1e-12, 11.0, -1.0, 1e300])
 def test_no_changed_parameter_is_missed(
     held: Recording, folder: Path, name: str, factor: float
@@ -125,9 +111,7 @@ def test_no_changed_parameter_is_missed(
     assert verdict_of(held, folder, meta=meta).verdict == "invalid"
 
 
-@pytest.mark.parametrize(
-    "name", ["axes", "device_origin", "handle_origin", "device_start", "handle_start", "tool_start"]
-)
+@pytest.mark.parametrize("name", LISTS)
 def test_no_changed_pose_of_the_start_is_missed(held: Recording, folder: Path, name: str) -> None:
     numbers = json.loads(held.meta[name])
     for index in range(len(numbers)):

@@ -21,12 +21,16 @@ from hapticbridge.recording import read_recording, repair
 PATIENCE = 60.0
 
 SCRIPT = """
-import sys
+import os, sys, time
 import hapticbridge as hb
 
 def tell(tick):
     if tick == 600:  # two chunks of the recording are full
-        print(bridge.session.stream.recorder.pid, flush=True)
+        child = os.fork() if sys.argv[2] == "SIGKILL" else 0
+        if sys.argv[2] == "SIGKILL" and not child:  # it keeps the recorder's pipe open
+            os.closerange(1, 3)
+            time.sleep(60)
+        print(bridge.session.stream.recorder.pid, child, flush=True)
 
 with hb.Bridge("virtual_wall", recording=sys.argv[1]) as bridge:
     summary = bridge.run(60.0, tell)
@@ -61,7 +65,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped
     try:
         for how in HOW:
             path = folder / f"{how}.mcap"
-            command = [sys.executable, "-c", SCRIPT, str(path)]
+            command = [sys.executable, "-c", SCRIPT, str(path), how]
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
             )
@@ -69,8 +73,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped
         for how, (path, process) in started.items():
             assert process.stdout is not None
             line = process.stdout.readline()
-            assert line.strip().isdigit(), line + process.stdout.read()
-            recorder = int(line)
+            assert line[:1].isdigit(), line + process.stdout.read()
+            recorder, child = map(int, line.split())
             if how == "both":
                 os.kill(recorder, signal.SIGKILL)
                 process.kill()
@@ -80,6 +84,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped
             limit = time.monotonic() + PATIENCE
             while not is_gone(recorder):
                 assert time.monotonic() < limit, "the recorder did not end"
+            if child:
+                os.kill(child, signal.SIGKILL)
             stopped[how] = Stopped(path, process.returncode, output, recorder)
         yield stopped
     finally:

@@ -66,25 +66,6 @@ def test_scales_and_axes_map_motion_in_and_wrench_out() -> None:
     assert np.linalg.norm(on_tool[:, :3], axis=1).max() > 0.1
 
 
-def test_equal_scales_keep_power_equal_on_both_sides() -> None:
-    limits = Limits(force=1e3, torque=50, ramp=0.0)
-    with fast(
-        "point_mass",
-        ScriptedDevice(sway, strength=1e3),
-        workspace=Workspace(scale=3.0),
-        limits=limits,
-    ) as bridge:
-        bridge.run(0.2)
-        rows = bridge.latest_records(200)
-    sent, held = rows["wrench_on_device"], rows["wrench_on_tool"]
-    for side, scene in (("device", "handle"),):
-        moved = np.diff(rows[f"{side}_position"], axis=0)
-        in_scene = np.diff(rows[f"{scene}_position"], axis=0)
-        np.testing.assert_allclose(
-            (sent[:-1, :3] * moved).sum(1), -(held[:-1, :3] * in_scene).sum(1), atol=1e-15
-        )
-
-
 def test_axes_written_with_six_digits_are_a_rotation_to_the_last_one(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     c = 0.707107

@@ -6,7 +6,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,21 +25,52 @@ from hapticbridge.recording import recorder as stream_module
 PATIENCE = 30.0
 
 
-def test_pose_that_is_not_finite_trips_with_zero_force_last(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    device = ScriptedDevice(lambda k: (np.nan, 0, 0, 1, 0, 0, 0) if k == 700 else sway(k))
-    with pytest.raises(SafetyTrip, match="tick 700: the device's pose") as caught:
-        recorded(path, "point_mass", device)
-    assert np.linalg.norm(device.writes[699]) > 0.01
-    assert all((wrench == 0).all() for wrench in device.writes[700:])
+def fail(number: int) -> None:
+    if number > 60:
+        raise DeviceError("unplugged")
+
+
+def unplugged(tick: int) -> tuple[float, ...]:
+    fail(tick + 1)
+    return sway(tick)
+
+
+def interfere(_bridge: Bridge, tick: int) -> None:
+    if tick == 60:
+        raise ZeroDivisionError("tick 60: the caller's own")
+
+
+FAILURES: dict[str, tuple[dict[str, Any], str]] = {
+    "pose": ({"pose": lambda k: (np.nan if k == 60 else 0, *sway(k)[1:])}, "the device's pose"),
+    "read": ({"pose": unplugged}, "unplugged"),
+    "write": ({"pose": sway, "on_write": fail}, "unplugged"),
+    "caller": ({"pose": sway}, "the caller's own"),
+}
+
+
+@pytest.mark.parametrize("name", FAILURES)
+def test_whatever_fails_zero_force_comes_first_and_the_recording_is_whole(
+    name: str, tmp_path: Path
+) -> None:
+    (given, words), path = FAILURES[name], tmp_path / "run.mcap"
+    device = ScriptedDevice(**given)
+    act = interfere if name == "caller" else None
+    with pytest.raises((SafetyTrip, ZeroDivisionError), match=f"tick 60: {words}") as caught:
+        recorded(path, "point_mass", device, on_tick=act)
+    assert np.linalg.norm(device.writes[59]) > 1e-3
+    assert len(device.writes) > 61  # zero force was tried after the failure
+    assert not any(wrench.any() for wrench in device.writes[60 + (name == "write") :])
     assert device.is_closed
-    records = caught.value.records
-    assert records["tick"].tolist() == list(range(700))
     recording = read_recording(path)
     assert not recording.is_cut and recording.digest == recording.computed_digest
-    assert [event["event"] for event in recording.events] == ["start", "trip", "stop"]
-    assert recording.events[1]["tick"] == 700
-    assert audit(path).verdict == "passive"
+    report = audit(path)
+    assert (report.verdict, report.ticks) == ("passive", len(recording.ticks))
+    if name in ("pose", "read"):
+        assert isinstance(caught.value, SafetyTrip)
+        assert caught.value.records["tick"].tolist() == list(range(60))
+        assert recording.ticks["tick"].tolist() == list(range(60))
+        assert [event["event"] for event in recording.events] == ["start", "trip", "stop"]
+        assert recording.events[1]["tick"] == 60 and words in recording.events[1]["reason"]
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (np.inf, 0, 0, 0), (0.1, 0, 0, 0)])
@@ -58,67 +88,6 @@ def test_last_second_of_records_comes_with_a_trip() -> None:
     assert caught.value.records["tick"].tolist() == list(range(500, 1500))
 
 
-def failing(message: str, tick: int, pose: Callable[[int], Any] = sway) -> Callable[[int], Any]:
-    def pose_or_fail(k: int) -> Any:
-        if k == tick:
-            raise DeviceError(message)
-        return pose(k)
-
-    return pose_or_fail
-
-
-def test_device_that_fails_to_read_gets_zero_force_and_the_recording_is_whole(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "run.mcap"
-    device = ScriptedDevice(failing("unplugged", 60))
-    with pytest.raises(SafetyTrip, match="tick 60: unplugged") as caught:
-        recorded(path, "point_mass", device)
-    assert (device.writes[-1] == 0).all()
-    assert device.is_closed
-    recording = read_recording(path)
-    assert not recording.is_cut
-    assert caught.value.records["tick"].tolist() == list(range(60))
-    assert [event["event"] for event in recording.events] == ["start", "trip", "stop"]
-    assert recording.events[1]["reason"] == "tick 60: unplugged"
-    assert (audit(path).verdict, len(recording.ticks)) == ("passive", 60)
-
-
-def test_device_that_fails_to_write_is_closed_and_the_recording_is_whole(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-
-    def fail(count: int) -> None:
-        if count > 60:
-            raise DeviceError("unplugged")
-
-    device = ScriptedDevice(sway, on_write=fail)
-    with pytest.raises(SafetyTrip, match="tick 60: unplugged"):
-        recorded(path, "point_mass", device)
-    assert len(device.writes) > 61  # zero force was tried after the failure
-    assert (device.writes[-1] == 0).all()
-    assert device.is_closed
-    recording = read_recording(path)
-    assert not recording.is_cut
-    assert recording.events[-1]["event"] == "stop"
-    assert "unplugged" in recording.events[-1]["reason"]
-    assert audit(path).verdict == "passive"
-
-
-def test_error_of_the_users_own_code_stops_the_run_the_same_way(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    device = ScriptedDevice(sway)
-
-    def fail(_bridge: Bridge, tick: int) -> None:
-        if tick == 40:
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        recorded(path, "point_mass", device, on_tick=fail)
-    assert (device.writes[-1] == 0).all()
-    assert not read_recording(path).is_cut
-    assert audit(path).ticks == 40
-
-
 def test_overruns_are_flagged_counted_and_pass_the_audit(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     clock = SlowClock({0: 2, 50: 1, 51: 7})
@@ -134,19 +103,25 @@ def test_overruns_are_flagged_counted_and_pass_the_audit(tmp_path: Path) -> None
     assert read_recording(path).events[-1]["skipped"] == 10
 
 
-def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "run.mcap"
-    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.064)
-    rings: list[Ring] = []
+@pytest.fixture
+def rings(monkeypatch: pytest.MonkeyPatch) -> list[Ring]:
+    """Rings in shared memory that a test has made."""
+    made: list[Ring] = []
     shared = Ring.shared
 
     def kept(capacity: int) -> Ring:
-        rings.append(shared(capacity))
-        return rings[-1]
+        made.append(shared(capacity))
+        return made[-1]
 
     monkeypatch.setattr(Ring, "shared", kept)
+    return made
+
+
+def test_full_ring_drops_rows_in_real_time_and_the_audit_calls_the_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rings: list[Ring]
+) -> None:
+    path = tmp_path / "run.mcap"
+    monkeypatch.setattr(stream_module, "RING_SECONDS", 0.064)
     device = ScriptedDevice(sway)
     with Bridge("point_mass", device, recording=path, clock=SlowClock({})) as bridge:
         recorder = bridge.session.stream.recorder
@@ -181,27 +156,14 @@ def test_full_ring_loses_nothing_in_simulated_time(
     assert audit(tmp_path / "run.mcap").ticks == 300
 
 
-def test_no_shared_memory_is_left_whatever_happens(tmp_path: Path) -> None:
-    def segments() -> set[str]:
-        return {ring.name for ring in made if ring.name and Path(ring.name).exists()}
-
-    made: list[Ring] = []
-    shared = Ring.shared
-    with pytest.MonkeyPatch.context() as patch:
-
-        def kept(capacity: int) -> Ring:
-            made.append(shared(capacity))
-            return made[-1]
-
-        patch.setattr(Ring, "shared", kept)
-        recorded(tmp_path / "run.mcap", "point_mass", duration=0.01)
-        assert len(made) == 1
-        assert not segments()
-        device = ScriptedDevice(still)
-        with pytest.raises(HapticBridgeError, match="does not exist"):
-            recorded(tmp_path / "no" / "run.mcap", "point_mass", device, duration=0.01)
-        assert device.is_closed
-        assert not segments()
+def test_no_shared_memory_is_left_whatever_happens(tmp_path: Path, rings: list[Ring]) -> None:
+    recorded(tmp_path / "run.mcap", "point_mass", duration=0.01)
+    assert len(rings) == 1
+    device = ScriptedDevice(still)
+    with pytest.raises(HapticBridgeError, match="does not exist"):
+        recorded(tmp_path / "no" / "run.mcap", "point_mass", device, duration=0.01)
+    assert device.is_closed
+    assert not any(Path(ring.name).exists() for ring in rings if ring.name)
 
 
 def test_a_run_whose_last_zero_force_cannot_be_sent_trips(tmp_path: Path) -> None:
@@ -221,8 +183,8 @@ def test_what_the_device_repeats_is_flagged_and_must_be_the_same(tmp_path: Path)
         is_honest = True
 
         def read(self, sample: NDArray[np.void]) -> int:
-            repeats, self._tick = self._tick % 3, self._tick + 1
-            self._report(sample, self._tick - (repeats if self.is_honest else 0))
+            repeats, self.tick = self.tick % 3, self.tick + 1
+            self.report(sample, self.tick - (repeats if self.is_honest else 0))
             return int(TickFlag.STALE_SAMPLE) if repeats else 0
 
     path = tmp_path / "run.mcap"

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
     NEEDED_SHARE,
     damping_for_delay,
@@ -18,14 +17,12 @@ from hapticbridge.certificate import (
     device_period,
     is_certified,
 )
-from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
-from hapticbridge.errors import DeviceError
 from hapticbridge.rendering import default_method
 
 T = 1e-3
-SPRING = Coupling(stiffness=1000.0, damping=0.0, rotational_stiffness=2.0, rotational_damping=0.0)
+SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
 
 
 def info(**changes: Any) -> DeviceInfo:
@@ -108,11 +105,3 @@ def test_a_real_device_of_unknown_damping_is_taken_for_one_of_a_tenth() -> None:
     assert default_coupling(turning, T).rotational_stiffness == pytest.approx(
         0.1 * simulated.rotational_stiffness
     )
-
-
-def test_a_real_device_refuses_simulated_time() -> None:
-    device = SimulatedDevice()
-    Bridge("point_mass", device, clock=SimulatedClock())
-    device.info = dataclasses.replace(device.info, is_real=True)
-    with pytest.raises(DeviceError, match=r"moves in real time.*--fast"):
-        Bridge("point_mass", device, clock=SimulatedClock())

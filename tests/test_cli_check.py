@@ -1,31 +1,32 @@
+"""``hapticbridge check``: counts, faults and cost of a scene, and a leaner scene."""
+
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from check_scenes import PLANTS, bench, line_of
+from cli_cases import Called
+from outside_scenes import CONTACT, hand_file, mjcf, scene_file
 
-from hapticbridge.cli import main
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import scene_path
 
 PLANT = {plant.kind: plant for plant in PLANTS}
 
 
-def facts_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, object]]:
-    code = main(["check", *arguments, "--json"])
-    facts: dict[str, object] = json.loads(capsys.readouterr().out)
-    return code, facts
+def facts_of(call: Called, *arguments: object) -> tuple[int, Any]:
+    code, out, _ = call("check", *arguments, "--json")
+    return code, json.loads(out)
 
 
-def test_check_says_what_costs_and_what_is_right(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> None:
     picture = tmp_path / "check.png"
-    assert main(["check", "virtual_wall", "--plot", str(picture)]) == 0
-    said = capsys.readouterr().out
+    code, out, _ = call("check", "virtual_wall", "--plot", picture)
+    assert code == 0
     for words in (
         "bodies               1, 1 of them moving",
         "pairs that can touch 1, 1 did",
@@ -36,99 +37,138 @@ def test_check_says_what_costs_and_what_is_right(
         "highest rate:",
         "nothing found",
     ):
-        assert words in said
+        assert words in out
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_check_names_line_and_change_of_a_fault(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) -> None:
     plant = PLANT["margin"]
     scene = bench(tmp_path / "scene", plant)
-    assert main(["check", str(scene)]) == 1
-    said = capsys.readouterr().out
-    file, line = line_of(plant, scene)
-    assert f" 1 margin  {file}:{line}, geom 'button'" in said
-    assert 'write: margin="0"' in said
-    assert "1 found" in said
-
-
-def test_json_holds_counts_faults_and_cost(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = bench(tmp_path / "scene", PLANT["keyframe"])
-    code, facts = facts_of(capsys, str(scene), "--rate", "2000", "--stiffness", "1000")
-    assert code == 1
-    assert facts["period_s"] == 0.0005
-    coupling, inventory, cost = facts["coupling"], facts["inventory"], facts["cost"]
-    assert isinstance(coupling, dict) and isinstance(inventory, dict) and isinstance(cost, dict)
-    assert coupling["stiffness"] == 1000
-    assert inventory["degrees_of_freedom"] == 14
-    assert {"free", "contact", "stages", "highest_rate", "by_rows"} <= cost.keys()
-    faults = facts["faults"]
-    assert isinstance(faults, list)
-    assert [fault["kind"] for fault in faults] == ["keyframe"]
-    assert faults[0]["place"]["file"] == "bench.xml"
-
-
-def test_scene_without_a_motion_follows_the_default_hand_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = bench(tmp_path / "scene")
     scene.with_suffix(".csv").unlink()
-    main(["check", str(scene)])
-    assert "motion: the default hand motion: slow, 1 cm about each axis" in capsys.readouterr().out
+    code, out, _ = call("check", scene)
+    file, line = line_of(plant, scene)
+    assert f" 1 margin  {file}:{line}, geom 'button'" in out
+    assert 'write: margin="0"' in out
+    assert (code, "1 found" in out) == (1, True)
+    assert "motion: the default hand motion: slow, 1 cm about each axis" in out
 
 
-def test_recording_is_a_motion_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_json_holds_counts_faults_and_cost(tmp_path: Path, call: Called) -> None:
+    scene = bench(tmp_path / "scene", PLANT["keyframe"])
+    code, facts = facts_of(call, scene, "--rate", 2000, "--stiffness", 1000)
+    assert (code, facts["period_s"], facts["coupling"]["stiffness"]) == (1, 0.0005, 1000)
+    assert facts["inventory"]["degrees_of_freedom"] == 14
+    assert {"free", "contact", "stages", "highest_rate", "by_rows"} <= facts["cost"].keys()
+    [fault] = facts["faults"]
+    assert (fault["kind"], fault["place"]["file"]) == ("keyframe", "bench.xml")
+
+
+def test_a_recording_is_a_motion_too(tmp_path: Path, call: Called) -> None:
     recording = tmp_path / "run.mcap"
-    run = ["run", "virtual_wall", "--fast", "--duration", "0.5", "--record", str(recording)]
-    assert main(run) == 0
-    capsys.readouterr()
-    code, facts = facts_of(capsys, "virtual_wall", "--motion", str(recording))
-    assert code == 0
-    motion = facts["motion"]
-    assert isinstance(motion, dict)
-    assert motion["seconds"] == pytest.approx(0.001 * (len(read_recording(recording).ticks) - 1))
+    call("run", "virtual_wall", "--fast", "--duration", 0.5, "--record", recording)
+    code, facts = facts_of(call, "virtual_wall", "--motion", recording)
+    length = 0.001 * (len(read_recording(recording).ticks) - 1)
+    assert (code, facts["motion"]["seconds"]) == (0, pytest.approx(length))
 
 
-def test_scale_and_workspace_decide_whether_the_motion_fits(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    narrow = ["check", "drawer", "--workspace", "0.1"]
-    assert main(narrow) == 1
-    assert "run it with --scale 2.0" in capsys.readouterr().out
-    assert main(["check", "drawer", "--workspace", "0.1", "--scale", "2.1"]) == 0
+def test_scale_and_workspace_decide_if_the_motion_fits(call: Called) -> None:
+    code, out, _ = call("check", "drawer", "--workspace", 0.1)
+    assert (code, "run it with --scale 2.0" in out) == (1, True)
+    assert call("check", "drawer", "--workspace", 0.1, "--scale", 2.1)[0] == 0
 
 
-def test_parameters_of_a_scene_are_checked_as_set(capsys: pytest.CaptureFixture[str]) -> None:
-    code, facts = facts_of(capsys, "peg_in_hole", "--set", "clearance=0.0005")
-    parameters, inventory = facts["parameters"], facts["inventory"]
-    assert code == 0
-    assert isinstance(parameters, dict) and isinstance(inventory, dict)
-    assert parameters["clearance"] == 0.0005
-    assert inventory["possible_pairs"] == 5
-    _, other = facts_of(capsys, "peg_in_hole")
-    before = other["inventory"]
-    assert isinstance(before, dict)
-    assert inventory["deepest"] != before["deepest"]
+def test_parameters_of_a_scene_are_checked_as_set(call: Called) -> None:
+    code, facts = facts_of(call, "peg_in_hole", "--set", "clearance=0.0005")
+    assert (code, facts["parameters"]["clearance"]) == (0, 0.0005)
+    assert facts["inventory"]["possible_pairs"] == 5
+    usual = facts_of(call, "peg_in_hole")[1]["inventory"]
+    assert facts["inventory"]["deepest"] != usual["deepest"]
 
 
 def test_check_leaves_no_log_of_mujocos_warnings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Called
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    folder = tmp_path / "scene"
-    scene = bench(folder, PLANT["mass ratio"], PLANT["solver iterations"])
-    assert main(["check", str(scene)]) == 1
+    scene = bench(tmp_path / "scene", PLANT["mass ratio"], PLANT["solver iterations"])
+    assert call("check", scene)[0] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
-def test_scene_of_somebody_else_in_another_folder_is_read_where_it_lies(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_copy_of_a_scene_in_another_folder_is_read_where_it_lies(
+    tmp_path: Path, call: Called
 ) -> None:
     copy = tmp_path / "round_peg"
     shutil.copytree(scene_path("round_peg").parent, copy)
-    code, facts = facts_of(capsys, str(copy / "round_peg.xml"))
+    code, facts = facts_of(call, copy / "round_peg.xml")
+    assert (code, facts["scene"]) == (0, str(copy / "round_peg.xml"))
+
+
+RIVETS = "".join(
+    f'<geom name="rivet_{k}" size="0.002" pos="{0.01 * k} 0.1 0" contype="0" conaffinity="0"/>'
+    for k in range(300)
+)
+OPTION = (
+    '<option timestep="0.001" gravity="0 0 0" integrator="discrete" cone="elliptic">'
+    '<flag diagexact="enable"/></option>'
+)
+TOOL = f"""<body name="tool"><joint name="rail" type="slide" axis="0 0 1"/>
+  <geom name="ball" size="0.01" mass="0.05" {CONTACT}/><site name="tip"/></body>"""
+WALL = f'<geom name="wall" type="box" size="0.03 0.03 0.01" pos="0 0 -0.025" {CONTACT}/>'
+
+
+@pytest.fixture
+def studded(tmp_path: Path) -> tuple[str, ...]:
+    """A tool on a rail before a wall with 300 rivets that are only seen, and its hand's motion."""
+    scene = scene_file(tmp_path, mjcf(OPTION, body=TOOL, world=WALL + RIVETS))
+    hand = hand_file(tmp_path, [(0.2, (0.0, 0.0, -0.008)), (0.2, (0.0, 0.0, 0.0))])
+    return str(scene), "--grip", "tip", "--motion", str(hand)
+
+
+def test_check_writes_a_leaner_scene_that_runs(
+    studded: tuple[str, ...], tmp_path: Path, call: Called
+) -> None:
+    lean, picture, table = (tmp_path / name for name in ("lean.xml", "lean.png", "tried.csv"))
+    code, out, _ = call("check", *studded, "--write", lean, "--plot", picture, "--table", table)
     assert code == 0
-    assert facts["scene"] == str(copy / "round_peg.xml")
+    run = f"hapticbridge run {lean} --grip tip"
+    for words in ("What could go", "nothing only seen", "may go with the picture", f"next: {run}"):
+        assert words in out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert table.read_text(encoding="utf-8").startswith("step,name,verdict")
+    assert "rivet" not in lean.read_text(encoding="utf-8")
+    assert call(*run.split()[1:], "--fast", "--duration", 0.2)[0] == 0
+
+
+def test_the_json_holds_what_was_tried(studded: tuple[str, ...], call: Called) -> None:
+    code, facts = facts_of(call, *studded, "--lean", "--budget", 0.5)
+    lean = facts["lean"]
+    assert (code, lean["budget_jnd"], lean["written"]) == (0, 0.5, None)
+    assert lean["result"]["felt_jnd"] <= 0.5
+    alone = {trial["name"]: trial for trial in lean["alone"]}
+    assert alone["nothing only seen"]["felt_jnd"] < 1e-6
+    assert alone["no friction"]["environment"] == "strict"
+
+
+def test_bad_input_is_refused_before_anything_is_run(
+    studded: tuple[str, ...], tmp_path: Path, call: Called
+) -> None:
+    for extra, words in (
+        ("--lean --budget -1", "budget"),
+        ("--lean --budget nan", "budget"),
+        (f"--write {studded[0]}", "is a file of the scene itself"),
+        (f"--write {tmp_path}/lean.txt", "must end in .xml"),
+        (f"--table {tmp_path}/tried.txt", "must end in .csv"),
+        (f"--table {tmp_path}/scene.csv", "taken for the hand's motion in 'scene.xml'"),
+        (f"--write {tmp_path}/lean.xml --table {tmp_path}/lean.csv", "motion in 'lean.xml'"),
+    ):
+        code, out, err = call("check", *studded, *extra.split())
+        assert (code, out) == (2, "")
+        assert words in err
+
+
+def test_a_scene_that_must_be_mended_first_is_not_made_leaner(
+    studded: tuple[str, ...], tmp_path: Path, call: Called
+) -> None:
+    scene_file(tmp_path, mjcf(OPTION, body=TOOL, world=WALL.replace("-0.025", "-0.015")))
+    code, _, err = call("check", *studded, "--lean")
+    assert (code, "what could go cannot be said: the tool starts" in err) == (1, True)

@@ -1,3 +1,5 @@
+"""``hapticbridge devices``: devices that are plugged in, access to them, and what helps."""
+
 from __future__ import annotations
 
 import json
@@ -12,7 +14,7 @@ from emulated.pid_model import PidStick
 
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
-from hapticbridge.device.discovery import RULES_FILE, plugged_devices, udev_rules
+from hapticbridge.device.discovery import plugged_devices, udev_rules
 from hapticbridge.device.driver import (
     RULES_COMMAND,
     Driver,
@@ -22,12 +24,10 @@ from hapticbridge.device.driver import (
 )
 from hapticbridge.device.force_dimension.dhd import VARIABLE
 from hapticbridge.device.haply import device as haply
-from hapticbridge.device.pid import device as effects
-from hapticbridge.device.registry import DRIVERS, all_drivers
+from hapticbridge.device.registry import all_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_bus
 from hapticbridge.device.transport import usb as usb_search
-from hapticbridge.device.watchdog import watchdog_time
 from hapticbridge.errors import DeviceError
 
 
@@ -78,49 +78,6 @@ def test_what_a_device_calls_itself_cannot_steer_a_terminal() -> None:
     assert (plugged.name, plugged.serial) == ("a\ufffd[31mb\ufffd", "\ufffd1\ufffd2")
 
 
-def test_devices_never_fails_on_a_machine_without_usb(
-    call: Called, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(usb_bus, "BUS", tmp_path / "no" / "bus")
-    monkeypatch.setattr(usb_search, "libusb", lambda: None)
-    monkeypatch.setattr(hid_search, "hid_api", lambda: None)
-    code, out, err = call("devices")
-    assert (code, err) == (0, "")
-    for family in all_drivers():
-        assert f"{family.name}: {family.about}" in out
-    assert "none; 'simulated' and 'trajectory:FILE' need none" in out
-    assert "hidapi cannot be loaded, so HID devices are not seen" in out
-
-
-def test_devices_runs_on_this_machine_whatever_it_has(call: Called) -> None:
-    code, out, _ = call("devices", "--json")
-    facts = json.loads(out)
-    assert code == 0
-    assert [family["name"] for family in facts["supported"]] == list(DRIVERS)
-    assert facts["plugged"] == json.loads(json.dumps([vars_of(d) for d in plugged_devices()]))
-
-
-def test_who_stands_still_reads_what_becomes_of_each_devices_force(call: Called) -> None:
-    code, out, _ = call("devices")
-    assert code == 0
-    told = {family.name: family.on_stall for family in all_drivers()}
-    assert [name for name, words in told.items() if not words] == ["spacemouse"]  # has no force
-    shown = " ".join(out.split())
-    for words in filter(None, told.values()):
-        assert f"if this machine stands still: {words}" in shown
-    # the times are those that are asked for
-    asked = f"after {1e3 * watchdog_time(1e-3):g} ms"
-    assert asked in told["rawhid"] and asked in told["forcedimension"]
-    slow = effects.LIFE * effects.RESTART_REPORTS * len(effects.ANGLES) * effects.SLOWEST_INTERVAL
-    for life in (effects.LIFE * effects.RESTART, slow):
-        assert f"{life:g} s" in told["pid"]
-    assert "stays on" in told["falcon"]
-
-
-def vars_of(device: FoundDevice) -> dict[str, object]:
-    return {name: getattr(device, name) for name in FoundDevice.__dataclass_fields__}
-
-
 def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
     call: Called, bus: Path
 ) -> None:
@@ -165,24 +122,6 @@ def test_it_says_what_to_do_next(
     assert words in out
     assert ("udevadm" in out) is (RULES_COMMAND in (plugged[0].problem or ""))
     assert f"rawhid: {plugged[0]}".replace("\x1b", "�") in out
-
-
-def test_the_rules_name_every_product_once_and_sort_before_the_seat(call: Called) -> None:
-    code, out, _ = call("devices", "--udev-rules")
-    assert (code, out) == (0, udev_rules())
-    rules = [line for line in out.splitlines() if line and not line.startswith("#")]
-    assert len(rules) == len(set(rules)) == sum(len(family.ids) for family in all_drivers())
-    assert all(rule.endswith('TAG+="uaccess"') for rule in rules)
-    for family in all_drivers():
-        for usb_id in family.ids:
-            if family.transport == "hid":
-                match = f'SUBSYSTEM=="hidraw", KERNELS=="*:{str(usb_id).upper()}.*"'
-            else:
-                vendor, product = str(usb_id).split(":")
-                match = f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
-            assert sum(match in rule for rule in rules) == 1
-    assert Path(RULES_FILE).name < "73-seat-late.rules"
-    assert RULES_FILE in out
 
 
 def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus: Path) -> None:

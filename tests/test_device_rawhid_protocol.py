@@ -31,9 +31,29 @@ states = st.builds(
     protocol.State, u8, u16, u16, st.integers(0, 2**32 - 1), st.tuples(*[single] * 12), u16
 )
 
+
+def sealed(body: bytes) -> bytes:
+    return body + struct.pack("<H", crc(body))
+
+
+def state_frame(state: protocol.State) -> bytes:
+    """Returns a device's state frame, by the document."""
+    head = 0x48, 1, 0x53, state.status, state.sequence, state.buttons, state.time_us
+    return sealed(struct.pack("<BBBBHHI12fH", *head, *state.numbers, state.echo))
+
+
+def sheet_frames(sequence: int, numbers: protocol.Numbers, name: str) -> tuple[bytes, bytes]:
+    """Returns both pages of a device's sheet; the name is truncated to 54 bytes in UTF-8."""
+    text = name.encode()[:54].decode(errors="ignore").encode()
+    return (
+        sealed(struct.pack("<BBBBHH11f10x", 0x48, 1, 0x44, 0, sequence, *numbers)),
+        sealed(struct.pack("<BBBBHH54s", 0x48, 1, 0x44, 1, sequence, 0, text)),
+    )
+
+
 WRITTEN = {
     "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
-    "State 258": protocol.state_frame(
+    "State 258": state_frame(
         protocol.State(
             protocol.Status.ENABLED,
             258,
@@ -44,12 +64,12 @@ WRITTEN = {
         )
     ),
     "Ask 1": protocol.ask_frame(1, 0),
-    "Sheet, page 0": protocol.sheet_frames(
+    "Sheet, page 0": sheet_frames(
         1, protocol.Numbers(1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4), ""
     )[0],
-    "Sheet, page 1": protocol.sheet_frames(
-        2, protocol.Numbers(1, *[NAN] * 11), "one-axis capstan paddle"
-    )[1],
+    "Sheet, page 1": sheet_frames(2, protocol.Numbers(1, *[NAN] * 11), "one-axis capstan paddle")[
+        1
+    ],
 }
 
 
@@ -122,7 +142,7 @@ def test_the_worked_sheet_holds_its_numbers_where_the_document_says() -> None:
 
 @given(states)
 def test_any_state_survives_a_frame(state: protocol.State) -> None:
-    assert protocol.decoded(protocol.state_frame(state)) == state
+    assert protocol.decoded(state_frame(state)) == state
 
 
 @given(
@@ -132,8 +152,7 @@ def test_any_state_survives_a_frame(state: protocol.State) -> None:
 )
 def test_any_sheet_survives_its_frames(axes: int, values: list[float], name: str) -> None:
     numbers, title = (
-        protocol.decoded(frame)
-        for frame in protocol.sheet_frames(9, protocol.Numbers(axes, *values), name)
+        protocol.decoded(frame) for frame in sheet_frames(9, protocol.Numbers(axes, *values), name)
     )
     assert isinstance(numbers, protocol.Numbers)
     assert isinstance(title, str)
@@ -163,14 +182,14 @@ def test_whatever_passes_the_check_is_read_without_a_crash(body: bytes) -> None:
 
 @given(states, st.integers(0, 64 * 8 - 1), st.integers(0, 64 * 8 - 1))
 def test_one_or_two_flipped_bits_never_pass(state: protocol.State, first: int, second: int) -> None:
-    frame = bytearray(protocol.state_frame(state))
+    frame = bytearray(state_frame(state))
     for bit in {first, second}:
         frame[bit // 8] ^= 1 << bit % 8
     assert protocol.decoded(bytes(frame)) is None
 
 
 def test_a_frame_of_another_version_is_told_from_noise() -> None:
-    body = bytearray(protocol.state_frame(protocol.State(0, 0, 0, 0, (0.0,) * 12, 0))[:62])
+    body = bytearray(state_frame(protocol.State(0, 0, 0, 0, (0.0,) * 12, 0))[:62])
     body[1] = 2
     frame = bytes(body) + struct.pack("<H", crc(bytes(body)))
     assert (protocol.version_of(frame), protocol.decoded(frame)) == (2, None)
@@ -181,7 +200,7 @@ def test_a_frame_of_another_version_is_told_from_noise() -> None:
 def test_a_state_that_is_not_finite_says_so(value: float) -> None:
     for place in range(12):
         numbers = tuple(value if i == place else 0.0 for i in range(12))
-        state = protocol.decoded(protocol.state_frame(protocol.State(0, 0, 0, 0, numbers, 0)))
+        state = protocol.decoded(state_frame(protocol.State(0, 0, 0, 0, numbers, 0)))
         assert isinstance(state, protocol.State)
         assert not state.is_finite
 

@@ -16,9 +16,9 @@ from cli_cases import Called
 from recording_cases import EPOCH, META, random_rows, write
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import Hdf5Sink, export, sidecar_of
+from hapticbridge.export import export, sidecar_of
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.recording import open_recording, reader
+from hapticbridge.recording import reader
 
 h5py: Any = importlib.import_module("h5py")
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -159,21 +159,26 @@ def test_file_that_exists_is_kept_unless_it_may_be_replaced(recording: Path, cal
     assert len(target.read_text().splitlines()) == COUNT + 1
 
 
-def test_hdf5_keeps_no_more_chunks_than_it_writes(recording: Path, tmp_path: Path) -> None:
+def test_hdf5_keeps_no_more_chunks_than_it_writes(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its own cache of 8 MB a column takes half a gigabyte before memory stays constant."""
-    sink = Hdf5Sink(tmp_path / "a.h5", open_recording(recording))
-    caches = [data.id.get_access_plist().get_chunk_cache()[1] for _, data in sink._columns]
-    sink.close()
+    caches: list[int] = []
+
+    class File(h5py.File):  # type: ignore[misc] # h5py has no types
+        def close(self) -> None:
+            columns = self["ticks"].values() if self else ()
+            caches.extend(data.id.get_access_plist().get_chunk_cache()[1] for data in columns)
+            super().close()
+
+    monkeypatch.setattr(h5py, "File", File)
+    export(recording, "hdf5")
     assert len(caches) == TICK_DTYPE.itemsize // 8
     assert sum(caches) < 10e6
 
 
-def test_a_recording_is_never_replaced_by_its_export(recording: Path, call: Called) -> None:
+def test_a_recording_is_never_replaced_by_its_export(recording: Path) -> None:
     before = recording.read_bytes()
-    for name in ("run.mcap", "run.parquet", "run"):
-        target = recording.with_name(name)
-        code, _, err = call("export", recording, "--format", "csv", "--out", target, "--overwrite")
-        assert (code, "must end in .csv" in " ".join(err.split())) == (2, True)
     # whatever it is called, and whichever way leads to it
     odd, link = recording.with_name("odd.CSV"), recording.with_name("link.h5")
     odd.write_bytes(before)
@@ -236,33 +241,3 @@ def test_a_piece_is_cut_where_deadlines_were_not_where_ticks_are_counted(tmp_pat
     write(tmp_path / "late.mcap", rows)
     done = export(tmp_path / "late.mcap", "csv", span=(0.3, 0.56))
     assert from_csv(done.files[0])[0]["tick"].tolist() == list(range(40, 59))
-
-
-def test_what_cannot_be_exported_is_refused_and_leaves_no_file(recording: Path) -> None:
-    foreign = recording.with_name("foreign.mcap")
-    foreign.write_bytes(b"nothing")
-    nowhere = recording.parent / "no" / "out.parquet"
-    ends = "no tick was due from 7 s to 8 s; the recording ends at 0.15 s"
-    table: list[tuple[Callable[[], object], str]] = [
-        (lambda: export(recording, "csv", span=(0.1, 0.1)), "from 0.1 s to 0.1 s is empty"),
-        (lambda: export(recording, "csv", span=(0.2, 0.1)), "its end must be later"),
-        (lambda: export(recording, "csv", span=(math.nan, 0.1)), "is empty"),
-        (lambda: export(recording, "csv", span=(7.0, 8.0)), ends),
-        (lambda: export(recording, "parquet", nowhere), r"the folder .* does not exist"),
-        (lambda: export(recording, "xls"), r"'xls' is unknown.*'csv', 'hdf5', 'parquet'"),
-        (lambda: export(foreign, "csv"), "not an MCAP file"),
-    ]
-    for call, message in table:
-        with pytest.raises(RecordingError, match=message):
-            call()
-    assert {path.name for path in recording.parent.iterdir()} == {"run.mcap", "foreign.mcap"}
-
-
-def test_the_command_line_cuts_and_tells_the_marks(recording: Path, call: Called) -> None:
-    code, out, _ = call("export", recording, "--format", "csv", "--from", "0.05", "--to", "0.12")
-    assert code == 0
-    assert "70 ticks, 1 events" in " ".join(out.split())
-    assert "marks at 0.000 s, 0.100 s" in out
-    arguments = ("--format", "csv", "--from", "0.05", "--overwrite", "--json")
-    told = json.loads(call("export", recording, *arguments)[1])
-    assert (told["ticks"], told["marks"]) == (101, [0.0, 0.1])

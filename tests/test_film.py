@@ -182,27 +182,3 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
     monkeypatch.setenv("MUJOCO_GL", "disable")
     with pytest.raises(HapticBridgeError, match="MUJOCO_GL=disable does not work"):
         still(sway, Shot())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("a.gif",), "neither a picture nor a film"),
-        (("nowhere/a.png",), "folder does not exist"),
-        (("a.mp4", "--at", "0.1"), "a time goes with a picture"),
-        (("a.png", "--speed", "0.1"), "go with a film"),
-        (("a.png", "--fps", "60"), "go with a film"),
-        (("a.mp4", "--speed", "0"), "speed is 0"),
-        (("a.mp4", "--start", "2", "--stop", "1"), "stop is 1 s, not after 2 s"),
-        (("a.png", "--at", "-1"), "time is -1 s"),
-        (("a.png", "--width", "17"), "even number"),
-        (("a.png", "--height", "0"), "height is 0"),
-        (("a.mp4", "--fps", "0"), "fps is 0"),
-    ],
-)
-def test_an_impossible_shot_is_refused_in_a_sentence(
-    arguments: tuple[str, ...], told: str, sway: Path, call: Called, tmp_path: Path
-) -> None:
-    code, _, err = call("render", sway, tmp_path / arguments[0], *arguments[1:])
-    assert code == 2
-    assert told in err

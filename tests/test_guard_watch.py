@@ -207,12 +207,12 @@ def test_a_device_that_moved_before_the_first_tick_finds_the_coupling_unstretche
     away = [0.0] + [0.05] * 20
     device = ScriptedDevice(lambda k: (away[min(k, 20)], 0, 0, 1, 0, 0, 0))
     device.start(1e-3)
-    device._tick = 5
+    device.tick = 5
     start = device.start
 
     def started(period: float) -> NDArray[np.void]:
         sample = start(period)
-        device._tick = 1  # by the first tick it is 50 mm away
+        device.tick = 1  # by the first tick it is 50 mm away
         return sample
 
     device.start = started  # type: ignore[method-assign]
@@ -272,7 +272,7 @@ def test_a_run_that_is_told_to_end_does_not_wait_for_rest(
     plain = device.read
 
     def read(sample: NDArray[np.void]) -> int:
-        if is_stopped and device._tick == 20:
+        if is_stopped and device.tick == 20:
             os.kill(os.getpid(), signal.SIGINT)
         return plain(sample)
 
@@ -281,7 +281,7 @@ def test_a_run_that_is_told_to_end_does_not_wait_for_rest(
         if is_stopped:
             summary = bridge.run(0.01)
             assert (summary.stopped_by, summary.ticks) == ("signal", 0)
-            assert device._tick < 100
+            assert device.tick < 100
         else:
             with pytest.raises(SafetyTrip, match="hold it still"):
                 bridge.run(0.01)

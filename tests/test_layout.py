@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "hapticbridge"
+TESTS = Path(__file__).parent
+PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "lazy", "record", "signals", "units"),
+    ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
     ("arguments", "clock", "coupling", "files", "pose"),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),
@@ -83,6 +84,14 @@ def test_concepts_do_not_import_each_other_in_a_circle() -> None:
 def test_the_audit_never_imports_the_bridge() -> None:
     for path in (PACKAGE / "audit").glob("*.py"):
         assert not {"bridge", "session", "options"} & imported_concepts(path), path.name
+    for name in (
+        "motion",
+        "wrench_limits",
+        "energy",
+    ):  # a second opinion has an arithmetic of its own
+        modules = imported_modules(PACKAGE / "audit" / f"{name}.py")
+        others = {module for module in modules if not module.startswith("hapticbridge.audit")}
+        assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.record"}, name
 
 
 def test_the_core_never_imports_the_lab() -> None:
@@ -105,6 +114,48 @@ def test_a_package_names_modules_that_exist() -> None:
             place = init.parent.joinpath(*name.split("."))
             if not (place.is_dir() or place.with_suffix(".py").is_file()):
                 offences.append(f"{init.parent.name} names {name}")
+    assert not offences
+
+
+def private_names(source: str) -> list[str]:
+    """Returns the private names that a test reads, of other objects than its own."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and re.match("_[^_]", node.attr):
+            owner = ast.unparse(node.value)
+            if owner not in {"self", "cls", "super()"} and node.attr not in PUBLIC:
+                found.append(f"{owner}.{node.attr}")
+        elif isinstance(node, ast.ImportFrom) and "hapticbridge" in (node.module or ""):
+            found += [each.name for each in node.names if each.name.startswith("_")]
+    return found
+
+
+PUBLIC = {"_exit", "_replace", "_asdict", "_fields", "_fields_", "_make"}
+"""Names of the standard library that are public although they begin with an underscore."""
+
+
+WITH_PRIVATE_NAMES = {
+    "test_check_lean.py",
+    "test_device_pid.py",
+    "test_device_rawhid.py",
+    "test_device_simulated.py",
+    "test_device_transport_hid.py",
+    "test_device_transport_usb.py",
+    "test_kernel.py",
+    "test_lossless.py",
+}
+"""Tests that still read one."""
+
+
+def test_no_test_reads_a_private_name() -> None:
+    examples = "device._link.close()\nfrom hapticbridge.jit import _cache"
+    assert set(private_names(examples)) == {"device._link", "_cache"}
+    offences = [
+        f"{path.name}: {name}"
+        for path in TESTS.rglob("*.py")
+        if path.name not in WITH_PRIVATE_NAMES
+        for name in private_names(path.read_text(encoding="utf-8"))
+    ]
     assert not offences
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import pytest
@@ -33,7 +33,7 @@ def scene() -> Scene:
     ("values", "message"),
     [
         ({"rate": 0.5}, "rate is 0.5 Hz; it must be 1 to 1e+06"),
-        ({"substeps": 0}, "substeps"),
+        *(({"substeps": number}, "substeps is") for number in (0, 2.5, 101)),
         ({"substeps": 2, "method": "lossless"}, "so it must be 1"),
         ({"method": "magic"}, "no method is called 'magic'; methods: "),
         ({"controller": "magic"}, "choices: 'damper', 'environment', 'off'"),
@@ -77,7 +77,8 @@ def test_a_setup_holds_the_choices_that_were_left_open(scene: Scene) -> None:
     setup = RunSetup.resolve(scene, REAL, None, BridgeOptions(), RealClock())
     assert (setup.method.name, setup.period) == ("lossless", 1e-3)
     assert setup.coupling.stiffness == pytest.approx(2400.0)  # 80 % of 2 (b - b/4) / T
-    assert setup.law.damping == pytest.approx(0.5)
+    expected = Coupling(2400.0, 0.5, 2.4, 5e-4)
+    assert asdict(setup.law) == pytest.approx(asdict(expected), rel=1e-12)
     assert setup.attainable == setup.coupling
     assert (setup.limits.force, setup.guard.controller) == (10.0, ENVIRONMENT)
     assert (setup.is_realtime, setup.is_pipelined) == (True, True)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import TAP, ScriptedDevice
-from bridge_runs import REST, fast, sway
+from audit_cases import ScriptedDevice
+from bridge_runs import fast, still, sway
+from golden_cases import WORKSHOP, runs
 from kernel_runs import FREE_BALL, at_rest
 from kernel_runs import fast as fast_run
 
@@ -19,42 +21,11 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.tick import can_split, is_sound
-from hapticbridge.lab.methods import METHODS
-from hapticbridge.record import TICK_DTYPE
 
 TICKS = 400
 
-WORKSHOP = """
-<mujoco>
-  <option cone="elliptic"/>
-  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001"/></default>
-  <worldbody>
-    <geom type="plane" size="1 1 0.1"/>
-    <body name="tool" pos="0 0 0.012" gravcomp="1"><freejoint/>
-      <geom type="sphere" size="0.01" mass="0.1"/><site name="grip"/></body>
-    <body name="lever" pos="0.03 0 0.02"><joint name="lever" type="hinge" axis="0 1 0"
-        stiffness="0.1" damping="0.001"/>
-      <geom type="capsule" size="0.004" fromto="0 0 0 0 0 0.05" mass="0.05"/></body>
-    <body name="load" pos="-0.1 0 0.05"><freejoint/>
-      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
-    <body name="lift" mocap="true" pos="-0.1 0 0.03">
-      <geom type="box" size="0.02 0.02 0.008"/></body>
-  </worldbody>
-  <actuator><position name="servo" joint="lever" kp="0.5" kv="0.01"/></actuator>
-  <sensor>
-    <framepos objtype="site" objname="grip"/><framelinvel objtype="site" objname="grip"/>
-    <jointpos joint="lever"/><touch name="touch" site="grip"/>
-  </sensor>
-</mujoco>"""
-"""A tool, a servo, a spring, sensors, and a load on a platform that is moved."""
-
-Rows = tuple[Any, ...]
-
-
-def numbers_of(bridge: Bridge) -> Rows:
-    data = bridge.scene.data
-    kept = data.qpos.copy(), data.qvel.copy(), data.sensordata.copy(), data.time
-    return (bridge.latest_records(TICKS), *kept)
+RUNS = runs()
+AHEAD = ", pipelined"
 
 
 @pytest.fixture
@@ -74,64 +45,29 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return seen
 
 
-def run(scene: Any, *, pipelined: bool, on_tick: Any = None, **options: Any) -> Rows:
-    device = options.pop("device", None) or ScriptedDevice(sway)
-    with fast(scene, device, pipelined=pipelined, **options) as bridge:
-        bridge.run(TICKS * bridge.period, on_tick and (lambda tick: on_tick(bridge, tick)))
-        return numbers_of(bridge)
+def ended(bridge: Bridge, rows: Any) -> list[bytes]:
+    """Returns every bit of the records, and of the scene after them."""
+    data = bridge.scene.data
+    found = (rows, data.qpos, data.qvel, data.sensordata, np.array(data.time))
+    return [each.tobytes() for each in found]
 
 
-def check_equal(plain: Rows, ahead: Rows) -> None:
-    for name in TICK_DTYPE.names or ():
-        np.testing.assert_array_equal(plain[0][name], ahead[0][name], err_msg=name)
-    for one, other in zip(plain[1:], ahead[1:], strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize(
-    ("method", "substeps"), [*((method, 1) for method in METHODS), ("implicit", 3), ("explicit", 2)]
-)
+@pytest.mark.parametrize("name", [name for name in RUNS if name.endswith(AHEAD)])
 def test_a_pipelined_run_is_the_plain_one_to_the_bit(
-    tmp_path: Path, method: str, substeps: int
+    name: str, tmp_path: Path, calls: list[str]
 ) -> None:
-    (tmp_path / "tap.csv").write_text(TAP)
-    plain, ahead = (
-        run(
-            "peg_in_hole",
-            device=f"trajectory:{tmp_path / 'tap.csv'}",
-            pipelined=pipelined,
-            method=method,
-            substeps=substeps,
-        )
-        for pipelined in (False, True)
-    )
-    assert plain[0]["contacts"].max() > 0
-    check_equal(plain, ahead)
-
-
-@pytest.mark.parametrize("method", ["lossless", "implicit", "explicit"])
-def test_motors_springs_sensors_and_moved_bodies_change_no_bit(
-    tmp_path: Path, calls: list[str], method: str
-) -> None:
-    path = tmp_path / "workshop.xml"
-    path.write_text(WORKSHOP)
-
-    def act(bridge: Bridge, tick: int) -> None:
-        if tick % 50 == 10:
-            bridge.set_input(ctrl={"servo": 0.3 * np.sin(tick)})
-        if 100 <= tick < 200:
-            height = 0.03 + 2e-5 * (tick - 100)
-            bridge.set_input(mocap={"lift": (-0.1, 0, height)})
-        if tick == 250:
-            bridge.set_input(body_wrench={"load": (0.01, 0, 0, 0, 0, 1e-5)})
-
-    plain = run(path, pipelined=False, method=method, on_tick=act)
-    calls.clear()
-    ahead = run(path, pipelined=True, method=method, on_tick=act)
-    assert calls.count("mj_step") == 100  # the first, and 99 in which a body was moved
-    assert plain[0]["external_work"][-1] != 0.0
-    assert plain[0]["actuator_work"][-1] != 0.0
-    check_equal(plain, ahead)
+    """Also where motors, springs, and sensors of motion are in the scene, and bodies are moved."""
+    run, found = RUNS[name], []
+    # a sensor of velocity, too
+    speed = '<framelinvel objtype="site" objname="grip"/><jointpos '
+    scene = run.scene.replace("<jointpos ", speed)
+    for is_ahead in (False, True):
+        calls.clear()
+        with replace(run, scene=scene).open(tmp_path, pipelined=is_ahead) as bridge:
+            found.append(ended(bridge, run.go(bridge)))
+    assert found[0] == found[1]
+    if name == f"inputs, implicit{AHEAD}":  # the first, and 99 in which a body was moved
+        assert calls.count("mj_step") == 100
 
 
 def test_only_the_first_tick_is_a_whole_step_and_the_wrench_goes_out_first(
@@ -145,7 +81,8 @@ def test_only_the_first_tick_is_a_whole_step_and_the_wrench_goes_out_first(
         write(wrench)
 
     monkeypatch.setattr(device, "write", noted)
-    run("point_mass", pipelined=True, device=device)
+    with fast("point_mass", device, pipelined=True) as bridge:
+        bridge.run(1e-3 * TICKS)
     # the last words are zero force, at the end of run and bridge
     ticks = ["mj_step", "write", "mj_fwdPosition"]
     ticks += ["mj_step2", "write", "mj_fwdPosition"] * (TICKS - 1)
@@ -158,7 +95,9 @@ def test_methods_whose_constraints_or_stages_need_the_sample_take_whole_steps(
 ) -> None:
     # a held torque makes the light tool spin, which the guard would stop
     limits = Limits(force=10.0, torque=0.5, angle=np.inf)
-    run("point_mass", pipelined=True, method=method, limits=limits)
+    device = ScriptedDevice(sway)
+    with fast("point_mass", device, pipelined=True, method=method, limits=limits) as bridge:
+        bridge.run(0.4)
     assert set(calls) == {"mj_step"}
 
 
@@ -167,17 +106,17 @@ def test_a_scene_changed_between_two_runs_is_taken_as_it_is(tmp_path: Path) -> N
     path.write_text(WORKSHOP)
     ends = []
     for pipelined in (False, True):
-        with fast(path, ScriptedDevice(lambda _tick: REST), pipelined=pipelined) as bridge:
+        with fast(path, ScriptedDevice(still), pipelined=pipelined) as bridge:
             bridge.run(0.01)
             model, data = bridge.scene.model, bridge.scene.data
             joint = model.body_jntadr[model.body("load").id]
             # a millimetre into the platform, from a millimetre above it: contacts must be found
             data.qpos[model.jnt_qposadr[joint] + 2] = 0.047
             bridge.run(0.01)
-            ends.append(numbers_of(bridge))
-    contacts = ends[0][0]["contacts"]
-    assert contacts[9] < contacts[10]
-    check_equal(*ends)
+            rows = bridge.latest_records(20)
+            assert rows["contacts"][9] < rows["contacts"][10]
+            ends.append(ended(bridge, rows))
+    assert ends[0] == ends[1]
 
 
 @pytest.mark.parametrize("pipelined", [False, True])

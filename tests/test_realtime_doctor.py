@@ -303,16 +303,6 @@ def test_cyclictests_refusal_is_told(
     assert bool(said) == bool(words)
 
 
-def test_the_command_prints_a_table_and_one_verdict(
-    quick: list[tuple[str, int, int]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["doctor", "--duration", "2"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split()[:5] == ["bridge", "10", "10", "10", "10"]
-    assert lines[2].split()[:6] == ["bare", "sleep", "60", "60", "60", "60"]
-    assert lines[-1].startswith("fit for 1000 Hz: 99.9 % of ticks within 10 µs, 0 missed")
-
-
 def test_the_command_speaks_json_and_exits_1_where_the_machine_is_unfit(
     quick: list[tuple[str, int, int]],
     monkeypatch: pytest.MonkeyPatch,

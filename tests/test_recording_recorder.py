@@ -6,20 +6,17 @@ import io
 import os
 import resource
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE, TickFlag
-from hapticbridge.recording import Attachment, Recorder, Ring, read_recording, repair
+from hapticbridge.recording import Attachment, Recorder, Ring, read_recording
 from hapticbridge.recording.recorder_process import LiveLine, RunState
 
 META = {"method": "implicit", "device": "{}"}
@@ -45,31 +42,11 @@ def produce(ring: Ring, recorder: Recorder, rows: NDArray[np.void]) -> None:
         time.sleep(0.001)
 
 
-def wait_for(path: Path) -> None:
-    limit = time.monotonic() + PATIENCE
-    while not path.exists():
-        assert time.monotonic() < limit, f"{path} did not appear"
-        time.sleep(0.01)
-
-
-def wait_for_end(pid: int) -> None:
-    """Waits for a process that is not a child of this one, dead but unreaped included."""
-    limit = time.monotonic() + PATIENCE
-    status = Path(f"/proc/{pid}/stat")
-    while status.exists() and status.read_text().rsplit(")")[-1].split()[0] != "Z":
-        assert time.monotonic() < limit, f"process {pid} did not end"
-        time.sleep(0.01)
-
-
 @pytest.fixture
 def ring() -> Iterator[Ring]:
     ring = Ring.shared(512)
     yield ring
     ring.close()
-
-
-def process_of(recorder: Recorder) -> int:
-    return recorder.pid
 
 
 def test_recorder_writes_every_record_and_event_of_a_run(ring: Ring, tmp_path: Path) -> None:
@@ -106,10 +83,10 @@ def test_records_that_wait_at_the_close_are_drained(ring: Ring, tmp_path: Path) 
 def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    os.kill(process_of(recorder), signal.SIGSTOP)
+    os.kill(recorder.pid, signal.SIGSTOP)
     for number in range(3000):
         recorder.event({"event": "mark", "text": "x" * 100, "number": number}, number)
-    os.kill(process_of(recorder), signal.SIGCONT)
+    os.kill(recorder.pid, signal.SIGCONT)
     recorder.close()
     events = read_recording(tmp_path / "run.mcap").events
     assert [event["number"] for event in events] == list(range(3000))
@@ -118,9 +95,9 @@ def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) 
 def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    assert os.getpgid(process_of(recorder)) != os.getpgid(0)
+    assert os.getpgid(recorder.pid) != os.getpgid(0)
     for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        os.kill(process_of(recorder), signal_number)
+        os.kill(recorder.pid, signal_number)
     produce(ring, recorder, numbered(0, 600))
     recorder.close()
     assert read_recording(tmp_path / "run.mcap").ticks.size == 600
@@ -129,7 +106,7 @@ def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path:
 def test_recorder_loads_neither_mujoco_nor_the_compiler(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    loaded = Path(f"/proc/{process_of(recorder)}/maps").read_text()
+    loaded = Path(f"/proc/{recorder.pid}/maps").read_text()
     recorder.close()
     assert "zstandard" in loaded
     assert "mujoco" not in loaded
@@ -159,7 +136,7 @@ def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_pa
     recorder = Recorder(ring, path, META, ())
     recorder.wait_until_ready()
     # stands for a full disk: the process may not let a file grow beyond this
-    resource.prlimit(process_of(recorder), resource.RLIMIT_FSIZE, (50_000, 50_000))
+    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
     rows = numbered(0, 20_000)
     done = 0
     while done < rows.size and recorder.is_alive():
@@ -177,7 +154,7 @@ def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_pa
 def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> None:
     recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
-    os.kill(process_of(recorder), signal.SIGKILL)
+    os.kill(recorder.pid, signal.SIGKILL)
     limit = time.monotonic() + PATIENCE
     while recorder.is_alive():
         assert time.monotonic() < limit
@@ -186,90 +163,6 @@ def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> Non
     with pytest.raises(RecordingError, match=r"killed by signal 9.*hapticbridge repair"):
         recorder.close()
     assert read_recording(tmp_path / "run.mcap").is_cut
-
-
-BRIDGE = """
-import os, signal, sys, time
-sys.path.insert(0, sys.argv[1])
-from test_recording_recorder import FILES, META, numbered
-from hapticbridge.recording import Recorder, Ring
-
-_, _, path, count, victims, fork = sys.argv
-ring = Ring.shared(512)
-recorder = Recorder(ring, path, META, FILES)
-recorder.wait_until_ready()
-if fork == "fork" and os.fork() == 0:  # a worker that keeps the recorder's pipe open
-    print(os.getpid(), flush=True)
-    time.sleep(60)
-recorder.event({"event": "start"}, 0)
-rows, done = numbered(0, int(count)), 0
-while done < rows.size:
-    done += ring.append(rows[done:])
-print(recorder.pid, ring.name, flush=True)
-if victims == "both":
-    while ring.pending():
-        time.sleep(0.005)
-    os.kill(recorder.pid, signal.SIGKILL)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def killed_bridge(path: Path, count: int, victims: str, fork: str = "") -> list[str]:
-    """Runs a bridge that ends itself by kill -9; returns what it printed."""
-    arguments = [str(Path(__file__).parent), str(path), str(count), victims, fork]
-    with subprocess.Popen(
-        [sys.executable, "-c", BRIDGE, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as bridge:
-        assert bridge.wait() == -signal.SIGKILL
-        assert bridge.stdout is not None
-        assert bridge.stderr is not None
-        lines = [bridge.stdout.readline() for _ in range(2 if fork else 1)]
-        words = sorted(lines, key=lambda line: len(line.split()))
-        if fork:
-            wait_for_end(int(words[-1].split()[0]))
-            os.kill(int(words[0]), signal.SIGKILL)
-        else:
-            wait_for_end(int(words[-1].split()[0]))
-        assert bridge.stderr.read() == ""
-    return words[-1].split()
-
-
-@pytest.mark.parametrize("fork", ["", "fork"])
-def test_killed_bridge_leaves_a_whole_recording_that_says_so(tmp_path: Path, fork: str) -> None:
-    path = tmp_path / "run.mcap"
-    _, ring_name = killed_bridge(path, 2000, "bridge", fork)
-    recording = read_recording(path)
-    assert not recording.is_cut
-    assert recording.problems == ()
-    assert recording.digest == recording.computed_digest
-    assert (recording.ticks == numbered(0, 2000)).all()
-    assert recording.events == [
-        {"event": "start", "time_ns": 0},
-        {"event": "bridge_died", "tick": 1999, "time_ns": 1_999_000_000},
-    ]
-    assert not Path(ring_name).exists()
-
-
-def test_killed_bridge_and_recorder_lose_one_chunk_at_most_and_repair_mends(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    killed_bridge(path, 2000, "both")
-    recording = read_recording(path)
-    assert recording.is_cut
-    assert recording.digest is None
-    assert recording.problems == ()
-    # one chunk of 128 kB and one batch that was taken from the ring but not written yet
-    assert 2000 - 302 - 512 <= recording.ticks.size < 2000
-    assert (recording.ticks == numbered(0, 2000)[: recording.ticks.size]).all()
-    mended = repair(path, tmp_path / "mended.mcap")
-    assert not mended.is_cut
-    assert mended.digest == mended.computed_digest
-    assert (mended.ticks == recording.ticks).all()
-    with (tmp_path / "mended.mcap").open("rb") as stream:
-        messages = list(NonSeekingReader(stream, validate_crcs=True).iter_messages(["/tick"]))
-    assert len(messages) == recording.ticks.size
 
 
 def test_live_line_in_a_file_is_plain_text(ring: Ring, capfd: pytest.CaptureFixture[str]) -> None:

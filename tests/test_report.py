@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import io
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 import report_runs
 from chromium import browser
-from cli_cases import Called
 from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.errors import RecordingError
-from hapticbridge.kernel.parameters import DAMPER, GuardParameters
+from hapticbridge.kernel.parameters import DAMPER
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
@@ -84,25 +82,15 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     assert "<p>The guard tripped.</p>" in text
     assert "The moment" not in text
     recording, active = made(report_runs.active_by_method)
-    evidence = evidence_of(recording)
-    energy, allowed = evidence.judged(active)
-    worst = int(np.argmax(energy - allowed))
-    cause = likely_cause(evidence, active)
+    energy, allowed = evidence_of(recording).judged(active)
+    cause = likely_cause(evidence_of(recording), active)
     assert cause is not None
-    assert active.tick is not None
     write_report(recording, active, page)
     text = html.unescape(page.read_text(encoding="utf-8"))
     first = text[text.index("<section") : text.index("</section>")]
-    most = format_si(float((energy - allowed)[worst]), "J")
-    for told in (
-        f"Not safe: the scene gave out up to {most} ",
-        f"from {1e-3 * (active.tick + 1):.3f} s on (tick {active.tick})",
-        f"most at {1e-3 * (worst + 1):.3f} s (tick {worst})",
-        f"{format_si(active.joules, 'J')} at first, {most} at most",
-        f"<strong>{cause.kind}</strong>. ",
-        cause.evidence[1:],
-        cause.remedy[1:],
-    ):
+    most = format_si(float((energy - allowed).max()), "J")
+    where = f"(tick {active.tick})", f"(tick {int(np.argmax(energy - allowed))})"
+    for told in (*where, most, f"<strong>{cause.kind}</strong>. ", cause.remedy[1:]):
         assert told in first
     assert "The moment" in text
 
@@ -143,21 +131,8 @@ def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) ->
     assert ("controller", "damper") in guard_facts(evidence)
     page = tmp_path / "page.html"
     write_report(guarded, audit(run_file), page)
-    text = page.read_text(encoding="utf-8")
-    assert "damper, at work in" in text
-    assert "up to 1.5 N s/m injected" in text
-    assert "reason it jumped" in text
-
-
-def test_the_page_tells_everything_that_the_guard_was_set_to(run_file: Path) -> None:
-    evidence = evidence_of(read_recording(run_file))
-    names = [field.name for field in fields(GuardParameters)]
-    guarding = GuardParameters(**dict.fromkeys(names, 1))  # type: ignore[arg-type] # any number will do
-    told = guard_facts(
-        replace(evidence, parameters=replace(evidence.parameters, guarding=guarding))
-    )
-    said = {name.replace(" ", "_") for name, _ in told}
-    assert said == set(names) - {"reanchors_at_start"}  # which is what every run of a device does
+    for told in ("damper, at work in", "up to 1.5 N s/m injected", "reason it jumped"):
+        assert told in page.read_text(encoding="utf-8")
 
 
 def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
@@ -168,21 +143,6 @@ def test_what_stopped_a_run_is_listed_after_any_number_of_inputs() -> None:
     assert rows[-1] == ("trip", "400", "0.400 s", "reason it jumped")
     others = [{"event": "resume", "tick": i} for i in range(2 * MAX_EVENTS)]
     assert len(event_rows([*inputs, *others])) == MAX_EVENTS
-
-
-@pytest.mark.parametrize("name", ["page.mcap", "page", "nowhere/page.html"])
-def test_a_page_replaces_no_recording_and_no_picture(
-    name: str, call: Called, run_file: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / name
-    if target.parent.exists():
-        target.write_bytes(b"what was there")
-    code, out, err = call("audit", run_file, "--report", target)
-    assert (code, out) == (2, "")  # before anything is computed
-    assert str(target) in err
-    with pytest.raises(RecordingError, match="page"):
-        write_report(read_recording(run_file), audit(run_file), target)
-    assert not target.exists() or target.read_bytes() == b"what was there"
 
 
 def test_a_browser_shows_the_page_without_a_request_or_a_complaint(

@@ -133,12 +133,10 @@ FUNCTIONS: dict[str, Callable[[Draw], Any]] = {
     "minimum damping": lambda d: p.minimum_damping(d.grid(), d.above(), **d.options()),
     "largest stiffness": lambda d: p.maximum_stiffness(d.above(), d.above(), d.least()),
     "default coupling": lambda d: p.stiffest_coupling(d.above(), d.above(), d.above()).stiffness,
-    "delayed": lambda d: p.coupled_stability_limit(d.least(), d.above(), delay=d.least()),
     "free device": lambda d: p.free_device_stiffness(
         d.least(), d.above(), d.above(), d.least(), delay=d.delay(), filter_time=d.least()
     ),
     "free damping": lambda d: p.free_device_damping(d.least(), d.above(), d.above()),
-    "margin": lambda d: p.matrix_margin(d.above(), d.least(), d.above(), d.above()),
     "quantization": mechanism,
     "spectrum": spectrum,
     "line": lambda d: p.transmission_line_stiffness(d.above(), d.above()),
@@ -220,7 +218,6 @@ def test_what_is_no_number_is_refused_in_one_line(value: Any) -> None:
     for call in (
         lambda: p.CouplingGrid(value),
         lambda: p.maximum_stiffness(value, T),
-        lambda: p.matrix_margin(value, 0, 0, T),
         lambda: m.ImpactBody(value, 1, [0, 0]),
     ):
         with pytest.raises(HapticBridgeError, match="must be numbers") as refused:

@@ -17,8 +17,6 @@ from scipy import signal
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.bounds import (
-    coupled_stability_limit,
-    matrix_margin,
     maximum_stiffness,
     minimum_damping,
     stiffest_coupling,
@@ -279,21 +277,6 @@ def test_stiffness_at_the_quantization_limit_needs_just_the_friction_there_is() 
     assert at_limit.friction_needed == pytest.approx(0.05, rel=1e-12)
 
 
-@given(st.integers(1, 5), st.integers(0, 10_000))
-def test_matrix_margin_does_not_depend_on_the_axes(size: int, seed: int) -> None:
-    generator = np.random.default_rng(seed)
-    k, damping, b = (generator.uniform(0, high, size) for high in (4e3, 2, 5))
-    axes, _ = np.linalg.qr(generator.normal(size=(size, size)))
-    first, second, third = (axes @ np.diag(value) @ axes.T for value in (k, damping, b))
-    margin = matrix_margin(first, second, third, T, scale=2, force_scale=0.75)
-    assert margin == pytest.approx((b - 1.5 * (k * T / 2 + damping)).min(), abs=1e-11)
-
-
-def test_stability_under_delay_gains_from_the_damper_that_passivity_pays_for() -> None:
-    assert coupled_stability_limit(2, T) == pytest.approx(maximum_stiffness(2, T), rel=1e-12)
-    assert coupled_stability_limit(2, T, damping=1, delay=1) == pytest.approx(2000, rel=1e-12)
-
-
 def test_grid_agrees_with_single_couplings() -> None:
     k, b = np.array([[500.0], [2000.0]]), np.array([0.0, 0.5, 3.0])
     grid = CouplingGrid(k, b)
@@ -324,7 +307,6 @@ def test_grid_agrees_with_single_couplings() -> None:
         (lambda v: damping_spectrum(WALL, T, [100.0, v]), "frequency is"),
         (lambda v: environment_minimum_damping(WALL, T, [0.1, v]), "mass is"),
         (lambda v: CouplingGrid([1.0, v]), "coupling stiffness is"),
-        (lambda v: coupled_stability_limit(1, T, delay=v), "delay is"),
     ],
 )
 def test_out_of_range_is_refused(call: Callable[[Any], Any], words: str, value: float) -> None:
@@ -346,9 +328,6 @@ def test_out_of_range_is_refused(call: Callable[[Any], Any], words: str, value: 
         (lambda: minimum_damping(WALL, T, discretization="euler"), "one of 'backward', 'tustin'"),  # type: ignore[call-overload]
         (lambda: minimum_mass(WALL, T, "rk4"), "one of 'explicit', 'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
         (lambda: damping_spectrum(WALL, T, 4 / T), "half the sampling rate"),
-        (lambda: matrix_margin(np.ones(3), 0, 0, T), "must be square"),
-        (lambda: matrix_margin([[1, 2], [0, 1]], np.eye(2), np.eye(2), T), "not symmetric"),
-        (lambda: matrix_margin(np.eye(3), np.eye(2), np.eye(2), T), "sizes"),
         (lambda: quantization_limit(UNKNOWN, WALL, T), "friction is not known"),
         (
             lambda: environment_minimum_damping(
@@ -382,29 +361,6 @@ def test_fields_of_a_grid_are_its_own_and_cannot_be_written() -> None:
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 3.0
     assert np.asarray(grid.stiffness)[0] == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"stiffness": -np.eye(2)}, "stiffness has the eigenvalue -1; all must be >= 0"),
-        ({"damping": [[1, 2], [2, 1]]}, "damping has the eigenvalue -1"),
-        ({"stiffness": [[np.nan, 0], [0, 1]]}, "stiffness is nan"),
-        ({"device_damping": [[1, 2], [3]]}, "device damping is .* must be numbers"),
-        ({"device_damping": np.zeros((0, 0))}, "device damping is an empty array"),
-        ({"stiffness": np.ones((2, 1, 1)), "damping": np.ones((3, 1, 1))}, "do not broadcast"),
-        ({"scale": 0.0}, "scale is 0"),
-        ({"force_scale": -1.0}, "force scale is -1"),
-        ({"period": 0.0}, "period is 0"),
-    ],
-)
-def test_matrices_without_meaning_are_refused(arguments: dict[str, Any], sentence: str) -> None:
-    valid: dict[str, Any] = dict.fromkeys(("stiffness", "damping", "device_damping"), np.eye(2))
-    valid["period"] = T
-    if "stiffness" in arguments and "damping" in arguments:
-        valid["device_damping"] = 1.0
-    with pytest.raises(CouplingError, match=sentence):
-        matrix_margin(**(valid | arguments))
 
 
 def test_a_late_force_without_damper_is_no_stable_environment_whatever_the_mass() -> None:

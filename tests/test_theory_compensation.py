@@ -13,13 +13,17 @@ from hapticbridge.theory.compensation import (
     effective_damping,
     largest_effective_damping,
     law_damping,
-    required_device_damping,
 )
 from hapticbridge.theory.rigid_body import drive_mass
 from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
 LAGS = {"implicit": 1.0, "midpoint": 0.5}
+
+
+def required_device_damping(k: float, felt: float, period: float, lag: float) -> float:
+    """K T/2 + B', the device damping for K and an effective B."""
+    return 0.5 * k * period + law_damping(k, felt, period, lag)
 
 
 def tool_spectrum(

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from audit_cases import COUPLING, ScriptedDevice
-from chromium import Tab, browser
+from chromium import browser
 from report_runs import LOOSE
 from test_bridge_commands import FLOOR, STEPS, swaying
 from test_commands import allowance
@@ -88,11 +88,6 @@ def stiffness(bridge: Bridge) -> float:
     return float(bridge.session.kernel.bound.state["coupling"]["stiffness"][0])
 
 
-def pressed(tab: Tab, key: str) -> None:
-    for kind in ("keyDown", "keyUp"):
-        tab._ask("Input.dispatchKeyEvent", type=kind, key=key, code=key)
-
-
 def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(tmp_path: Path) -> None:
     with running(tmp_path) as (bridge, window), browser(tmp_path) as tab:
         page = tab()
@@ -101,7 +96,7 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(tmp_
         page.wait_for("document.body.innerText.includes('They end where the device')")
         page.value("document.querySelectorAll('[role=slider]')[0].focus()")
         before = stiffness(bridge)
-        pressed(page, "Home")  # its least value
+        page.press("Home")  # its least value
         until(lambda: stiffness(bridge) == pytest.approx(200.0))
         page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
         assert page.complaints == []

@@ -207,23 +207,11 @@ class EnergyBalance:
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
         totals |= _device_energies(block, events, delay)
-        released, commanded = coupling_work, np.zeros(len(ticks))
-        totals["stored_in_coupling"] = np.zeros(len(ticks))
-        lost = created  # without a law, all energy stored in the scene counts
+        commanded, parts, held = _coupling_energies(block, events, works)
+        kept = _summed(parts, before["stored_in_coupling"])
+        totals["stored_in_coupling"] = kept
+        released, lost = coupling_work, created  # without a law, all that the scene stores counts
         if parameters.has_law:
-            shares = transmitted_shares(ticks, parameters)
-            stretched = motion.stretched
-            paths = (
-                SpringPath(motion.pulled, motion.stretch, stretched[0], works[0], shares[0]),
-                SpringPath(motion.turned, motion.twist, stretched[1], works[1], shares[1]),
-            )
-            gains_before = events.gains(ticks["tick"] - 1)
-            commanded = work_of_commands(parameters, gains_before, gains, paths, block.share_before)
-            parts, held = stored_in_coupling(
-                parameters, gains, paths, block.is_start, block.share, block.share_before
-            )
-            kept = _summed(parts - commanded, before["stored_in_coupling"])
-            totals["stored_in_coupling"] = kept
             # with a delay the device is elsewhere, and only the energy given so far counts
             released = kept if delay else kept + held
             # The slack covers energy created by the environment, but a ramp or a limit passes only
@@ -257,32 +245,66 @@ def _summed(values: Array, before: float) -> Array:
     return np.cumsum(np.concatenate([[before], values]))[1:]
 
 
+def _coupling_energies(
+    block: AuditedBlock, events: RunEvents, works: tuple[Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Returns the work of commands, the energy that coupling and tool keep, and r V(e), (n,) each.
+
+    All are 0 without a coupling law. ``works`` are the coupling's in translation and rotation.
+    """
+    ticks, motion, parameters = block.ticks, block.motion, events.parameters
+    if not parameters.has_law:
+        none = np.zeros(len(ticks))
+        return none, none, none
+    shares, stretched = transmitted_shares(ticks, parameters), motion.stretched
+    paths = (
+        SpringPath(motion.pulled, motion.stretch, stretched[0], works[0], shares[0]),
+        SpringPath(motion.turned, motion.twist, stretched[1], works[1], shares[1]),
+    )
+    before, gains = events.gains(ticks["tick"] - 1), events.gains(ticks["tick"])
+    commanded = work_of_commands(parameters, before, gains, paths, block.share_before)
+    parts, held = stored_in_coupling(
+        parameters, gains, paths, block.is_start, block.share, block.share_before
+    )
+    return commanded, parts - commanded, held
+
+
 def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict[str, Array]:
     """Returns cumulative energies at the device port, by name, (n,) each in J."""
     ticks, parameters, before = block.ticks, events.parameters, block.state.sums
     rows = np.concatenate([block.state.row, ticks, block.following])
     sent = rows["wrench_on_device"][: len(ticks)].copy()
     sent[np.isin(ticks["tick"], events.resumed)] = 0.0
-    position, orientation = rows["device_position"], rows["device_quaternion"]
-    motions = np.diff(position, axis=0), turn_between(orientation[:-1], orientation[1:])
-    works, moved = [], []
-    for first in (0, delay):
-        moved = [motion[first : first + len(ticks)] for motion in motions]
-        # the motion after the last record is unknown and counts as none
-        moved = [np.concatenate([m, np.zeros((len(ticks) - len(m), 3))]) for m in moved]
-        linear, angular = sent[:, :3] * moved[0], sent[:, 3:] * moved[1]
-        works.append(np.sum(linear, axis=1) + np.sum(angular, axis=1))
+    moved, turned = _device_motion(rows, 0, len(ticks))
+    late_moved, late_turned = _device_motion(rows, delay, len(ticks))
+    work = np.sum(sent[:, :3] * moved, axis=1) + np.sum(sent[:, 3:] * turned, axis=1)
+    late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
     dissipation = np.zeros(len(ticks))
     if parameters.device_damping is not None:
-        interval, is_first = block.interval, block.is_first
-        parts = dissipated_by_damping(parameters, moved[0], moved[1], interval, ~is_first)
+        parts = dissipated_by_damping(
+            parameters, late_moved, late_turned, block.interval, ~block.is_first
+        )
         dissipation = _summed(parts, before["device_dissipation"])
     return {
-        "device_energy": _summed(works[0], before["device_energy"]),
-        "device_throughput": _summed(np.abs(works[0]), before["device_throughput"]),
-        "delayed_device_energy": _summed(works[1], before["delayed_device_energy"]),
+        "device_energy": _summed(work, before["device_energy"]),
+        "device_throughput": _summed(np.abs(work), before["device_throughput"]),
+        "delayed_device_energy": _summed(late, before["delayed_device_energy"]),
         "device_dissipation": dissipation,
     }
+
+
+def _device_motion(rows: NDArray[np.void], first: int, count: int) -> tuple[Array, Array]:
+    """Returns motions and rotation vectors of the device after each row from ``first`` on, (n, 3).
+
+    The motion after the last record is unknown and counts as none.
+    """
+    chosen = rows[first : first + count + 1]
+    moved, turned = np.zeros((count, 3)), np.zeros((count, 3))
+    known = max(len(chosen) - 1, 0)
+    orientation = chosen["device_quaternion"]
+    moved[:known] = np.diff(chosen["device_position"], axis=0)[:known]
+    turned[:known] = turn_between(orientation[:known], orientation[1:])
+    return moved, turned
 
 
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:

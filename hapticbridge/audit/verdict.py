@@ -330,7 +330,7 @@ def _unchecked(run: AuditedRun) -> str:
     if not method.has_coupling:
         return "the wrench comes from contacts: checked by re-simulation alone"
     if not method.has_law:
-        return "the wrench is MuJoCo's constraint force: checked by re-simulation alone"
+        return "no coupling law gives the wrench: checked by re-simulation alone"
     if run.parameters.law_evaluations > 1:
         return "the wrench is a mean over substeps: it and its work checked by re-simulation alone"
     return ""

@@ -217,11 +217,8 @@ class Run:
     """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
     carried over; second order away from contact. 'implicit', the default with substeps: all of the
     coupling inside the step, which adds K T to the damping. 'compensated': 'implicit' with the
-    added K T subtracted from the coupling's damping. The others exist to be compared:
-    'implicitfast' and 'implicitfast:compensated' (the actuators of 'implicit' under that
-    integrator, the second with K T more damping), 'explicit', 'explicit:implicitfast' and
-    'explicit:rk4' (a force held for a tick, under Euler or the named integrator), 'weld' (MuJoCo's
-    weld constraint), 'direct' (a tool without mass, no coupling)."""
+    added K T subtracted from the coupling's damping. Or a method that exists to be compared, such
+    as 'explicit', 'weld' or 'direct' (a tool without mass); an unknown name lists them."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
@@ -319,35 +316,7 @@ class Run:
         callbacks: list[Callable[[str], None]],
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
-        options = BridgeOptions(
-            rate=self.rate,
-            substeps=self.substeps,
-            method=self.method,
-            contact_stiffness=self.contact_stiffness,
-            i_know=self.i_know,
-            workspace=Workspace(
-                scale=self.scale,
-                force_scale=self.force_scale,
-                axes=SAME_FRAME.axes if self.axes is None else self.axes,
-                absolute=self.absolute,
-            ),
-            limits=Limits(
-                force=device.info.force_limit if self.force_limit is None else self.force_limit,
-                torque=(
-                    device.info.torque_limit if self.torque_limit is None else self.torque_limit
-                ),
-                ramp=self.ramp,
-                stretch=self.stretch_limit,
-                energy=self.energy_limit,
-                reach=self.reach_limit,
-            ),
-            controller=self.controller,
-            clutch=self.clutch,
-            dead_man=self.dead_man,
-            mark=self.mark,
-            live=not self.as_json and (err.is_terminal or not self.fast),
-            realtime=self.realtime or None,
-        )
+        options = self._options(device.info)
         coupling = self._coupling(device.info, options)
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
@@ -374,6 +343,35 @@ class Run:
             )
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _options(self, info: DeviceInfo) -> BridgeOptions:
+        return BridgeOptions(
+            rate=self.rate,
+            substeps=self.substeps,
+            method=self.method,
+            contact_stiffness=self.contact_stiffness,
+            i_know=self.i_know,
+            workspace=Workspace(
+                scale=self.scale,
+                force_scale=self.force_scale,
+                axes=SAME_FRAME.axes if self.axes is None else self.axes,
+                absolute=self.absolute,
+            ),
+            limits=Limits(
+                force=info.force_limit if self.force_limit is None else self.force_limit,
+                torque=info.torque_limit if self.torque_limit is None else self.torque_limit,
+                ramp=self.ramp,
+                stretch=self.stretch_limit,
+                energy=self.energy_limit,
+                reach=self.reach_limit,
+            ),
+            controller=self.controller,
+            clutch=self.clutch,
+            dead_man=self.dead_man,
+            mark=self.mark,
+            live=not self.as_json and (err.is_terminal or not self.fast),
+            realtime=self.realtime or None,
+        )
 
     def _window(self) -> Window:
         from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone

@@ -17,7 +17,6 @@ from hapticbridge.device.simulated.device import SimulatedDevice as SimulatedDev
 from hapticbridge.device.simulated.device import scene_hand as scene_hand
 from hapticbridge.device.simulated.hand import DEFAULT_HAND as DEFAULT_HAND
 from hapticbridge.device.simulated.hand import Hand as Hand
-from hapticbridge.device.simulated.hand import random_hand as random_hand
 from hapticbridge.device.trajectory import Motion as Motion
 from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
 from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice

@@ -40,6 +40,20 @@ def checked_period(period: float) -> float:
     return checked_number("the loop's period", period, "s", is_positive=True)
 
 
+TIMING = 0.1
+"""Length in s of a measurement of a device's rate or delay, before a run."""
+
+ON_TIME = 0.95
+"""Share of answers within the delay, without unit. The slowest answers are stalls of the host,
+which the loop counts as missed deadlines."""
+
+
+def usual_delay(times: Iterable[float]) -> float:
+    """Returns the delay in s that the share ``ON_TIME`` of measured delays meets."""
+    ordered = sorted(times)
+    return ordered[math.ceil(ON_TIME * len(ordered)) - 1]
+
+
 DATA_SHEET_UNITS = {
     "mass": "kg",
     "damping": "N s/m",

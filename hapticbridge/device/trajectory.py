@@ -82,7 +82,7 @@ class Motion:
         if fault := first_fault(table):
             raise DeviceError(f"row {fault[0]} of the motion: {fault[1]}")
         table[:, 0] -= table[0, 0]
-        _normalise(table)
+        direct(_normalise, table)(table)
         self.table: NDArray[np.float64] = table
 
     @property
@@ -149,8 +149,8 @@ def _relative_to_first(quaternions: NDArray[np.float64], result: NDArray[np.floa
 
 
 def _relative_rotations(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    result = np.empty(quaternions.shape)
-    _relative_to_first(np.ascontiguousarray(quaternions), result)
+    source, result = np.ascontiguousarray(quaternions), np.empty(quaternions.shape)
+    direct(_relative_to_first, source, result)(source, result)
     return result
 
 

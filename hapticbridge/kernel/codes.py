@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeAlias
 
@@ -44,15 +45,50 @@ class Scheme(IntEnum):
     MASSLESS = 3
     MIDPOINT = 4
 
+    @property
+    def properties(self) -> SchemeProperties:
+        """Properties of the path that other code reads; its steps stand in the kernel."""
+        return _PROPERTIES[self]
 
-def has_law(scheme: int) -> bool:
-    """Returns True if the coupling law gives the wrench."""
-    return scheme in (Scheme.IMPLICIT, Scheme.ZERO_ORDER_HOLD, Scheme.MIDPOINT)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SchemeProperties:
+    """Properties of a path of the wrench to the tool.
+
+    Attributes:
+        has_law: True if the coupling law gives the wrench.
+        has_tool_mass: True if MuJoCo moves the tool; False if the tool is placed at the handle.
+        holds_wrench: True if the wrench is applied as a force during the next tick. The law is then
+            evaluated once per tick, else once per MuJoCo step.
+        may_split: True if MuJoCo's position stage may run ahead of the sample.
+        one_substep: Reason for which a tick has one MuJoCo step; empty if it may have several.
+    """
+
+    has_law: bool = True
+    has_tool_mass: bool = True
+    holds_wrench: bool = False
+    may_split: bool = True
+    one_substep: str = ""
+
+    def law_evaluations(self, substeps: int) -> int:
+        """Returns the evaluations of the tool's wrench per tick."""
+        return 1 if self.holds_wrench else substeps
 
 
-def law_evaluations(scheme: int, substeps: int) -> int:
-    """Returns the evaluations of the tool's wrench per tick."""
-    return 1 if scheme == Scheme.ZERO_ORDER_HOLD else substeps
+_PROPERTIES = {
+    Scheme.IMPLICIT: SchemeProperties(),
+    Scheme.ZERO_ORDER_HOLD: SchemeProperties(holds_wrench=True),
+    Scheme.WELD: SchemeProperties(has_law=False, may_split=False),
+    Scheme.MASSLESS: SchemeProperties(
+        has_law=False,
+        has_tool_mass=False,
+        may_split=False,
+        one_substep="a tool without mass has no motion to divide",
+    ),
+    Scheme.MIDPOINT: SchemeProperties(
+        one_substep="a lossless coupling carries half of a tick's wrench over to the next"
+    ),
+}
 
 
 OK, BAD_SAMPLE, BAD_RESULT, HALF_DONE, RING_FULL = 0, 1, 2, 3, 4

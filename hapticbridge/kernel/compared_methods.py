@@ -13,7 +13,8 @@ with p the penetration in m, n the contact's normal, K_c the contact stiffness i
 no mass, so the hand's wrench on it is minus the sum of the contacts' wrenches.
 
 A method with a scheme that exists is registered in ``hapticbridge.lab.methods`` alone. A new scheme
-needs an entry in ``codes.Scheme`` and its branch in ``drive_compared`` and ``compared_wrench`` too.
+needs a number and its properties in ``codes``, and here its branch in ``drive_compared`` and
+``compared_wrench``; all else is in its ``rendering.Method``.
 """
 
 from __future__ import annotations

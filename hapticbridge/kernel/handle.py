@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
+from hapticbridge.jit import compiled, direct
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics
 from hapticbridge.kernel.parameters import RunParameters
@@ -15,6 +15,7 @@ from hapticbridge.pose import (
     add,
     canonical,
     conjugate,
+    norm,
     product,
     quaternion_exp,
     quaternion_of,
@@ -91,8 +92,23 @@ def bind_poses(run: Part, pose: Part, parameters: RunParameters) -> None:
     )
     x, y, z, qw, qx, qy, qz = parameters.device_start
     pose["device_position"], pose["device_quaternion"] = (x, y, z), (qw, qx, qy, qz)
-    position, quaternion = handle_pose(run, pose, (x, y, z), (qw, qx, qy, qz))
-    pose["handle_position"], pose["handle_quaternion"] = position, quaternion
+    direct(_place_first, run, pose)(run, pose)
+
+
+@compiled
+def _place_first(run: Part, pose: Part) -> None:
+    position, quaternion = vector_of(pose.device_position), quaternion_of(pose.device_quaternion)
+    handle, orientation = handle_pose(run, pose, position, quaternion)
+    store_vector(pose.handle_position, handle)
+    store_quaternion(pose.handle_quaternion, orientation)
+
+
+@compiled
+def stretch_at(s: State, sample: NDArray[np.void]) -> float:
+    """Returns the distance in m between the tool and the handle that a sample would give."""
+    pose, first = s.pose, sample[0]
+    handle, _ = handle_pose(s.run, pose, vector_of(first.position), quaternion_of(first.quaternion))
+    return norm(subtract(handle, vector_of(pose.tool_position)))
 
 
 def set_tool(pose: Part, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:

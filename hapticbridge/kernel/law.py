@@ -28,8 +28,12 @@ energy that the device received beyond the hand's.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 
+from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
@@ -58,6 +62,15 @@ Gains = tuple[float, float, float]
 """Gains of a coupling actuator: factor of its control, stiffness in N/m, damping in N s/m. For
 rotation: factor, N m/rad, N m s/rad."""
 
+GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
+"""Gains of the coupling's actuators, for forces and for torques, by the law's coupling and MuJoCo's
+time step in s."""
+
+SLACK_SHARE = 0.5
+"""Share of ½ (K + nB/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick; no
+unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
+environment counts as active sooner."""
+
 TUNED = (
     "stiffness",
     "damping",
@@ -81,11 +94,50 @@ COUPLING_DTYPE = np.dtype(
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
 
+def implicit_gains(coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
+    """Returns the gains of actuators that evaluate the whole law inside MuJoCo's step."""
+    k, b = coupling.stiffness, coupling.damping
+    kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+    return (b, k, b), (br, kr, br)
+
+
+def no_gains(_coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
+    """Returns the gains of actuators without effect."""
+    return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+
+
+def slack_gains(parameters: RunParameters) -> tuple[float, float]:
+    """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
+
+    δx_k and δφ_k are the tool's motion in tick k, in m and rad. Without a coupling law (a weld, a
+    tool without mass) both gains are 0, because the proof of a slack needs a law. With one
+    evaluation of the law per tick g = K + B/T.
+
+    With n > 1 evaluations g = ½ (K/n + B/T). The whole slack ½ (K + nB/T) ‖δx_i‖² of each
+    evaluation i would require infinite device damping at B = 0; half of it does not
+    (``certificate.required_damping``). A record holds only δx_k, the sum of all δx_i. For a given
+    sum the slack is least if all δx_i are equal, so that g bounds it from below.
+    """
+    if not parameters.has_law:
+        return 0.0, 0.0
+    coupling = parameters.coupling
+    share = 1.0 if parameters.law_evaluations == 1 else SLACK_SHARE
+    return (
+        share
+        * (coupling.stiffness / parameters.law_evaluations + coupling.damping / parameters.period),
+        share
+        * (
+            coupling.rotational_stiffness / parameters.law_evaluations
+            + coupling.rotational_damping / parameters.period
+        ),
+    )
+
+
 def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
     """Returns the numbers of ``TUNED`` for a coupling; all are linear in it."""
     coupling = parameters.coupling
     law = (getattr(coupling, name) for name in TUNED[:4])
-    return (*law, *parameters.slack_gains())
+    return (*law, *slack_gains(parameters))
 
 
 def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float, ...]) -> None:

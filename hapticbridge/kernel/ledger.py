@@ -131,9 +131,16 @@ def _keep_residuals(s: State) -> None:
         mj_make_constraint(mj.model, mj.data)  # positions are still those before the move
         s.energy.equality_rows = min(ints(mj.ne, 1)[0], mj.equality_capacity)
         residuals = floats(pointer_at(mj.efc_pos), s.energy.equality_rows)
-        floats(mj.equality_before, s.energy.equality_rows)[:] = residuals
+        _copy(residuals, floats(mj.equality_before, residuals.size))
     if mj.ntendon > 0:
-        floats(mj.tendon_before, mj.ntendon)[:] = floats(mj.ten_length, mj.ntendon)
+        _copy(floats(mj.ten_length, mj.ntendon), floats(mj.tendon_before, mj.ntendon))
+
+
+@compiled
+def _copy(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    # an assignment to a slice could raise, which machine code without numba cannot
+    for i in range(source.size):
+        target[i] = source[i]
 
 
 @compiled
@@ -427,17 +434,13 @@ def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
 
 
 @compiled
-def judge_environment(s: State) -> bool:
-    """Closes the tick's balance and compares it with (14) and with the slack.
+def close_balance(s: State) -> bool:
+    """Closes the tick's balance, and compares it with (14), with the slack, and at the device.
 
         slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
 
-    g in N/m and g_r in N m/rad are those of ``RunParameters.slack_gains``: K + B/T and K_r + B_r/T
+    g in N/m and g_r in N m/rad are those of ``coupling.slack_gains``: K + B/T and K_r + B_r/T
     with one evaluation of the law per tick.
-
-    Without a coupling law (a weld, a tool without mass) the device can receive too much energy even
-    if (14) holds. For these methods, the energy sent to the device is compared with its damper's
-    dissipation plus the energy that the scene released.
 
     Returns:
         True if the balance is finite.
@@ -451,15 +454,33 @@ def judge_environment(s: State) -> bool:
     energy.environment_energy = created
     allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput)
     if s.run.watches_device:
-        ratio = s.run.force_scale / s.run.scale
-        gained = ratio * (stored - energy.actuator_work - energy.external_work)
-        excess = energy.device_energy - energy.device_dissipation + gained
-        if energy.first_device_excess < 0 and excess > allowed:
-            energy.first_device_excess = s.loop.tick
+        _judge_device(s, stored, allowed)
+    _judge_environment(s, created, allowed)
+    return math.isfinite(created)
+
+
+@compiled
+def _judge_environment(s: State, created: float, allowed: float) -> None:
+    """Notes the first energy created, the first beyond the slack, and the largest share of it."""
+    energy = s.energy
     if created > allowed:
         if energy.first_unstrict < 0:
             energy.first_unstrict = s.loop.tick
         energy.slack_share = max(energy.slack_share, created / (energy.slack + allowed))
         if created > energy.slack + allowed and energy.first_active < 0:
             energy.first_active = s.loop.tick
-    return math.isfinite(created)
+
+
+@compiled
+def _judge_device(s: State, stored: float, allowed: float) -> None:
+    """Notes the first energy sent to the device beyond its dissipation and the scene's release.
+
+    Without a coupling law (a weld, a tool without mass) the device can receive too much energy even
+    if (14) holds.
+    """
+    energy = s.energy
+    ratio = s.run.force_scale / s.run.scale
+    gained = ratio * (stored - energy.actuator_work - energy.external_work)
+    excess = energy.device_energy - energy.device_dissipation + gained
+    if energy.first_device_excess < 0 and excess > allowed:
+        energy.first_device_excess = s.loop.tick

@@ -295,21 +295,24 @@ def implicit_half(s: State) -> tuple[Vector, Vector]:
     ``actuator_force`` is their force at the step's start; two terms of MuJoCo's effective metric
     take it to the end (``ledger._actuator_work``). Must run before the kinematics are refreshed.
     """
-    mj = s.mj
-    h = s.run.timestep
-    first = mj.coupling_output_adr
-    forces = floats(mj.actuator_force, first + 6)
-    f = np.empty(6)
-    for axis in range(6):
-        stiffness, damping = s.coupling.stiffness, s.coupling.damping
-        if axis >= 3:
-            stiffness, damping = s.coupling.rotational_stiffness, s.coupling.rotational_damping
-        end = moment_dot(s, first + axis, mj.qvel)
-        change = moment_dot(s, first + axis, mj.qacc)
-        in_position, in_velocity = 0.5 * h * stiffness, 0.5 * h * (h * stiffness + damping)
-        f[axis] = forces[first + axis] - in_position * (end - h * change) - in_velocity * change
+    force = (_implicit_half_of(s, 0), _implicit_half_of(s, 1), _implicit_half_of(s, 2))
+    torque = (_implicit_half_of(s, 3), _implicit_half_of(s, 4), _implicit_half_of(s, 5))
     handle = quaternion_of(s.pose.handle_quaternion)
-    return rotated(handle, vector_of(f)), rotated(handle, vector_of(f[3:6]))
+    return rotated(handle, force), rotated(handle, torque)
+
+
+@compiled
+def _implicit_half_of(s: State, axis: int) -> float:
+    mj, h = s.mj, s.run.timestep
+    actuator = mj.coupling_output_adr + axis
+    stiffness, damping = s.coupling.stiffness, s.coupling.damping
+    if axis >= 3:
+        stiffness, damping = s.coupling.rotational_stiffness, s.coupling.rotational_damping
+    end = moment_dot(s, actuator, mj.qvel)
+    change = moment_dot(s, actuator, mj.qacc)
+    in_position, in_velocity = 0.5 * h * stiffness, 0.5 * h * (h * stiffness + damping)
+    force = floats(mj.actuator_force, actuator + 1)[actuator]
+    return float(force - in_position * (end - h * change) - in_velocity * change)
 
 
 @compiled
@@ -572,14 +575,18 @@ def bind_lossless(
     return owned | {"user_forces": owned["last_written"].copy()}
 
 
+@compiled
 def restart_lossless(s: State) -> None:
     """Starts in the implicit form again after the scene was reset; nothing is carried over."""
-    lossless, nv = s["lossless"], int(s["mj"]["nv"])
-    lossless["is_midpoint"] = lossless["is_near"] = lossless["holdoff"] = 0
-    forces = floats(int(lossless["qfrc_written"]), nv)
-    floats(int(s["mj"]["qfrc_applied"]), nv)[:] = forces
-    floats(int(lossless["last_written"]), nv)[:] = forces
-    floats(int(lossless["carried_force"]), nv)[:] = 0.0
+    mj, lossless = s.mj, s.lossless
+    lossless.is_midpoint = 0
+    lossless.is_near = 0
+    lossless.holdoff = 0
+    written, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)
+    last, carried = floats(lossless.last_written, mj.nv), floats(lossless.carried_force, mj.nv)
+    for i in range(mj.nv):
+        users[i] = last[i] = written[i]
+        carried[i] = 0.0
     set_gains(s, 1.0)
     note_twist(s)
 

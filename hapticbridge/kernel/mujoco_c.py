@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
 import mujoco
-import numba
 import numpy as np
 from mujoco.introspect import ast_nodes, structs
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import compiled
+from hapticbridge.jit import Deferred, compiled, external, intrinsic
 from hapticbridge.kernel.codes import Part
 
 
@@ -37,51 +35,43 @@ def _library() -> Path:
 # Makes the symbols known to the compiler's linker; the Python bindings use the same library file.
 llvmlite.binding.load_library_permanently(str(_library()))
 
-_ADDRESS = types.intp
-_ON_DATA = types.void(_ADDRESS, _ADDRESS)
-mj_step: Any = types.ExternalFunction("mj_step", _ON_DATA)
-mj_kinematics: Any = types.ExternalFunction("mj_kinematics", _ON_DATA)
-mj_fwd_kinematics: Any = types.ExternalFunction("mj_fwdKinematics", _ON_DATA)
-mj_fwd_position: Any = types.ExternalFunction("mj_fwdPosition", _ON_DATA)
-mj_fwd_velocity: Any = types.ExternalFunction("mj_fwdVelocity", _ON_DATA)
-mj_transmission: Any = types.ExternalFunction("mj_transmission", _ON_DATA)
-mj_sensor_pos: Any = types.ExternalFunction("mj_sensorPos", _ON_DATA)
-mj_sensor_vel: Any = types.ExternalFunction("mj_sensorVel", _ON_DATA)
-mj_com_pos: Any = types.ExternalFunction("mj_comPos", _ON_DATA)
-mj_make_m: Any = types.ExternalFunction("mj_makeM", _ON_DATA)
-mj_energy_pos: Any = types.ExternalFunction("mj_energyPos", _ON_DATA)
-mj_energy_vel: Any = types.ExternalFunction("mj_energyVel", _ON_DATA)
-mj_make_constraint: Any = types.ExternalFunction("mj_makeConstraint", _ON_DATA)
-mj_com_vel: Any = types.ExternalFunction("mj_comVel", _ON_DATA)
-mj_factor_m: Any = types.ExternalFunction("mj_factorM", _ON_DATA)
-mj_passive: Any = types.ExternalFunction("mj_passive", _ON_DATA)
-mj_rne: Any = types.ExternalFunction(
-    "mj_rne", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
-)
-mj_mul_m: Any = types.ExternalFunction(
-    "mj_mulM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS)
-)
-mj_solve_m: Any = types.ExternalFunction(
-    "mj_solveM", types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32)
-)
-mj_apply_ft: Any = types.ExternalFunction(
-    "mj_applyFT",
-    types.void(_ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, _ADDRESS, types.int32, _ADDRESS),
-)
-mj_contact_force: Any = types.ExternalFunction(
-    "mj_contactForce", types.void(_ADDRESS, _ADDRESS, types.int32, _ADDRESS)
-)
+mj_step: Any = external("mj_step", "void(intp, intp)")
+mj_kinematics: Any = external("mj_kinematics", "void(intp, intp)")
+mj_fwd_kinematics: Any = external("mj_fwdKinematics", "void(intp, intp)")
+mj_fwd_position: Any = external("mj_fwdPosition", "void(intp, intp)")
+mj_fwd_velocity: Any = external("mj_fwdVelocity", "void(intp, intp)")
+mj_transmission: Any = external("mj_transmission", "void(intp, intp)")
+mj_sensor_pos: Any = external("mj_sensorPos", "void(intp, intp)")
+mj_sensor_vel: Any = external("mj_sensorVel", "void(intp, intp)")
+mj_com_pos: Any = external("mj_comPos", "void(intp, intp)")
+mj_make_m: Any = external("mj_makeM", "void(intp, intp)")
+mj_energy_pos: Any = external("mj_energyPos", "void(intp, intp)")
+mj_energy_vel: Any = external("mj_energyVel", "void(intp, intp)")
+mj_make_constraint: Any = external("mj_makeConstraint", "void(intp, intp)")
+mj_com_vel: Any = external("mj_comVel", "void(intp, intp)")
+mj_factor_m: Any = external("mj_factorM", "void(intp, intp)")
+mj_passive: Any = external("mj_passive", "void(intp, intp)")
+mj_rne: Any = external("mj_rne", "void(intp, intp, int32, intp)")
+mj_mul_m: Any = external("mj_mulM", "void(intp, intp, intp, intp)")
+mj_solve_m: Any = external("mj_solveM", "void(intp, intp, intp, intp, int32)")
+mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, int32, intp)")
+mj_contact_force: Any = external("mj_contactForce", "void(intp, intp, int32, intp)")
 
 
-@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
+_view = Deferred(lambda: import_module("numba").carray)
+
+
+@intrinsic
 def _as_pointer(_typing: Any, _address: Any) -> Any:
-    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+    types = import_module("numba.core.types")
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(types.voidptr))
 
     return types.voidptr(types.intp), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator] # numba ships no types
+@intrinsic
 def release_fence(_typing: Any) -> Any:
     """Orders the record's bytes before the cursor that publishes them (release semantics)."""
 
@@ -89,27 +79,27 @@ def release_fence(_typing: Any) -> Any:
         builder.fence("release")
         return context.get_dummy_value()
 
-    return types.void(), generate
+    return import_module("numba.core.types").void(), generate
 
 
 @compiled
 def floats(address: int, count: int) -> NDArray[np.float64]:
     """Returns ``count`` doubles at an address, as a view."""
-    view: NDArray[np.float64] = numba.carray(_as_pointer(address), count, np.float64)
+    view: NDArray[np.float64] = _view(_as_pointer(address), count, np.float64)
     return view
 
 
 @compiled
 def ints(address: int, count: int) -> NDArray[np.int32]:
     """Returns ``count`` 32-bit integers at an address, as a view."""
-    view: NDArray[np.int32] = numba.carray(_as_pointer(address), count, np.int32)
+    view: NDArray[np.int32] = _view(_as_pointer(address), count, np.int32)
     return view
 
 
 @compiled
 def pointer_at(address: int) -> int:
     """Returns the pointer stored at an address (arrays in MuJoCo's arena move between steps)."""
-    return int(numba.carray(_as_pointer(address), 1, np.int64)[0])
+    return int(_view(_as_pointer(address), 1, np.int64)[0])
 
 
 _DIVERGED = tuple(

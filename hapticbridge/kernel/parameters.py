@@ -14,7 +14,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.codes import Scheme, has_law, law_evaluations
+from hapticbridge.kernel.codes import Scheme, SchemeProperties
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
@@ -165,11 +165,6 @@ UNGUARDED = GuardParameters()
 """Guard parameters of runs without a device, and of recordings older than the guard."""
 
 
-SLACK_SHARE = 0.5
-"""Share of ½ (K + nB/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick; no
-unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
-environment counts as active sooner."""
-
 MAX_SUBSTEPS = 100
 """Largest number of MuJoCo steps per tick. More do not fit into the period of a haptic loop."""
 
@@ -189,12 +184,9 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
     Raises:
         HapticBridgeError: The message gives the reason.
     """
-    reasons: dict[int, str] = {
-        Scheme.MASSLESS: "a tool without mass has no motion to divide",
-        Scheme.MIDPOINT: "a lossless coupling carries half of a tick's wrench over to the next",
-    }
-    if substeps != 1 and scheme in reasons:
-        raise HapticBridgeError(f"substeps is {substeps!r}; {reasons[scheme]}, so it must be 1")
+    reason = Scheme(scheme).properties.one_substep
+    if substeps != 1 and reason:
+        raise HapticBridgeError(f"substeps is {substeps!r}; {reason}, so it must be 1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,12 +251,14 @@ class RunParameters:
             if not math.isfinite(value) or value <= 0:
                 raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
         if self.scheme not in list(Scheme):
-            raise HapticBridgeError(f"scheme is {self.scheme!r}; it must be 0 to 4")
+            raise HapticBridgeError(
+                f"scheme is {self.scheme!r}; it must be 0 to {max(Scheme).value}"
+            )
         stiffness = self.contact_stiffness
         if (
             not math.isfinite(stiffness)
             or stiffness < 0
-            or (stiffness > 0) != (self.scheme == Scheme.MASSLESS)
+            or (stiffness > 0) == self.properties.has_tool_mass
         ):
             raise HapticBridgeError(
                 f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
@@ -287,39 +281,24 @@ class RunParameters:
             raise _no_rotation(self.axes)
 
     @property
+    def properties(self) -> SchemeProperties:
+        """Properties of the scheme."""
+        return Scheme(self.scheme).properties
+
+    @property
+    def holds_wrench(self) -> bool:
+        """True if the wrench is applied as a force during the next tick."""
+        return self.properties.holds_wrench
+
+    @property
     def law_evaluations(self) -> int:
         """Evaluations of the tool's wrench per tick."""
-        return law_evaluations(self.scheme, self.substeps)
+        return self.properties.law_evaluations(self.substeps)
 
     @property
     def has_law(self) -> bool:
         """True if the coupling law gives the wrench."""
-        return has_law(self.scheme)
-
-    def slack_gains(self) -> tuple[float, float]:
-        """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
-
-        δx_k and δφ_k are the tool's motion in tick k, in m and rad. Without a coupling law (a weld,
-        a tool without mass) both gains are 0, because the proof of a slack needs a law. With one
-        evaluation of the law per tick g = K + B/T.
-
-        With n > 1 evaluations g = ½ (K/n + B/T). The whole slack ½ (K + nB/T) ‖δx_i‖² of each
-        evaluation i would require infinite device damping at B = 0; half of it does not
-        (``certificate.required_damping``). A record holds only δx_k, the sum of all δx_i. For a
-        given sum the slack is least if all δx_i are equal, so that g bounds it from below.
-        """
-        if not self.has_law:
-            return 0.0, 0.0
-        coupling = self.coupling
-        share = 1.0 if self.law_evaluations == 1 else SLACK_SHARE
-        return (
-            share * (coupling.stiffness / self.law_evaluations + coupling.damping / self.period),
-            share
-            * (
-                coupling.rotational_stiffness / self.law_evaluations
-                + coupling.rotational_damping / self.period
-            ),
-        )
+        return self.properties.has_law
 
 
 _ROUNDING = 4 * np.finfo(np.float64).eps

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.jit import compiled
+from hapticbridge.jit import compiled, direct
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF, Part, State
 from hapticbridge.kernel.law import releasable_energy
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
@@ -94,7 +94,7 @@ def cap_dissipation(s: State) -> None:
         - energy["start_energy"]
         - observer["stored_while_force_off"]
     )
-    released = 0.0 if s["guard"]["commanded"] & FORCE_OFF else releasable_energy(s)
+    released = 0.0 if s["guard"]["commanded"] & FORCE_OFF else direct(releasable_energy, s)(s)
     limit = float(observer["energy_credit_limit"]) + released + ratio * max(stored, 0.0)
     observer["net_device_energy"] = max(float(observer["net_device_energy"]), -limit)
 

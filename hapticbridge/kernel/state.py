@@ -25,10 +25,18 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_to_tool, set_tool
-from hapticbridge.kernel.law import COUPLING_DTYPE, Gains, bind_coupling, set_tuning_goal
+from hapticbridge.kernel.law import (
+    COUPLING_DTYPE,
+    Gains,
+    bind_coupling,
+    implicit_gains,
+    releasable_energy,
+    set_tuning_goal,
+)
 from hapticbridge.kernel.ledger import (
     ENERGY_DTYPE,
     add_reset_work,
@@ -60,6 +68,7 @@ _FROM_PARAMETERS = (
     "scheme",
     "law_evaluations",
     "has_law",
+    "holds_wrench",
     "scale",
     "force_scale",
     "force_limit",
@@ -75,6 +84,7 @@ RUN_DTYPE = np.dtype(
         ("substeps", "<i8"),
         ("law_evaluations", "<i8"),
         ("has_law", "<i8"),
+        ("holds_wrench", "<i8"),
         ("watches_device", "<i8"),
         ("ramp_ticks", "<i8"),
         ("period", "<f8"),
@@ -189,13 +199,13 @@ class BoundKernel:
         self._take_tool_pose()
         move_handle_to_tool(s["pose"])
         discard_wrench(s["loop"])
-        refresh_energies(s)
+        direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
         request_reanchoring(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
-            restart_lossless(s)
+            direct(restart_lossless, s)(s)
 
     def _bind_model(self, parameters: RunParameters) -> None:
         model, data, mj = self._model, self._data, self._record["mj"]
@@ -208,8 +218,7 @@ class BoundKernel:
         mj["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
         grip = mj["grip_site_id"] = model.site(parameters.grip).id
         mj["grip_body_id"] = model.site_bodyid[grip]
-        is_weld = parameters.scheme == Scheme.WELD
-        mj["weld_id"] = model.equality(WELD_NAME).id if is_weld else -1
+        mj["weld_id"] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
@@ -255,10 +264,12 @@ class BoundKernel:
             mujoco.mj_fwdPosition(self._model, self._data)
             balance_contacts(s)
         else:
-            refresh_energies(s)
+            direct(refresh_energies, s)(s)
         start_energies(s["energy"])
         if parameters.scheme == Scheme.MIDPOINT:
-            note_twist(s)
+            direct(note_twist, s)(s)
+            direct(restart_lossless, s)
+        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""
@@ -274,10 +285,8 @@ class BoundKernel:
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters) -> tuple[float, ...]:
     """Returns the whole gains of the coupling's actuators, for forces and then for torques."""
     if parameters.scheme == Scheme.MIDPOINT:  # the model may have half of them
-        coupling = parameters.coupling
-        k, b = coupling.stiffness, coupling.damping
-        kr, br = coupling.rotational_stiffness, coupling.rotational_damping
-        return b, k, b, br, kr, br
+        forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
+        return (*forces, *torques)
     gains: list[float] = []
     first = model.actuator(COUPLING_ACTUATORS[0]).id
     for actuator in (first, first + 3):

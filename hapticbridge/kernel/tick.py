@@ -40,7 +40,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.law import command_handle_velocity, retune, wrench_after_step
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
-    judge_environment,
+    close_balance,
     meter_device,
     meter_ports,
     note_moved_mocap_bodies,
@@ -119,23 +119,31 @@ def _is_pose(position: Vector, quaternion: Quaternion) -> bool:
 
 
 @compiled
+def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tuple[Vector, Vector]:
+    """Returns motion and rotation vector of the device since the previous tick.
+
+    The rotation is exactly zero without a turn: rounding would be a velocity that the controller
+    damps.
+    """
+    turned, last = (0.0, 0.0, 0.0), quaternion_of(pose.device_quaternion)
+    if quaternion != last:
+        turned = rotation_between(last, quaternion)
+    return subtract(position, vector_of(pose.device_position)), turned
+
+
+@compiled
 def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elapsed: float) -> int:
     """Checks a sample, observes the energy of the previous tick, and moves the handle.
 
     Returns:
         ``OK``, or the reason to refuse the sample; nothing was changed then.
     """
-    pose, r = s.pose, row[0]
+    pose = s.pose
     position = vector_of(sample[0].position)
     if not _is_pose(position, quaternion_of(sample[0].quaternion)):
         return BAD_SAMPLE
     quaternion = canonical(quaternion_of(sample[0].quaternion))
-
-    moved = subtract(position, vector_of(pose.device_position))
-    # exactly zero without a turn: rounding would be a velocity that the controller damps
-    turned, last = (0.0, 0.0, 0.0), quaternion_of(pose.device_quaternion)
-    if quaternion != last:
-        turned = rotation_between(last, quaternion)
+    moved, turned = _device_motion(pose, position, quaternion)
     code = refusal(s, moved, turned, elapsed)
     if code != OK:
         return code
@@ -158,13 +166,19 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
         retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
 
-    r.tick = s.loop.tick
-    r.buttons = buttons
-    store_vector(r.device_position, position)
-    store_quaternion(r.device_quaternion, quaternion)
-    store_vector(r.handle_position, handle)
-    store_quaternion(r.handle_quaternion, orientation)
+    row[0].buttons = buttons
+    _record_sample(s, row)
     return OK
+
+
+@compiled
+def _record_sample(s: State, row: NDArray[np.void]) -> None:
+    r, pose = row[0], s.pose
+    r.tick = s.loop.tick
+    store_vector(r.device_position, vector_of(pose.device_position))
+    store_quaternion(r.device_quaternion, quaternion_of(pose.device_quaternion))
+    store_vector(r.handle_position, vector_of(pose.handle_position))
+    store_quaternion(r.handle_quaternion, quaternion_of(pose.handle_quaternion))
 
 
 @compiled
@@ -237,7 +251,7 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
         scheme: One of ``Scheme``.
     """
     return (
-        scheme in (Scheme.IMPLICIT, Scheme.ZERO_ORDER_HOLD, Scheme.MIDPOINT)
+        Scheme(scheme).properties.may_split
         and model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
         and model.nplugin == 0
         and mujoco.get_mjcb_control() is None
@@ -329,11 +343,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
     is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
-    if (
-        not math.isfinite(square)
-        or (scheme == Scheme.ZERO_ORDER_HOLD and is_too_large)
-        or has_warned(s.mj)
-    ):
+    if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or has_warned(s.mj):
         return _refuse(s)
     _render(s, force, torque)
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
@@ -382,7 +392,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     if s.run.scheme == Scheme.MIDPOINT:
         finish_lossless(s)
     add_coupling_work(s.energy, loop.law_work)
-    if not judge_environment(s):
+    if not close_balance(s):
         return _refuse(s)
     loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_tool)))
     loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
@@ -546,16 +556,18 @@ def publish_positions(
         (mj.mocap_pos, 3 * mj.nmocap),
         (mj.mocap_quat, 4 * mj.nmocap),
     ):
-        numbers[end : end + count] = floats(source, count)
-        end += count
+        for value in floats(source, count):
+            numbers[end] = value
+            end += 1
     shown = min(ints(mj.ncon, 1)[0], (numbers.size - end) // 6)
     for c in range(shown):
         contact = pointer_at(mj.contact) + c * mj.contact_size
         slot, frame = numbers[end : end + 6], floats(contact + mj.contact_frame, 9)
         mj_contact_force(mj.model, mj.data, c, slot.ctypes.data)  # along the axes of its frame
         normal, first, second = slot[0], slot[1], slot[2]
-        slot[:3] = floats(contact + mj.contact_point, 3)
+        point = floats(contact + mj.contact_point, 3)
         for axis in range(3):
+            slot[axis] = point[axis]
             slot[3 + axis] = (
                 normal * frame[axis] + first * frame[3 + axis] + second * frame[6 + axis]
             )
@@ -572,7 +584,7 @@ def publish_positions(
 
 
 @compiled
-def _tick(
+def whole_tick(
     state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], elapsed: float
 ) -> bool:
     """Runs one tick; returns True if sample and result were finite."""
@@ -604,7 +616,7 @@ def simulate(
         Count of completed ticks; less than ``samples.size`` if a sample or a result was not finite.
     """
     for k in range(samples.size):
-        if not _tick(state, samples[k : k + 1], row, state[0].run.period):
+        if not whole_tick(state, samples[k : k + 1], row, state[0].run.period):
             return k
         rows[k] = row[0]
     return int(samples.size)
@@ -634,7 +646,7 @@ def simulate_recorded(
     """
     for k in range(samples.size):
         state[0].loop.external_flags = external_flags[k]
-        if not _tick(state, samples[k : k + 1], row, elapsed[k]):
+        if not whole_tick(state, samples[k : k + 1], row, elapsed[k]):
             return k
         rows[k] = row[0]
     return int(samples.size)

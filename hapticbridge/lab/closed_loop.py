@@ -22,9 +22,8 @@ from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled_for_threads, direct
-from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
-from hapticbridge.kernel.tick import advance, after_step, before_step
+from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import Method, prepare, resolve_contact_stiffness
@@ -243,12 +242,8 @@ def _run(
         for _ in range(intervals[k] if k > 0 else 1):
             next_sample(devices, motion, sample)
         elapsed = devices[0].period * intervals[k]
-        for substep in range(s.run.substeps):
-            if before_step(state, sample, row, substep, elapsed) != OK:
-                return k
-            advance(state)
-            if after_step(state, row, substep) != OK:
-                return k
+        if not whole_tick(state, sample, row, elapsed):
+            return k
         wrench = row[0].wrench_on_device
         for i in range(6):
             written[i] = wrench[i]

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.codes import Scheme
+from hapticbridge.kernel.law import Gains, no_gains
 from hapticbridge.rendering import METHODS, Method
+from hapticbridge.scene.checks import check_massless_tool
+from hapticbridge.scene.handle import check_weldable
 from hapticbridge.theory.compensation import IMPLICIT_SHARE
 
-__all__ = ["METHODS"]
+__all__ = ["METHODS", "THEORIES"]
 
 _CREATES = "creates energy in free motion, more the lighter the tool and the stiffer the coupling"
 _HELD_ABOUT = (
@@ -16,6 +22,18 @@ _HELD_ABOUT = (
 _HELD_HAZARD = (
     f"the wrench acts one tick late: it {_CREATES}, and a light tool diverges whatever the device"
 )
+
+
+def _held_gains(_coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
+    return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+
+
+def _gains_with_lag(coupling: Coupling, timestep: float) -> tuple[Gains, Gains]:
+    """Returns gains with K h more damping, which makes an implicit velocity one of position too."""
+    k, b = coupling.stiffness, coupling.damping
+    kr, br = coupling.rotational_stiffness, coupling.rotational_damping
+    return (b, k, b + k * timestep), (br, kr, br + kr * timestep)
+
 
 _COMPARED = (
     Method(
@@ -32,7 +50,7 @@ _COMPARED = (
         hazard="contacts are solved without the coupling's stiffness and may create energy",
         scheme=Scheme.IMPLICIT,
         integrator="implicitfast",
-        has_extra_damping=True,
+        gains=_gains_with_lag,
         added_share=IMPLICIT_SHARE,
     ),
     *(
@@ -42,6 +60,8 @@ _COMPARED = (
             hazard=_HELD_HAZARD,
             scheme=Scheme.ZERO_ORDER_HOLD,
             integrator=integrator,
+            gains=_held_gains,
+            warns=False,
         )
         for integrator in ("Euler", "implicitfast", "RK4")
     ),
@@ -55,6 +75,9 @@ _COMPARED = (
         scheme=Scheme.WELD,
         integrator="implicitfast",
         discretization="none",
+        gains=no_gains,
+        check=check_weldable,
+        warns=False,
     ),
     Method(
         name="direct",
@@ -65,7 +88,24 @@ _COMPARED = (
         scheme=Scheme.MASSLESS,
         integrator="discrete",
         discretization="none",
+        gains=no_gains,
+        check=partial(check_massless_tool, method="direct"),
+        warns=False,
     ),
 )
 
 METHODS.update((method.name, method) for method in _COMPARED)
+
+THEORIES = {
+    "implicit": "implicit",
+    "compensated": "implicit",
+    "lossless": "lossless",
+    "implicitfast": "implicitfast",
+    "implicitfast:compensated": "implicit",
+    "explicit": "explicit",
+    "explicit:rk4": "explicit:rk4",
+    "weld": "implicit",
+}
+"""Theory of a free tool (``lab.maps.tool_mass``) by method; the map ``coupling`` shows these. The
+law of ``weld`` is not that of the coupling; its theory is that of the nominal K and B. On a heavy
+tool the weld is stiffer by the mass, so it has no wall without contact."""

@@ -10,15 +10,12 @@ Reference mechanics: ``rigid_body`` moves a body by four integrators of known en
 behind the coupling; ``impact`` is Routh's method with three laws of restitution.
 """
 
-from hapticbridge.theory.bounds import coupled_stability_limit as coupled_stability_limit
-from hapticbridge.theory.bounds import matrix_margin as matrix_margin
 from hapticbridge.theory.bounds import maximum_stiffness as maximum_stiffness
 from hapticbridge.theory.bounds import minimum_damping as minimum_damping
 from hapticbridge.theory.bounds import stiffest_coupling as stiffest_coupling
 from hapticbridge.theory.bounds import worst_frequency as worst_frequency
 from hapticbridge.theory.compensation import effective_damping as effective_damping
 from hapticbridge.theory.compensation import law_damping as law_damping
-from hapticbridge.theory.compensation import required_device_damping as required_device_damping
 from hapticbridge.theory.device_limits import QuantizationLimit as QuantizationLimit
 from hapticbridge.theory.device_limits import free_device_damping as free_device_damping
 from hapticbridge.theory.device_limits import free_device_stiffness as free_device_stiffness

@@ -70,21 +70,6 @@ def effective_damping(stiffness: float, damping: float, period: float, share: fl
     return damping + scalar("share", share, "") * stiffness * _period(period)
 
 
-def required_device_damping(
-    stiffness: float, effective: float, period: float, share: float
-) -> float:
-    """Returns the device damping b in N s/m required for K and effective B: K T/2 + B'.
-
-    Sufficient for any passive hand and any environment that is discrete-time passive (14).
-    Necessary against a wall, and for λ = ½ against a free tool of any mass. Arguments as for
-    ``law_damping``.
-
-    References:
-        Brown & Colgate 1997, eq. (6), for the law with B'; derivation in the module docstring.
-    """
-    return 0.5 * stiffness * _period(period) + law_damping(stiffness, effective, period, share)
-
-
 def largest_effective_damping(
     device_damping: float, stiffness: float, period: float, share: float
 ) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import Array, shown
 from hapticbridge.errors import MechanicsError
-from hapticbridge.theory.rigid_body import chosen, common_shape, finite, positive, within
+from hapticbridge.theory.rigid_body import CHECK
 
 # Normal velocity of an impact over its normal impulse
 
@@ -112,14 +112,14 @@ class ImpactBody:
     arm: ArrayLike
 
     def __post_init__(self) -> None:
-        arm = finite("arm", self.arm, "m")
+        arm = CHECK.numbers("arm", self.arm, "m")
         if arm.shape[-1:] != (2,):
             raise MechanicsError(f"arm has shape {arm.shape}; it must be (..., 2): r_t, r_n in m")
         mass, inertia = (
-            positive("mass", self.mass, "kg"),
-            positive("inertia", self.inertia, "kg m²"),
+            CHECK.numbers("mass", self.mass, "kg", least=0, is_open=True),
+            CHECK.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True),
         )
-        common_shape(mass=mass, inertia=inertia, arm=arm[..., 0])
+        CHECK.shape(mass=mass, inertia=inertia, arm=arm[..., 0])
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "inertia", inertia)
         object.__setattr__(self, "arm", arm)
@@ -146,13 +146,13 @@ class ImpactBody:
         Raises:
             MechanicsError: The impulse is not finite or mis-shaped.
         """
-        impulse = finite("impulse", impulse, "N s")
+        impulse = CHECK.numbers("impulse", impulse, "N s")
         if impulse.shape[-1:] != (2,):
             raise MechanicsError(
                 f"impulse has shape {impulse.shape}; it must be (..., 2): P_t, P_n"
             )
         mass, inertia, arm = (np.asarray(a) for a in (self.mass, self.inertia, self.arm))
-        common_shape(body=self.compliance()[0], impulse=impulse[..., 0])
+        CHECK.shape(body=self.compliance()[0], impulse=impulse[..., 0])
         moment = arm[..., 0] * impulse[..., 1] - arm[..., 1] * impulse[..., 0]
         changes = (impulse[..., 0] / mass, impulse[..., 1] / mass, moment / inertia)
         return np.stack(np.broadcast_arrays(*changes), axis=-1)
@@ -224,8 +224,8 @@ def resolve_impact(
         Routh 1905, Dynamics of a System of Rigid Bodies I, art. 182 ff.; Stronge 1990, Proc. R.
         Soc. A 431; Brown & Colgate 1997, section 4.
     """
-    chosen("law", law, LAWS)
-    velocity = finite("velocity", velocity, "m/s")
+    CHECK.one_of("law", law, LAWS)
+    velocity = CHECK.numbers("velocity", velocity, "m/s")
     if velocity.shape[-1:] != (2,):
         raise MechanicsError(f"velocity has shape {velocity.shape}; it must be (..., 2): v_t, v_n")
     v_t, v_n = velocity[..., 0], velocity[..., 1]
@@ -234,16 +234,16 @@ def resolve_impact(
             f"normal velocity is {v_n.max():g} m/s; it must be < 0: bodies that do not approach "
             "do not collide"
         )
-    mu = within("friction", friction, "(no unit)", 0, np.inf)
-    e = within("restitution", restitution, "(no unit)", 0, 1)
+    mu = CHECK.numbers("friction", friction, "(no unit)", least=0)
+    e = CHECK.numbers("restitution", restitution, "(no unit)", least=0, most=1)
     for name, one in (("body", body), ("other", other)):
         if not isinstance(one, ImpactBody) and not (name == "other" and one is None):
             raise MechanicsError(f"{name} is {shown(one)}; it must be an ImpactBody")
     a, d, g = body.compliance()
     if other is not None:
-        common_shape(body=a, other=other.compliance()[0])
+        CHECK.shape(body=a, other=other.compliance()[0])
         a, d, g = (left + right for left, right in zip((a, d, g), other.compliance(), strict=True))
-    common_shape(bodies=a, velocity=v_t, friction=mu, restitution=e)
+    CHECK.shape(bodies=a, velocity=v_t, friction=mu, restitution=e)
 
     # overflow is refused below, and results of a division by zero are not used
     with np.errstate(all="ignore"):

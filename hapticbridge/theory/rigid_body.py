@@ -2,70 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.arguments import LARGEST, Arguments, Array, shown
+from hapticbridge.arguments import LARGEST, Arguments, Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
 from hapticbridge.jit import compiled
 from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
-
-# Argument checks of the reference mechanics
+from hapticbridge.theory.transfer import spring_and_damper
 
 MAX_STEPS = 10**8
 """Largest length of a run in steps: a day at 1 kHz, which still fits into memory."""
 
-_ARGUMENTS = Arguments(MechanicsError)
-
-
-def finite(name: str, value: ArrayLike, unit: str) -> Array:
-    """Returns finite numbers as an array, or raises MechanicsError."""
-    return _ARGUMENTS.numbers(name, value, unit)
-
-
-def positive(name: str, value: ArrayLike, unit: str) -> Array:
-    """Returns numbers as an array, all finite and > 0, or raises MechanicsError."""
-    return _ARGUMENTS.numbers(name, value, unit, least=0, is_open=True)
-
-
-def within(name: str, value: ArrayLike, unit: str, low: float, high: float) -> Array:
-    """Returns numbers as an array, all finite and in [low, high], or raises MechanicsError."""
-    return _ARGUMENTS.numbers(name, value, unit, least=low, most=high)
-
-
-def step(period: float) -> float:
-    """Returns the period T in s, one finite number > 0, or raises MechanicsError."""
-    return _ARGUMENTS.number("period", period, "s", least=0, is_open=True)
-
-
-def whole(name: str, value: int, least: int) -> int:
-    """Returns a whole number in [least, ``MAX_STEPS``], or raises MechanicsError."""
-    return _ARGUMENTS.whole(name, value, least=least, most=MAX_STEPS)
-
-
-def chosen(name: str, value: str, valid: Iterable[str]) -> str:
-    """Returns the value if it is one of the valid names, or raises MechanicsError."""
-    return _ARGUMENTS.one_of(name, value, valid)
-
-
-def common_shape(**arrays: Array) -> tuple[int, ...]:
-    """Returns the broadcast shape of the arrays, or raises MechanicsError."""
-    return _ARGUMENTS.shape(**arrays)
-
-
-def spring_and_damper(coupling: Coupling) -> tuple[float, float]:
-    """Returns K in N/m and B in N s/m of a coupling, or raises MechanicsError."""
-    if not isinstance(coupling, Coupling):
-        raise MechanicsError(f"coupling is {shown(coupling)}; it must be a Coupling")
-    return (
-        _ARGUMENTS.number("coupling stiffness", float(coupling.stiffness), "N/m", least=0),
-        _ARGUMENTS.number("coupling damping", float(coupling.damping), "N s/m", least=0),
-    )
+CHECK = Arguments(MechanicsError)
+"""Argument checks of the reference mechanics."""
 
 
 # Point mass under a prescribed force, with four integrators and their generated energy
@@ -153,13 +107,19 @@ def integrate_particle(
     References:
         Brown & Colgate 1997, eqs. (15), (17).
     """
-    chosen("scheme", scheme, SCHEMES)
-    mass, period = positive("mass", mass, "kg"), step(period)
-    position, velocity = finite("position", position, "m"), finite("velocity", velocity, "m/s")
-    force = finite("force", force, "N")
+    CHECK.one_of("scheme", scheme, SCHEMES)
+    mass, period = (
+        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
+        CHECK.number("period", period, "s", least=0, is_open=True),
+    )
+    position, velocity = (
+        CHECK.numbers("position", position, "m"),
+        CHECK.numbers("velocity", velocity, "m/s"),
+    )
+    force = CHECK.numbers("force", force, "N")
     if force.ndim == 0 or len(force) < 2:
         raise MechanicsError(f"force has shape {force.shape}; it must be (N + 1, ...) with N >= 1")
-    shape = common_shape(mass=mass, force=force[0], position=position, velocity=velocity)
+    shape = CHECK.shape(mass=mass, force=force[0], position=position, velocity=velocity)
     acting = force[1:] if scheme in {"implicit", "midpoint"} else force[:-1]
     gained = np.cumsum(period / mass * acting, axis=0)
     v = np.empty((len(force), *shape))
@@ -240,15 +200,18 @@ def drive_mass(
         Brown & Colgate 1997, eqs. (4), (15); Kim, Lee et al. 2017, "Haptic rendering and
         interactive simulation using passive midpoint integration", Int. J. Robotics Research 36.
     """
-    chosen("scheme", scheme, COUPLED_SCHEMES)
-    mass, period = positive("mass", mass, "kg"), step(period)
-    h = finite("handle position", handle, "m")
+    CHECK.one_of("scheme", scheme, COUPLED_SCHEMES)
+    mass, period = (
+        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
+        CHECK.number("period", period, "s", least=0, is_open=True),
+    )
+    h = CHECK.numbers("handle position", handle, "m")
     if h.ndim == 0 or len(h) < 2:
         raise MechanicsError(f"handle has shape {h.shape}; it must be (N + 1, ...) with N >= 1")
-    start = h[0] if position is None else finite("position", position, "m")
-    velocity = finite("velocity", velocity, "m/s")
-    k, b = (np.asarray(value) for value in spring_and_damper(coupling))
-    shape = common_shape(mass=mass, handle=h[0], position=start, velocity=velocity, coupling=k + b)
+    start = h[0] if position is None else CHECK.numbers("position", position, "m")
+    velocity = CHECK.numbers("velocity", velocity, "m/s")
+    k, b = spring_and_damper(coupling)
+    shape = CHECK.shape(mass=mass, handle=h[0], position=start, velocity=velocity, coupling=k + b)
     if scheme == "compensated":
         b = np.maximum(b - k * period, 0)
     f, x, v = (np.empty((len(h), *shape)) for _ in range(3))
@@ -286,8 +249,11 @@ def exact_mass_response(
     Mass in kg and frequency in Hz must be finite and > 0, and broadcast; otherwise MechanicsError
     is raised. At the resonance of an undamped mass X/H is inf.
     """
-    mass, frequency = positive("mass", mass, "kg"), positive("frequency", frequency, "Hz")
-    common_shape(mass=mass, frequency=frequency)
+    mass, frequency = (
+        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
+        CHECK.numbers("frequency", frequency, "Hz", least=0, is_open=True),
+    )
+    CHECK.shape(mass=mass, frequency=frequency)
     omega = 2 * np.pi * frequency
     stiffness, damping = spring_and_damper(coupling)
     impedance = stiffness + 1j * omega * damping
@@ -376,11 +342,14 @@ def integrate_rotation(
         Simo & Wong 1991, Int. J. Numerical Methods in Engineering 31 (midpoint); the other three
         are Brown & Colgate's schemes (15), (17) applied to Euler's equations.
     """
-    chosen("scheme", scheme, SCHEMES)
-    inertia, period = positive("inertia", inertia, "kg m²"), step(period)
-    omega = finite("angular velocity", angular_velocity, "rad/s")
-    steps = whole("steps", steps, least=1)
-    tau = np.zeros((steps + 1, 3)) if torque is None else finite("torque", torque, "N m")
+    CHECK.one_of("scheme", scheme, SCHEMES)
+    inertia, period = (
+        CHECK.numbers("inertia", inertia, "kg m²", least=0, is_open=True),
+        CHECK.number("period", period, "s", least=0, is_open=True),
+    )
+    omega = CHECK.numbers("angular velocity", angular_velocity, "rad/s")
+    steps = CHECK.whole("steps", steps, least=1, most=MAX_STEPS)
+    tau = np.zeros((steps + 1, 3)) if torque is None else CHECK.numbers("torque", torque, "N m")
     if len(np.atleast_1d(tau)) != steps + 1:
         raise MechanicsError(f"torque has shape {tau.shape}; it must be ({steps + 1}, ..., 3)")
     for name, array in (("inertia", inertia), ("angular velocity", omega), ("torque", tau[0])):
@@ -392,7 +361,7 @@ def integrate_rotation(
             "a principal moment exceeds the sum of the other two, which no rigid body has; "
             "correct the moments of inertia"
         )
-    shape = common_shape(inertia=inertia, angular_velocity=omega, torque=tau[0])
+    shape = CHECK.shape(inertia=inertia, angular_velocity=omega, torque=tau[0])
     tau = tau.reshape(len(tau), *(1,) * (len(shape) + 1 - tau.ndim), *tau.shape[1:])
     rates = np.empty((steps + 1, *shape))
     turns = np.empty((steps + 1, *shape[:-1], 4))

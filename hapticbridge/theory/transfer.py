@@ -47,11 +47,6 @@ def frequencies(value: ArrayLike) -> NDArray[np.float64]:
     return _FREQUENCIES.numbers("frequency", value, "rad/s", least=0, is_open=True)
 
 
-def finite(name: str, value: ArrayLike, unit: str = "") -> NDArray[np.float64]:
-    """Returns finite numbers of any sign as an array, or raises CouplingError."""
-    return _ARGUMENTS.numbers(name, value, unit)
-
-
 def whole(name: str, value: int, least: int = 0, most: int = MAX_SAMPLES) -> int:
     """Returns a whole number of samples in [least, most], or raises CouplingError."""
     return _ARGUMENTS.whole(name, value, "samples", least=least, most=most)

@@ -14,7 +14,6 @@ not been verified on hardware.
 from __future__ import annotations
 
 import array
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,7 +21,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import USUAL_TORQUE_LIMIT, DeviceInfo, checked_period, stated_numbers
+from hapticbridge.device.base import (
+    TIMING,
+    USUAL_TORQUE_LIMIT,
+    DeviceInfo,
+    checked_period,
+    stated_numbers,
+    usual_delay,
+)
 from hapticbridge.device.driver import Driver, Notify, UsbId, ignore_message, select_device
 from hapticbridge.device.falcon.kinematics import (
     BELIEVED,
@@ -61,9 +67,6 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 # Measured timing of a Falcon
 
-TIME = 0.1
-"""Length of each of the two measurements in s."""
-
 UNDER_WAY = 2
 """Number of requests kept on their way while the rate is measured, so that one waits when a reply
 leaves."""
@@ -71,10 +74,6 @@ leaves."""
 PACE = 1.07e-3
 """Time in s between requests while the delay is measured. It is slightly longer than the bridge's
 timer of 1 ms, so that the requests sweep over all its phases."""
-
-SHARE = 0.95
-"""Share of replies within the delay, without unit. The slowest replies are stalls of the host,
-which the loop counts as missed deadlines."""
 
 TRIES = 3
 """Number of measurements before a Falcon counts as silent. A reply can be lost on the serial line,
@@ -89,9 +88,9 @@ def measured_timing(link: Link, stream: ReplyStream, name: str) -> tuple[float, 
 
     The rate is measured with ``UNDER_WAY`` requests always on their way; replies that arrive
     together are one delivery. The delay is the time from a single request to its reply that the
-    share ``SHARE`` of the replies meets. A packet both requests the encoders and carries the force,
-    so both have this delay. With one packet per tick the force acts after the delay, rounded up to
-    whole ticks, beyond the one tick for which it is held.
+    share ``device.base.ON_TIME`` of the replies meets. A packet both requests the encoders and
+    carries the force, so both have this delay. With one packet per tick the force acts after the
+    delay, rounded up to whole ticks, beyond the one tick for which it is held.
 
     Raises:
         DeviceLost: The device stopped replying.
@@ -111,7 +110,7 @@ def _rate(link: Link, stream: ReplyStream) -> float | None:
         send_question(link)
     begin = last = link.now()
     deliveries = 0
-    while last - begin < TIME:
+    while last - begin < TIMING:
         found = answers(link, stream, _ANSWER_TIME)
         if not found:
             return None
@@ -129,7 +128,7 @@ def _rate(link: Link, stream: ReplyStream) -> float | None:
 def _delay(link: Link, stream: ReplyStream) -> float | None:
     """Measures the delay in s; None if a reply is missing."""
     times = []
-    end = link.now() + TIME
+    end = link.now() + TIMING
     while (begin := link.now()) < end:
         if not ask(link, stream, 0, _ANSWER_TIME):
             return None
@@ -137,8 +136,7 @@ def _delay(link: Link, stream: ReplyStream) -> float | None:
         while (left := begin + PACE - link.now()) > 0:
             link.wait(left)
             link.take()  # the bridge reports its status every millisecond
-    times.sort()
-    return times[math.ceil(SHARE * len(times)) - 1]
+    return usual_delay(times)
 
 
 class FalconDevice:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
-import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hapticbridge.device.base import USUAL_TORQUE_LIMIT
+from hapticbridge.device.base import TIMING, USUAL_TORQUE_LIMIT, usual_delay
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
@@ -139,9 +138,6 @@ MAX_WATCHDOG = 255
 WATCHDOG_STEP = 125e-6
 """Step of the watchdog in s."""
 
-TIMING, SHARE = 0.1, 0.95
-"""Time in s for which exchanges are measured, and share of them, without unit, within the delay."""
-
 _NUMBERS = POINTER(c_double)
 
 FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
@@ -237,7 +233,7 @@ class Dhd:
         return code >= 0
 
     def timing(self, exchange: Callable[[], object]) -> tuple[float, float]:
-        """Measures the rate of exchanges in Hz and the time in s that the share ``SHARE`` meets.
+        """Measures the rate of exchanges in Hz and the time in s that the share ``ON_TIME`` meets.
 
         ``exchange`` reads a sample and writes a force; it is repeated for ``TIMING``.
         """
@@ -248,8 +244,7 @@ class Dhd:
             now = self.now()
             times.append(now - last)
             last = now
-        times.sort()
-        return len(times) / (last - begin), times[math.ceil(SHARE * len(times)) - 1]
+        return len(times) / (last - begin), usual_delay(times)
 
 
 def located(library: object = None) -> str:

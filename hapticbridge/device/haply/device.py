@@ -24,12 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
+    TIMING,
     USUAL_SPEED_LIMIT,
     USUAL_TORQUE_LIMIT,
     DeviceInfo,
     checked_number,
     checked_period,
     stated_numbers,
+    usual_delay,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, ignore_message, select_device
 from hapticbridge.device.haply import messages
@@ -42,15 +44,8 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 # Measured timing of the service
 
-TIME = 0.1
-"""Length of each of the two measurements in s."""
-
 UNDER_WAY = 2
 """Number of messages kept on their way while the rate is measured, as in the loop."""
-
-SHARE = 0.95
-"""Share of answers within the delay, without unit. The slowest answers are stalls of the host,
-which the loop counts as missed deadlines."""
 
 PACE = 1e-3
 """Time in s between messages while the delay is measured: a period of the loop, so that threads
@@ -78,7 +73,7 @@ def _rate(link: Link, message: str, name: str) -> float:
     _answer(link, name)
     begin = link.now()
     count = 0
-    while (now := link.now()) - begin < TIME:
+    while (now := link.now()) - begin < TIMING:
         link.send(message)
         _answer(link, name)
         count += 1
@@ -89,14 +84,13 @@ def _rate(link: Link, message: str, name: str) -> float:
 
 def _delay(link: Link, message: str, name: str) -> float:
     times = []
-    end = link.now() + TIME
+    end = link.now() + TIMING
     while (begin := link.now()) < end:
         link.send(message)
         _answer(link, name)
         times.append(link.now() - begin)
         link.wait(max(begin + PACE - link.now(), 0.0))  # no answer is due, so this only sleeps
-    times.sort()
-    return times[math.ceil(SHARE * len(times)) - 1]
+    return usual_delay(times)
 
 
 def _answer(link: Link, name: str) -> None:

@@ -70,8 +70,6 @@ ENABLE = 1
 NUMBERS_PAGE, NAME_PAGE = 0, 1
 """Pages of the sheet, byte 3 of a frame that requests or holds one."""
 
-NAME_BYTES = 54
-
 _STATE = struct.Struct("<BBBBHHI12fH")
 _FORCE = struct.Struct("<BBBBHH6f30x")
 _NUMBERS = struct.Struct("<BBBBHH11f10x")
@@ -172,33 +170,6 @@ def force_frame(
 def ask_frame(sequence: int, page: int) -> bytes:
     """Returns the frame that requests a page of the sheet."""
     return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 6))
-
-
-def state_frame(state: State) -> bytes:
-    """Returns a device's state frame."""
-    return _sealed(
-        _STATE.pack(
-            MAGIC,
-            VERSION,
-            Kind.STATE,
-            state.status,
-            state.sequence,
-            state.buttons,
-            state.time_us,
-            *state.numbers,
-            state.echo,
-        )
-    )
-
-
-def sheet_frames(sequence: int, numbers: Numbers, name: str) -> tuple[bytes, bytes]:
-    """Returns both pages of a device's sheet; the name is truncated to 54 bytes in UTF-8."""
-    head = MAGIC, VERSION, Kind.SHEET
-    text = name.encode()[:NAME_BYTES].decode(errors="ignore").encode()
-    return (
-        _sealed(_NUMBERS.pack(*head, NUMBERS_PAGE, sequence, *numbers)),
-        _sealed(_NAME.pack(*head, NAME_PAGE, sequence, 0, text)),
-    )
 
 
 def _sealed(body: bytes) -> bytes:

@@ -85,6 +85,26 @@ def _machine_code() -> Callable[[NDArray[np.void], NDArray[np.float64], NDArray[
     )
 
 
+def _check_hands(
+    hand: Hand | WorstHand | None, rotational_hand: WorstHand | None, friction: float
+) -> None:
+    is_line = isinstance(hand, WorstHand)
+    if rotational_hand is not None and not is_line:
+        raise DeviceError("rotational_hand requires a WorstHand as hand")
+    if is_line and friction:
+        raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
+
+
+def _target(
+    hand: Hand | WorstHand | None, path: str | os.PathLike[str] | Motion | None
+) -> tuple[NDArray[np.float64], float | None]:
+    """Returns the table of the hand's path and its duration in s; an empty one without a path."""
+    if not isinstance(hand, Hand) or path is None:
+        return np.empty((0, 8)), None
+    motion = path if isinstance(path, Motion) else read_motion(path)
+    return np.ascontiguousarray(motion.relative().table), motion.duration
+
+
 class SimulatedDevice:
     """Six-axis device with inertia and damping, held by a hand that follows a path.
 
@@ -149,17 +169,8 @@ class SimulatedDevice:
     ) -> None:
         if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
-        self._motion = np.empty((0, 8))
-        duration = None
-        is_line = isinstance(hand, WorstHand)
-        if rotational_hand is not None and not is_line:
-            raise DeviceError("rotational_hand requires a WorstHand as hand")
-        if is_line and friction:
-            raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
-        if hand is not None and not is_line and path is not None:
-            motion = path if isinstance(path, Motion) else read_motion(path)
-            self._motion = np.ascontiguousarray(motion.relative().table)
-            duration = motion.duration
+        _check_hands(hand, rotational_hand, friction)
+        self._motion, duration = _target(hand, path)
         mass = checked_number("mass", mass, "kg", is_positive=True)
         damping = checked_number("damping", damping, "N s/m")
         rotational_inertia = checked_number(

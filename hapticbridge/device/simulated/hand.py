@@ -5,11 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-import numpy as np
-
-from hapticbridge.arguments import Arguments
 from hapticbridge.device.base import checked_number
-from hapticbridge.errors import DeviceError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,33 +51,6 @@ class Hand:
 
 
 DEFAULT_HAND = Hand()
-
-HAND_RANGES = {
-    "mass": (0.05, 2.0),
-    "damping": (0.5, 50.0),
-    "stiffness": (10.0, 2000.0),
-    "rotational_inertia": (1e-4, 1e-2),
-    "rotational_damping": (2e-3, 0.2),
-    "rotational_stiffness": (0.1, 10.0),
-}
-"""Ranges of random hands in the units of ``Hand``: from two fingers that hardly hold to an arm that
-grips hard, around the measured arm of the defaults. Every hand in them is passive."""
-
-
-def random_hand(seed: int) -> Hand:
-    """Returns a random passive hand that depends only on the seed, a whole number >= 0.
-
-    Every value is drawn independently, evenly in its logarithm, from its ``HAND_RANGES``.
-    """
-    Arguments(DeviceError).whole("seed", seed, least=0, most=2**63 - 1)
-    generator = np.random.default_rng(seed)
-    return Hand(
-        **{
-            name: float(np.exp(generator.uniform(np.log(least), np.log(most))))
-            for name, (least, most) in HAND_RANGES.items()
-        }
-    )
-
 
 NO_HAND = Hand(
     mass=0.0,

@@ -18,7 +18,6 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory import pose_at
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.chart.setting import OWN, Setting, ShippedOptions
@@ -213,7 +212,7 @@ class Stages:
 
     def for_method(self, setting: Setting) -> Stage:
         """Returns the stage that a setting runs on."""
-        is_weld = setting.method.scheme == Scheme.WELD
+        is_weld = setting.method.is_weld
         if is_weld not in self._stages:
             self._stages[is_weld] = self._make()
         return self._stages[is_weld]
@@ -364,7 +363,7 @@ class Staged(ABC):
             StudyError: The method omits the tool's own dynamics, which the workload judges.
         """
         method = setting.method
-        if self.needs_tool and method.scheme in (Scheme.WELD, Scheme.MASSLESS):
+        if self.needs_tool and (method.is_weld or not method.has_coupling):
             raise StudyError(f"method '{method.name}' {self.needs_tool}")
         return SceneRun(self._stages.for_method(setting), setting, self._judge)
 

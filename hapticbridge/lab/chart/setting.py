@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import StudyError
-from hapticbridge.kernel.codes import Scheme
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
@@ -250,7 +249,7 @@ def settings_for(
     points += [
         Setting(method, usual, substeps=count)
         for method in methods
-        if method.scheme not in (Scheme.MIDPOINT, Scheme.MASSLESS)
+        if not method.scheme.properties.one_substep
         for count in SUBSTEPS
     ]
     if has_contact:

@@ -462,6 +462,15 @@ def of_method(table: Table, what: str, name: str) -> Table:
     return table.select((table["what"] == what) & (table["method"] == name))
 
 
+def panels(figure: Figure, count: int) -> list[Axes]:
+    """Returns panels with shared axes in rows of three, such as one a method."""
+    rows = -(-count // 3)
+    all_panels = figure.subplots(rows, 3, sharex=True, sharey=True, squeeze=False).ravel()
+    for spare in all_panels[count:]:
+        spare.remove()
+    return list(all_panels[:count])
+
+
 def draw_verdicts(
     axes: Axes,
     x: NDArray[np.float64],

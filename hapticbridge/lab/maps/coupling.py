@@ -17,7 +17,7 @@ from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
 from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
-from hapticbridge.lab.methods import METHODS
+from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
@@ -43,20 +43,6 @@ TICKS = 2000
 KNOCK = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
 """Displacement that starts a run of the worst hand, in m: 0.1 mm, so that a loop that decays never
 reaches the wall 10 mm away."""
-
-THEORIES: Mapping[str, str] = {
-    "implicit": "implicit",
-    "compensated": "implicit",
-    "lossless": "lossless",
-    "implicitfast": "implicitfast",
-    "implicitfast:compensated": "implicit",
-    "explicit": "explicit",
-    "explicit:rk4": "explicit:rk4",
-    "weld": "implicit",
-}
-"""Theory of a free tool that tunes a method's worst hand. The law of ``weld`` is not that of the
-coupling; its hand is that of the nominal K and B. On a heavy tool the weld is stiffer by the mass,
-so it has no wall without contact."""
 
 STIFFNESS = (100.0, 20_000.0)
 """Range of K in N/m, even in its logarithm: from soft to five times the bound at B = 0."""
@@ -194,8 +180,7 @@ FINE = 201
 def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     """Draws K against B by method, with the bounds and the measured limits on top."""
     figure = new_figure(8, 8.4)
-    *panels, last = figure.subplots(3, 3, sharex=True, sharey=True).ravel()
-    last.remove()
+    panels = base.panels(figure, len(THEORIES))
     for axes, name in zip(panels, THEORIES, strict=True):
         has_wall = METHODS[name].has_law
         _draw_cells(axes, base.of_method(table, "cell", name))
@@ -204,7 +189,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
         axes.plot(limits["damping"], limits.numbers("limit"), "o", color="black", ms=4, mfc="white")
         axes.set_title(f"{name}{_note(name)}", fontsize="medium")
         axes.set(xlim=DAMPING, ylim=STIFFNESS)
-    for axes in panels[5:]:
+    for axes in panels[-3:]:
         axes.set_xlabel("coupling damping B (N s/m)")
         axes.tick_params(labelbottom=True)
     for axes in panels[::3]:

@@ -18,7 +18,7 @@ from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
-from hapticbridge.lab.methods import METHODS
+from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.sampled_loop import WorstHand
@@ -168,15 +168,8 @@ HELD_STILL = 1e9
 PATH = base.swinging(0.0025, 3.0, duration=2.0, count=401)
 """Path of a hand that swings the tool by 5 mm at 3 Hz, without rotation."""
 
-THEORIES: Mapping[str, str] = {
-    "implicit": "implicit",
-    "compensated": "implicit",
-    "lossless": "lossless",
-    "implicitfast": "implicitfast",
-    "explicit": "explicit",
-    "explicit:rk4": "explicit:rk4",
-}
-"""Methods shown, each with its theory of a free tool."""
+SHOWN = tuple(name for name in THEORIES if name not in ("implicitfast:compensated", "weld"))
+"""Methods shown. The two left out have the theory of ``implicit`` by construction or nominally."""
 
 LIMITS = 9
 """Number of K per method at which the limits in mass are searched."""
@@ -187,18 +180,18 @@ SEARCHES = ("held still", "worst hand")
 
 def points(count: int) -> Sequence[Point]:
     """Returns a grid of mass and stiffness per method, and searches for the limit in mass."""
-    side = max(2, round((count / len(THEORIES)) ** 0.5))
+    side = max(2, round((count / len(SHOWN)) ** 0.5))
     stiffness = np.geomspace(*STIFFNESS, side)
     cells: list[Point] = [
         {"what": "cell", "method": name, "stiffness": float(k), "mass": float(m)}
-        for name in THEORIES
+        for name in SHOWN
         for k in stiffness
         for m in np.geomspace(*MASS, side)
     ]
     # two to a column of the picture, and away from the grid's own values
     limits: list[Point] = [
         {"what": what, "method": name, "stiffness": float(k), "mass": 0.0}
-        for name in THEORIES
+        for name in SHOWN
         for k in np.geomspace(1.1 * STIFFNESS[0], STIFFNESS[1] / 1.1, min(LIMITS, side))
         for what in SEARCHES
     ]
@@ -291,7 +284,7 @@ def predicted_limit(name: str, stiffness: float, *, is_held: bool) -> Mapping[st
     """Returns the theoretical mass at which stability changes, within ``MASS``.
 
     Args:
-        name: One of ``THEORIES``.
+        name: One of ``SHOWN``.
         stiffness: K in N/m, > 0.
         is_held: True for a handle that is held still; False for the worst hand of the device.
 
@@ -343,8 +336,8 @@ _LINES = (
 def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     """Draws stiffness against mass by method, theory on top."""
     figure = new_figure(8, 7.6)
-    panels = figure.subplots(2, 3, sharex=True, sharey=True).ravel()
-    for axes, name in zip(panels, THEORIES, strict=True):
+    panels = base.panels(figure, len(SHOWN))
+    for axes, name in zip(panels, SHOWN, strict=True):
         cells = base.of_method(table, "cell", name)
         verdict = base.verdict_numbers(is_stable(cells), cells.texts("environment"))
         base.draw_verdicts(axes, cells["mass"], cells["stiffness"], verdict, log_x=True, log_y=True)
@@ -356,7 +349,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
             )
         axes.set_title(name, fontsize="medium")
         axes.set(xlim=MASS, ylim=STIFFNESS)
-    for axes in panels[3:]:
+    for axes in panels[-3:]:
         axes.set_xlabel("tool mass m (kg)")
         axes.set_xticks(np.geomspace(MASS[0], MASS[1] / 10, 4))  # the last would touch the next
     for axes in panels[::3]:
@@ -409,7 +402,7 @@ def _draw_theory(axes: Axes, name: str) -> None:
 def summarize(table: Table) -> dict[str, Any]:
     """Counts failures by method, and compares the limits in mass with theory."""
     methods: dict[str, dict[str, Any]] = {}
-    for name in THEORIES:
+    for name in SHOWN:
         cells = base.of_method(table, "cell", name)
         methods[name] = _counts(name, cells) if len(cells) else {}
         for what in SEARCHES:

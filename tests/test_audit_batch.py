@@ -28,8 +28,8 @@ from hapticbridge.recording import read_recording
 
 # their packages hold functions of these names
 batch = importlib.import_module("hapticbridge.audit.batch")
-WEAK = Coupling(stiffness=1000, damping=0.9, rotational_stiffness=1, rotational_damping=9e-4)
-STIFF = Coupling(stiffness=6000, damping=0.5, rotational_stiffness=1, rotational_damping=9e-4)
+WEAK = Coupling(1000, 0.9, 1, 9e-4)
+STIFF = Coupling(6000, 0.5, 1, 9e-4)
 
 
 @pytest.fixture(scope="module")
@@ -163,26 +163,16 @@ def test_the_command_prints_a_line_each_and_the_worst_exit_code(
 ) -> None:
     target = tmp_path / "all.csv"
     code, out, err = call("audit", runs, "--table", target)
-    assert code == 2
-    lines = out.splitlines()
-    order = [index for index, line in enumerate(lines) if ".mcap" in line and "  " in line]
-    assert "foreign.mcap" in lines[order[0]]
-    assert "(cut)" in next(line for line in lines if "cut.mcap" in line)
-    assert "the device has less damping than the coupling needs" in out
+    assert (code, f"wrote {target}" in err) == (2, True)
+    assert "(cut)" in next(line for line in out.splitlines() if "cut.mcap" in line)
     assert "6 recordings: 4 passive, 1 invalid, 1 unreadable" in out
-    assert f"wrote {target}" in err
     with target.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
     assert rows[2]["verdict"] == "passive"
     assert float(rows[2]["margin"]) == pytest.approx(-0.5)
-    code, out, _ = call("audit", f"{runs}/a/b/*.mcap")
-    assert code == 0
-    assert "1 recording: 1 passive" in out
     code, out, err = call("audit", runs, "--json", "--jobs", 1)
     assert (code, len(json.loads(out)), err.count("error:")) == (2, 5, 1)
-    code, _, err = call("audit", runs, "--what-if", "rate=500")
-    assert (code, "one recording at a time" in err) == (2, True)
 
 
 def test_a_table_that_cannot_be_written_is_refused_before_anything_is_audited(

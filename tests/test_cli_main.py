@@ -1,4 +1,4 @@
-"""Start of a command: what is imported for it, its entry in the table, and what ends it early."""
+"""The command line: imports of a command, its entry in the table, refusals, and its end."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import signal
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
+import mujoco
 import pytest
-from cli_cases import Called
+from cli_cases import Called, one_sentence
 
+from hapticbridge.cli import main
 from hapticbridge.cli.main import COMMANDS
 from hapticbridge.signals import leaving_on_interrupt
 
@@ -24,7 +27,8 @@ HEAVY = frozenset(
 """Packages that neither the version nor the top-level help needs."""
 
 NOT_FOR_A_RUN = frozenset(
-    {
+    [
+        "numba",
         "matplotlib",
         "scipy.signal",
         "scipy.spatial",
@@ -59,7 +63,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.lab",
         "hapticbridge.view",
         "hapticbridge.whatif",
-    }
+    ]
 )
 """Packages and modules that a run with the simulated device, without view, does not need."""
 
@@ -112,7 +116,8 @@ def test_version_and_help_import_nothing_heavy(flag: str) -> None:
 
 
 def test_a_run_imports_nothing_that_it_does_not_use() -> None:
-    loaded = loaded_by("run", "point_mass", "--fast", "--duration", "0.01")
+    for _ in range(2):  # the first run on a machine compiles
+        loaded = loaded_by("run", "point_mass", "--fast", "--duration", "0.01")
     assert "hapticbridge.bridge" in loaded
     assert not NOT_FOR_A_RUN & loaded
 
@@ -124,17 +129,12 @@ def test_what_a_run_must_not_import_exists(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_table_has_the_summary_of_each_command(name: str) -> None:
+def test_a_command_has_the_summary_of_the_table_and_a_dozen_first_options(name: str) -> None:
     documentation = inspect.getdoc(command_class(name))
     assert documentation is not None
     assert documentation.splitlines()[0] == COMMANDS[name].summary
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_first_options_are_options(name: str) -> None:
-    command = command_class(name)
-    options = [field.name for field in fields(command)]
-    first = getattr(command, "FIRST_OPTIONS", options)
+    options = [field.name for field in fields(command_class(name))]
+    first = getattr(command_class(name), "FIRST_OPTIONS", options)
     assert set(first) <= set(options)
     assert len(first) <= 12
 
@@ -161,18 +161,6 @@ def test_a_long_help_has_two_parts(call: Called) -> None:
     flags = [set(re.findall(r"^. (--[a-z-]+)", text, flags=re.MULTILINE)) for text in (out, every)]
     assert flags[0] < flags[1]
     assert len(flags[1]) - len(flags[0]) == int(more[1])
-
-
-@pytest.mark.parametrize(
-    ("word", "sentence"),
-    [
-        ("exprot", "error: there is no command 'exprot'; did you mean 'export'?"),
-        ("xyz", "error: there is no command 'xyz'; 'hapticbridge --help' lists the commands"),
-        ("--fast", "error: there is no option '--fast'; 'hapticbridge --help' lists the commands"),
-    ],
-)
-def test_a_wrong_command_is_one_sentence(word: str, sentence: str, call: Called) -> None:
-    assert call(word) == (2, "", sentence + "\n")
 
 
 @pytest.mark.parametrize("value", ["nonsense", "[red]\n"])
@@ -205,3 +193,78 @@ def test_a_handler_of_sigint_that_is_not_pythons_own_is_kept() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
+def test_ctrl_c_is_one_word_and_exit_code_130(
+    where: str, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_arguments: object, **_named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(where, interrupted)
+    code, out, err = call("stability", "rate")
+    assert (code, out, err.strip()) == (130, "", "interrupted")
+
+
+def test_calling_the_command_line_leaves_warnings_as_they_were(call: Called) -> None:
+    import warnings
+
+    before = warnings.showwarning
+    call("scenes")
+    assert warnings.showwarning is before
+
+
+def test_version_names_the_package_and_mujoco(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert f"MuJoCo {mujoco.mj_versionString()}" in capsys.readouterr().out
+
+
+def test_a_name_that_is_too_long_for_the_system_is_refused(call: Called) -> None:
+    for command in (("run", "point_mass", "--fast", "--record"), ("repair", "x.mcap")):
+        code, _, err = call(*command, "x" * 300 + ".mcap")
+        assert code == 2
+        one_sentence(err)
+
+
+def test_results_that_nobody_has_room_for_are_one_sentence() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "bound", "--stiffness", "100"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert one_sentence(done.stderr) == "error: cannot write: No space left on device"
+
+
+@pytest.mark.parametrize("content", [None, b"", b"hello"])
+def test_what_is_no_recording_is_refused_in_one_sentence(
+    content: bytes | None, call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "[red]what.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    for command in (("audit", path), ("repair", path, tmp_path / "out.mcap")):
+        code, out, err = call(*command)
+        assert (code, out) == (2, "")
+        assert "[red]what.mcap" in one_sentence(err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(), ("frobnicate",), ("run",), ("run", "point_mass", "--bogus"), ("audit", "x", "--bogus")],
+)
+def test_wrong_usage_is_exit_code_2_without_a_traceback(
+    arguments: tuple[str, ...], call: Called
+) -> None:
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert err and "Traceback" not in err
+
+
+def test_help_into_a_reader_that_went_away_ends_without_a_traceback() -> None:
+    command = [sys.executable, "-m", "hapticbridge", "--help"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert told == b""

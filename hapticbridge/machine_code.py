@@ -1,0 +1,281 @@
+"""Machine code of compiled functions, kept on disk and called without numba.
+
+Importing numba and its registries takes longer than all else at the start of a run. A file of this
+module holds one function as an object file, which llvmlite loads alone. The code is numba's own;
+an entry in front of it takes Python objects apart (``METH_FASTCALL``).
+
+A function can be kept if it needs only MuJoCo, the C library and CPython. Code that may allocate or
+raise needs numba's runtime; the linker then refuses it, and the caller uses numba.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numpy as np
+
+Kind = type | tuple[np.dtype[Any], int]
+"""Type of an argument: ``bool``, ``int`` or ``float``; or the type of an array's items and the
+number of its axes, 0 for a record."""
+
+_ENTRY = "hapticbridge_entry"
+
+_HEADER = object.__basicsize__
+"""Size in bytes of the header of Python objects. In an array, the address of the data follows, the
+number of axes in 8 bytes, and the address of the shape; in a record, a size in 8 bytes and the
+address of the data. NumPy's public C headers declare both."""
+
+_FAST_CALL = 0x80
+"""Flag ``METH_FASTCALL``: a function is called with an array of arguments and their number."""
+
+_RESULTS = {
+    "none": ("ptr", "call void @Py_IncRef(ptr @_Py_NoneStruct)\nret ptr @_Py_NoneStruct"),
+    "bool": (
+        "i8",
+        "%byte = load i8, ptr %place\n%wide = zext i8 %byte to i64\n"
+        "%object = call ptr @PyBool_FromLong(i64 %wide)\nret ptr %object",
+    ),
+    "int64": (
+        "i64",
+        "%number = load i64, ptr %place\n"
+        "%object = call ptr @PyLong_FromLongLong(i64 %number)\nret ptr %object",
+    ),
+    "float64": (
+        "double",
+        "%number = load double, ptr %place\n"
+        "%object = call ptr @PyFloat_FromDouble(double %number)\nret ptr %object",
+    ),
+}
+"""Type of a result in memory and the code that returns it as an object, by numba's name of it."""
+
+_DECLARATIONS = """
+declare double @PyFloat_AsDouble(ptr)
+declare i64 @PyLong_AsLongLong(ptr)
+declare i32 @PyObject_IsTrue(ptr)
+declare ptr @PyBool_FromLong(i64)
+declare ptr @PyLong_FromLongLong(i64)
+declare ptr @PyFloat_FromDouble(double)
+declare void @Py_IncRef(ptr)
+@_Py_NoneStruct = external global i8
+"""
+
+
+def kind_of(argument: object) -> Kind | None:
+    """Returns the type of an argument; None if an entry cannot take it apart."""
+    if isinstance(argument, np.ndarray):
+        flags = argument.flags
+        is_plain = flags.c_contiguous and flags.writeable and argument.ndim > 0
+        return (argument.dtype, argument.ndim) if is_plain else None
+    if type(argument) is np.void:
+        return (argument.dtype, 0)
+    return type(argument) if type(argument) in (bool, int, float) else None
+
+
+@cache
+def name_of(kind: Kind) -> str:
+    """Returns a text that distinguishes the type from others, in every process."""
+    return repr(kind)
+
+
+@cache
+def _machine() -> tuple[Any, Any]:
+    """Returns LLVM's description of this processor, and a linker for it."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    cpu, features = processor()
+    target = llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(
+        cpu=cpu, features=features, opt=3, reloc="pic", codemodel="default"
+    )
+    return target, llvm.create_lljit_compiler(target, suppress_errors=True)
+
+
+@cache
+def processor() -> tuple[str, str]:
+    """Returns name and features of this processor, for which the code is made."""
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> bytes:
+    """Compiles a function's optimised code together with an entry.
+
+    Args:
+        ir: LLVM code of the function and all that it calls, as numba prints it.
+        symbol: Name of the function there.
+        kinds: Types of the arguments.
+        result: numba's name of the result's type.
+
+    Returns:
+        The object code, empty if it cannot be used without numba's runtime.
+    """
+    if result not in _RESULTS:
+        return b""
+    target, _ = _machine()
+    try:
+        module = llvm.parse_assembly(ir)
+        module.link_in(llvm.parse_assembly(_entry(symbol, kinds, result)))
+        for value in (*module.functions, *module.global_variables):
+            if not value.is_declaration and value.name != _ENTRY:
+                value.linkage = "internal"
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_global_dead_code_eliminate_pass()
+        passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
+        code = bytes(target.emit_object(module))
+        load(code, symbol)
+    except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
+        return b""
+    return code
+
+
+def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
+    """Returns LLVM code that calls a function of numba with Python objects.
+
+    The function takes places for its result and for an exception, and returns 0 without one. NULL
+    as the entry's result becomes a ``SystemError``.
+    """
+    lines: list[str] = []
+    passed = ["ptr %place", "ptr %exception"]
+    for number, kind in enumerate(kinds):
+        code, values = _unpacked(f"%a{number}", kind)
+        lines += (
+            f"%a{number}.place = getelementptr ptr, ptr %arguments, i64 {number}",
+            f"%a{number} = load ptr, ptr %a{number}.place",
+            *code,
+        )
+        passed += values
+    place, give = _RESULTS[result]
+    types = ", ".join(value.split()[0] for value in passed)
+    body = "\n".join(lines)
+    return f"""{_DECLARATIONS}
+declare i32 @"{symbol}"({types})
+define ptr @{_ENTRY}(ptr %self, ptr %arguments, i64 %count) {{
+%place = alloca {place}
+%exception = alloca ptr
+{body}
+%status = call i32 @"{symbol}"({", ".join(passed)})
+%failed = icmp ne i32 %status, 0
+br i1 %failed, label %fail, label %done
+fail:
+ret ptr null
+done:
+{give}
+}}
+"""
+
+
+def _unpacked(a: str, kind: Kind) -> tuple[list[str], list[str]]:
+    """Returns the code that takes the object ``a`` apart, and what numba's function is passed.
+
+    An array is passed as owner (none), parent, size, size of an item, data, shape and strides.
+    """
+    if kind is float:
+        return [f"{a}.value = call double @PyFloat_AsDouble(ptr {a})"], [f"double {a}.value"]
+    if kind is int:
+        return [f"{a}.value = call i64 @PyLong_AsLongLong(ptr {a})"], [f"i64 {a}.value"]
+    if isinstance(kind, type):
+        lines = [f"{a}.truth = call i32 @PyObject_IsTrue(ptr {a})"]
+        return [*lines, f"{a}.value = trunc i32 {a}.truth to i8"], [f"i8 {a}.value"]
+    dtype, axes = kind
+    offset = _HEADER if axes else _HEADER + 8
+    lines = [
+        f"{a}.field = getelementptr i8, ptr {a}, i64 {offset}",
+        f"{a}.data = load ptr, ptr {a}.field",
+    ]
+    if not axes:
+        return lines, [f"ptr {a}.data"]
+    lines += [
+        f"{a}.last = getelementptr i8, ptr {a}, i64 {_HEADER + 16}",
+        f"{a}.shape = load ptr, ptr {a}.last",
+        f"{a}.stride{axes} = add i64 0, {dtype.itemsize}",
+    ]
+    for axis in reversed(range(axes)):
+        lines += [
+            f"{a}.place{axis} = getelementptr i64, ptr {a}.shape, i64 {axis}",
+            f"{a}.length{axis} = load i64, ptr {a}.place{axis}",
+            f"{a}.stride{axis} = mul i64 {a}.length{axis}, {a}.stride{axis + 1}",
+        ]
+    lines.append(f"{a}.size = udiv i64 {a}.stride0, {dtype.itemsize}")
+    lengths = [f"i64 {a}.length{axis}" for axis in range(axes)]
+    strides = [f"i64 {a}.stride{axis + 1}" for axis in range(axes)]
+    start = ["ptr null", "ptr null", f"i64 {a}.size", f"i64 {dtype.itemsize}", f"ptr {a}.data"]
+    return lines, [*start, *lengths, *strides]
+
+
+class _Definition(ctypes.Structure):
+    """``PyMethodDef``."""
+
+    _fields_ = (
+        ("name", ctypes.c_char_p),
+        ("address", ctypes.c_void_p),
+        ("flags", ctypes.c_int),
+        ("doc", ctypes.c_char_p),
+    )
+
+
+_new_function = ctypes.PYFUNCTYPE(ctypes.py_object, *3 * (ctypes.c_void_p,))(
+    ("PyCFunction_NewEx", ctypes.pythonapi)
+)
+
+_numbers = count()
+"""Numbers of libraries, whose names must differ."""
+
+_loaded: list[tuple[object, object]] = []
+"""All that must live as long as the functions, which is as long as the process."""
+
+
+def load(code: bytes, name: str) -> Callable[..., Any]:
+    """Returns a function that runs object code.
+
+    Raises:
+        RuntimeError: It needs a symbol that neither MuJoCo nor this process has, or is no object
+            file of this machine.
+    """
+    _, linker = _machine()
+    # numba's release of an array's owner, never called: arrays from an entry have none
+    unused = ctypes.cast(ctypes.pythonapi.Py_FatalError, ctypes.c_void_p).value
+    builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
+    builder.import_symbol("NRT_MemInfo_call_dtor", unused).export_symbol(_ENTRY)
+    library = builder.link(linker, f"{name} {next(_numbers)}")
+    definition = _Definition(name.encode(), library[_ENTRY], _FAST_CALL, None)
+    _loaded.append((library, definition))
+    function: Callable[..., Any] = _new_function(ctypes.addressof(definition), None, None)
+    return function
+
+
+def read(path: Path) -> bytes | None:
+    """Returns the object code of a file; None if there is none, or it is damaged or another's."""
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if hasattr(os, "getuid") and (
+                status.st_uid not in (0, os.getuid()) or status.st_mode & 0o022
+            ):
+                return None
+            content = file.read()
+    except OSError:
+        return None
+    digest, code = content[:32], content[32:]
+    return code if hashlib.sha256(code).digest() == digest else None
+
+
+def write(path: Path, code: bytes) -> None:
+    """Writes object code behind its digest, as a whole or not at all."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            try:
+                file.write(hashlib.sha256(code).digest() + code)
+                file.close()
+                Path(file.name).replace(path)
+            except BaseException:
+                Path(file.name).unlink(missing_ok=True)
+                raise

@@ -1,0 +1,77 @@
+"""``hapticbridge bound``: the damping that a coupling needs, and what would help a device."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_cases import Called
+
+
+def facts_of(call: Called, command: str) -> tuple[int, Any]:
+    """Returns the exit code, and what was printed: JSON without inf and nan."""
+    code, out, _ = call(*f"{command} --json".split())
+    return code, json.loads(out, parse_constant=pytest.fail)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "ways"),
+    [(2400.0, 3.0, 1), (5000.0, 1.0, 2), (5000.0, 3.0, 1)],  # frozen in words: sessions/bound.txt
+)
+def test_each_piece_of_advice_is_right_and_only_just(
+    stiffness: float, damping: float, ways: int, call: Called
+) -> None:
+    asked = f"bound --stiffness {stiffness:g} --damping {damping:g} --device-damping 2"
+    code, out, _ = call(*asked.split())
+    advice = " ".join(out.split()).split("not passive in any hand ")[1]
+    changes = advice.split(", or ")[:-1]
+    assert (code, len(changes)) == (1, ways)
+    for change in changes:
+        values = {"damping": damping, "stiffness": stiffness, "rate": 1000.0}
+        found = dict(re.findall(r"(damping|stiffness|rate) to ([0-9.]+)", change))
+        if "stiffness" in found and "rate" in found:  # the one or the other
+            del found["rate"]
+        values |= {name: float(number) for name, number in found.items()}
+        command = "bound " + " ".join(f"--{name} {value}" for name, value in values.items())
+        for share, expected in ((1.0, 0), (0.99, 1)):
+            assert call(*f"{command} --device-damping {2 * share}".split())[0] == expected
+
+
+@pytest.mark.parametrize(("device", "code", "holds"), [("", 0, None), ("0.9", 1, False)])
+def test_the_json_is_null_where_none_suffices(
+    device: str, code: int, holds: bool | None, call: Called
+) -> None:
+    more = f" --device-damping {device}" if device else ""
+    ended, facts = facts_of(call, f"bound --stiffness 2000 --damping 1{more}")
+    assert (ended, facts["holds"]) == (code, holds)
+    assert facts["largest_stiffness"] == (0 if device else None)  # B alone is too much
+    assert facts["frequency_hz"] is None  # without damper it is every frequency
+    assert (facts["method"], facts["used_damping"]) == ("lossless", 0.0)
+    assert [way["needed"] is None for way in facts["alternatives"]] == [
+        *(False, False, False, False, False, True, False, True, False)
+    ]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "zwidth --damping 1e-30 --mass 1e30 --rate 1",
+        "zwidth --damping 2 --friction 1e30 --resolution 1e-30",
+        "zwidth --damping 2 --delay 3 --filter-time 1e25",
+        "bound --stiffness 1e24 --damping 1e30 --device-damping 1e-30",
+        "bound --stiffness 1e-20 --damping 1e30 --device-damping 1e30",
+    ],
+)
+def test_numbers_at_the_ends_of_the_range_give_valid_json(command: str, call: Called) -> None:
+    code, facts = facts_of(call, command)
+    assert code in {0, 1} and facts
+
+
+def test_a_picture_is_written(tmp_path: Path, call: Called) -> None:
+    picture = tmp_path / "out.png"
+    code, _, err = call("bound", "--stiffness", "2000", "--damping", "1", "--plot", picture)
+    assert (code, f"wrote {picture}" in err) == (0, True)
+    assert picture.stat().st_size > 10_000

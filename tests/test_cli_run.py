@@ -1,0 +1,185 @@
+"""``hapticbridge run``: options, trips, signals, and files that it leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import pkgutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice
+from bridge_runs import still, sway
+from cli_cases import Called, one_sentence
+
+from hapticbridge.audit import audit
+from hapticbridge.cli import main
+from hapticbridge.recording import read_recording
+
+
+def test_run_prints_the_summary_as_json(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    command = ("run", "virtual_wall", "--fast", "--duration", 0.1, "--json", "--record", path)
+    code, out, err = call(*command)
+    assert (code, err) == (0, "")
+    summary = json.loads(out)
+    assert (summary["ticks"], summary["verdict"]) == (100, "passive")
+    assert summary["recording"] == str(path)
+
+
+def test_options_of_a_run_reach_the_recording(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    options = {
+        "--rate": 500,
+        "--substeps": 2,
+        "--stiffness": 700,
+        "--damping": 0.25,
+        "--rotational-stiffness": 0.7,
+        "--rotational-damping": 0.0003,
+        "--scale": 1.5,
+        "--force-scale": 0.5,
+        "--force-limit": 3,
+        "--torque-limit": 0.2,
+        "--ramp": 0.01,
+    }
+    flat = [part for pair in options.items() for part in pair]
+    axes = ("--axes", 0, -1, 0, 1, 0, 0, 0, 0, 1)
+    command = ("run", "point_mass", "--fast", "--duration", 0.1, *flat, *axes, "--record", path)
+    code, _, err = call(*command)
+    assert code == 0, err
+    meta = read_recording(path).meta
+    assert float(meta["period_s"]) == 0.002
+    assert (meta["substeps"], meta["ramp_ticks"]) == ("2", "5")
+    for name, value in options.items():
+        key = name[2:].replace("-", "_")
+        if key in meta and key != "ramp":
+            assert float(meta[key]) == value
+    assert json.loads(meta["axes"]) == [0, -1, 0, 1, 0, 0, 0, 0, 1]
+
+
+def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "millimetres.csv"
+    path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")
+    code, _, err = call("run", "point_mass", "--fast", "--device", f"trajectory:{path}")
+    assert code == 3
+    assert "than the stretch limit; check the motion's unit (m)" in err
+
+
+def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("wild.xml").write_text(
+        """<mujoco>
+          <worldbody>
+            <body><freejoint/><geom size=".02" mass=".05"/><site name="grip"/></body>
+            <body pos="1 0 0"><joint name="j" type="slide"/><geom size=".01" mass="1"/></body>
+          </worldbody>
+          <actuator>
+            <general joint="j" biastype="affine" gainprm="0" biasprm="1 1e8 0"/>
+          </actuator>
+        </mujoco>""",
+        encoding="utf-8",
+    )
+    assert main(["run", "wild.xml", "--fast", "--duration", "0.1"]) == 3
+    told = capsys.readouterr().err
+    assert "safety trip" in told
+    assert not list(tmp_path.glob("*LOG*"))
+
+
+SIGNALS = pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+
+
+@pytest.fixture
+def unheeded() -> Iterator[list[int]]:
+    """What Python's own handler would have got; that would end the tests with this one."""
+    got: list[int] = []
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = {each: signal.signal(each, lambda number, _: got.append(number)) for each in numbers}
+    yield got
+    for each, handler in before.items():
+        signal.signal(each, handler)
+
+
+@SIGNALS
+@pytest.mark.parametrize(
+    "moment", ["session.prepare", "bridge.Bridge.run", "bridge.Bridge.__exit__"]
+)
+def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
+    name: str,
+    moment: str,
+    call: Called,
+    unheeded: list[int],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path, device = tmp_path / "run.mcap", ScriptedDevice(still)
+    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: device)
+    usual = pkgutil.resolve_name(f"hapticbridge.{moment}")
+
+    def signalled(*arguments: Any, **options: Any) -> Any:
+        os.kill(os.getpid(), getattr(signal, name))
+        return usual(*arguments, **options)
+
+    monkeypatch.setattr(f"hapticbridge.{moment}", signalled)
+    code, out, err = call("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
+    assert device.is_closed and not np.any(device.writes) and not unheeded
+    if moment == "session.prepare":
+        assert (code, out, err.splitlines()[-1]) == (130, "", "interrupted")
+        return
+    ticks, words = (0, "signal") if moment.endswith("run") else (10, "duration")
+    assert (code, f"{ticks} ticks ({words})" in out) == (0, True)
+    recording = read_recording(path)
+    assert not recording.is_cut and len(recording.ticks) == ticks and device.writes
+    assert recording.events[-1]["reason"] == words
+    assert recording.events[-1].get("signal", name) == name
+
+
+@SIGNALS
+@pytest.mark.parametrize(
+    ("module", "arguments"),
+    [("identify", ("identify", "scripted")), ("zwidth", ("zwidth", "--measure", "scripted"))],
+)
+def test_a_signal_while_a_device_is_measured_leaves_no_force(
+    name: str,
+    module: str,
+    arguments: tuple[str, ...],
+    call: Called,
+    unheeded: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It comes in the first tick that has a force."""
+
+    def strike(count: int) -> None:
+        if count and device.writes[-1].any() and not struck:
+            struck.append(count)
+            os.kill(os.getpid(), getattr(signal, name))
+
+    struck: list[int] = []
+    device = ScriptedDevice(sway, on_write=strike)
+    monkeypatch.setattr(f"hapticbridge.cli.{module}.open_device", lambda *_, **__: device)
+    code, _, err = call(*arguments)
+    assert (code, err.splitlines()[-1]) == (130, "interrupted")
+    assert struck
+    assert not device.writes[-1].any() and device.is_closed
+    assert not unheeded
+
+
+def test_existing_recording_is_kept_unless_overwriting_is_asked_for(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    command = ("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
+    code, _, err = call(*command)
+    assert code == 2
+    assert "--overwrite" in one_sentence(err)
+    assert path.read_text() == "precious"
+    assert call(*command, "--duration", "nan", "--overwrite")[0] == 2
+    assert path.read_text() == "precious"
+    assert call(*command, "--overwrite")[0] == 0
+    assert audit(path).verdict == "passive"

@@ -1,0 +1,79 @@
+"""``hapticbridge zwidth``: the region of a device by theory, and walls tried on one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli_cases import Called
+
+from hapticbridge.device import SimulatedDevice
+
+ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --rate 1000"
+FREE = "simulated:hand=none,resolution=1e-6"
+
+
+def facts_of(call: Called, command: str) -> Any:
+    """Returns what a command printed, which must be JSON without inf and nan."""
+    return json.loads(call(*command.split())[1], parse_constant=pytest.fail)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [ZWIDTH, f"{ZWIDTH} --rate 2000 --delay 1", "bound --stiffness 2000 --device-damping 2"],
+)
+def test_the_next_command_runs_certified_and_is_rendered_as_it_asks(
+    command: str, call: Called
+) -> None:
+    _, out, _ = call(*command.split())
+    following = out.split("next: hapticbridge ")[1].replace("SCENE", "point_mass")
+    code, out, err = call(*f"{following.strip()} --fast --duration 0.05 --json".split())
+    told, asked = json.loads(out), following.split("--damping ")[1].split()[0]
+    assert (code, told["is_certified"], "warning" in err) == (0, True, False)
+    assert f"B = {float(asked):.4g} N s/m felt" in told["coupling_sentences"][0]
+
+
+def test_the_json_holds_the_whole_region(call: Called) -> None:
+    facts = facts_of(call, f"{ZWIDTH} --json")
+    assert facts["corner"]["stiffness"] == pytest.approx(2400, rel=1e-12)
+    assert facts["corner"]["limited_by"] == "passive for any hand"
+    lengths = {len(line["stiffness"]) for line in facts["lines"]}
+    assert lengths == {len(facts["damping"])} == {len(facts["limit"])}
+    assert [line["required"] for line in facts["lines"]] == [True, True, True]
+
+
+def test_what_is_measured_meets_the_line_of_a_device_that_nobody_holds(
+    tmp_path: Path, call: Called
+) -> None:
+    picture = tmp_path / "width.svg"
+    facts = facts_of(call, f"zwidth --measure {FREE} --plot {picture} --json")
+    line = next(line for line in facts["lines"] if line["name"] == "stable without a hand")
+    for limit in facts["measured"]:
+        # the line is given at points; between them it is nearly straight
+        near = min(range(101), key=lambda i: abs(facts["damping"][i] - limit["damping"]))
+        assert limit["borne"] == pytest.approx(line["stiffness"][near], rel=0.05)
+        assert limit["borne"] < limit["not_borne"] < 1.03 * limit["borne"]
+    assert facts["measured"][0]["borne"] == pytest.approx(2.0 * 2.0 / 1e-3, rel=0.05)  # 2 b / T
+    assert "measured" in picture.read_text(encoding="utf-8")
+
+
+def test_a_device_of_less_damping_than_was_said_is_found_out(call: Called) -> None:
+    for damping, is_told in (("--damping 2 ", True), ("", False)):
+        code, out, _ = call(*f"zwidth {damping}--measure simulated:hand=none,damping=1".split())
+        assert (code, "it bears less than theory allows" in out) == (0, is_told)
+
+
+def test_a_device_is_closed_whatever_was_refused(
+    call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[SimulatedDevice] = []
+
+    def close(device: SimulatedDevice) -> None:
+        closed.append(device)
+
+    monkeypatch.setattr(SimulatedDevice, "close", close)
+    for wrong in ("--axis q", "--damping nan"):
+        assert call(*f"zwidth --measure {FREE} {wrong}".split())[0] == 2
+    assert len(closed) == 2

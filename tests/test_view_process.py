@@ -1,0 +1,134 @@
+"""Process of the live view: every body where the run has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, recorded
+from report_runs import LOOSE
+from view_cases import FLOOR, pressed
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.errors import RecordingError
+from hapticbridge.film_process import Stage
+from hapticbridge.recording import Attachment, Ring, read_recording
+from hapticbridge.recording.snapshot import Snapshot
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+
+from hapticbridge.view.geometry import Tendons
+from hapticbridge.view.page import Sight
+from hapticbridge.view.process import LiveRun, run_of
+from hapticbridge.view.replay import contacts_of
+
+# viser's threads and sockets end with the process
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+class Watcher:
+    """An onlooker in the bridge's own process."""
+
+    live: LiveRun | None = None
+
+    def start(
+        self,
+        ring: str,
+        snapshot: str,
+        metadata: Mapping[str, str],
+        attachments: Sequence[Attachment],
+    ) -> None:
+        files = {item.name: item.data for item in attachments}
+        self.live = LiveRun(Ring.attach(ring), snapshot, run_of(dict(metadata), files))
+
+    def event(self, event: Mapping[str, object]) -> None:
+        """Is not interested."""
+
+    def close(self) -> None:
+        """Has nothing to close."""
+
+
+LIFTED = FLOOR.replace(
+    "</worldbody>",
+    """<body name="lift" mocap="true" pos="0 0 0.5"><geom size="0.01"/></body>
+    <body name="loose" pos="0.08 0 0.04"><freejoint/><geom size="0.03" mass="0.1"/></body>
+    </worldbody>""",
+)
+
+
+@pytest.mark.parametrize(("cone", "pipelined"), [("elliptic", True), ("pyramidal", False)])
+def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
+    tmp_path: Path, cone: str, pipelined: bool
+) -> None:
+    scene, path = tmp_path / "lifted.xml", tmp_path / "run.mcap"
+    scene.write_text(LIFTED.replace("elliptic", cone))
+    watcher, sights = Watcher(), list[Sight]()
+
+    def look(bridge: Bridge, tick: int) -> None:
+        assert watcher.live is not None
+        bridge.set_input(mocap={"lift": (0, 0, 0.5 + 1e-5 * tick)})
+        sight = watcher.live.look()
+        if sight is not None:
+            sights.append(sight)
+
+    summary = recorded(
+        path,
+        str(scene),
+        ScriptedDevice(pressed),
+        LOOSE,
+        duration=0.9,
+        on_tick=look,
+        observer=watcher,
+        pipelined=pipelined,
+    )
+    assert len(sights) == 28  # of 900 ticks, one in 33
+    assert summary.dropped == 0  # it frees no record
+    assert watcher.live is not None
+    time, lines = watcher.live.trace.curves()
+    ticks = read_recording(path).ticks
+    at = np.searchsorted(ticks["deadline_ns"], np.round(1e9 * time).astype(np.int64))
+    np.testing.assert_allclose(lines[2], 1e3 * ticks["device_energy"][at])
+    force = np.linalg.norm(ticks["wrench_on_tool"][:, :3], axis=1)
+    assert lines[0].max() == pytest.approx(force[: at[-1] + 1].max())
+    stage, touched = Stage(path), 0
+    lift = stage.model.body("lift").id
+    for sight in sights:
+        stage.show(stage.tick_at(sight.time))
+        contacts = contacts_of(stage.model, stage.data)
+        again = Sight.of(stage.model, stage.data, stage.row, Tendons(stage.model), contacts)
+        assert sight.time == again.time
+        np.testing.assert_array_equal(sight.places, again.places)
+        np.testing.assert_array_equal(sight.turns, again.turns)
+        np.testing.assert_array_equal(sight.contact_places, again.contact_places)
+        np.testing.assert_allclose(sight.contact_forces, again.contact_forces, atol=1e-12)
+        np.testing.assert_array_equal(sight.grip, again.grip)
+        touched += len(sight.contact_places) > 0
+    assert touched > 5
+    assert np.ptp([sight.places[lift, 2] for sight in sights]) > 0.008
+    assert audit(path).resimulation == "bit for bit"
+
+
+def test_a_picture_that_is_being_written_is_not_shown() -> None:
+    model = mujoco.MjModel.from_xml_string(FLOOR)
+    snapshot = Snapshot.shared(model)
+    try:
+        other = Snapshot.attach(str(snapshot.name), model)
+        assert other.read() is None  # there is none yet
+        snapshot.head[:3] = 2, 7, 1
+        snapshot.numbers[0] = 0.5
+        picture = other.read()
+        assert picture is not None
+        assert (picture.number, picture.slack, len(picture.contacts)) == (7, 0.5, 1)
+        snapshot.head[0] = 3
+        assert other.read() is None
+        with pytest.raises(RecordingError, match="bytes, the scene"):
+            Snapshot.attach(str(snapshot.name), mujoco.MjModel.from_xml_string("<mujoco/>"))
+    finally:
+        snapshot.close()
+    with pytest.raises(RecordingError, match="no ring at"):
+        Snapshot.attach(str(snapshot.name), model)

@@ -1,0 +1,110 @@
+"""Replay of a recording: what it shows, and whom it plays for."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from cli_cases import Called
+from view_cases import pressed_floor
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.recording import read_recording
+from hapticbridge.view.window import Address
+
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+from page_client import PATIENCE, hand, said
+
+from hapticbridge.view.replay import Replay, Theatre
+
+# viser's threads and sockets end with the process
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory: pytest.TempPathFactory) -> Replay:
+    return Replay(pressed_floor(tmp_path_factory.mktemp("view")))
+
+
+@contextlib.contextmanager
+def served(replay: Replay, address: Address) -> Iterator[tuple[Theatre, int]]:
+    theatre = Theatre(replay, address)
+    try:
+        yield theatre, int(theatre.url.split(":")[2].split("/")[0])
+    finally:
+        theatre.close()
+
+
+def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay: Replay) -> None:
+    records = read_recording(replay.stage.recording.path).ticks
+    ball = replay.stage.model.body("ball").id
+    for moment in (0.0, 0.4, 1.2):
+        sight = replay.at(moment)
+        row = records[max(round(sight.time * 1000) - 1, 0)]
+        np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
+        np.testing.assert_allclose(sight.handle, row["handle_position"])
+    still = replay.at(1.5)
+    assert np.linalg.norm(still.force) > 1
+    assert len(still.contact_places) == 1
+    # at rest what the coupling pushes the floor gives back
+    np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.force, atol=2e-2)
+    assert not len(replay.at(0.0).contact_places)
+
+
+def test_a_port_that_cannot_be_had_is_named_and_not_exchanged(replay: Replay, call: Called) -> None:
+    for port in (65536, -1):
+        with pytest.raises(HapticBridgeError, match=f"port is {port}"):
+            Address(port)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(HapticBridgeError, match=f"port {port} is in use"):
+            Theatre(replay, Address(port))
+        code, _, err = call(
+            "run",
+            replay.stage.recording.path.with_name("floor.xml"),
+            "--fast",
+            "--view",
+            "--port",
+            port,
+        )
+    assert (code, f"port {port} is in use" in err) == (2, True)
+
+
+def test_whatever_a_browser_sends_for_the_time_the_replay_plays_on(
+    replay: Replay, capfd: pytest.CaptureFixture[str]
+) -> None:
+    is_over = threading.Event()
+    with served(replay, Address(0)) as (theatre, _), hand(theatre.url) as page:
+        for value in (float("nan"), float("inf"), -1e308, "x", None, [1.0], {"a": 1}):
+            page.send("time (s)", value=value)
+        page.send("play", value="x")
+        page.send("time (s)", value=1.2)
+        assert said(page, "**1.2").startswith("**1.200 s**")
+        player = threading.Thread(target=theatre.play, args=(is_over,))
+        player.start()
+        try:
+            page.send("play", value=True)
+            said(page, "**1.4")
+            said(page, "**0.")  # from its end it begins again
+        finally:
+            is_over.set()
+            player.join(PATIENCE)
+    assert not player.is_alive()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_without_the_extra_a_sentence_says_how_to_get_it(
+    replay: Replay, call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    for command in (("view", replay.stage.recording.path), ("run", "peg_in_hole", "--view")):
+        code, _, err = call(*command)
+        assert code == 2
+        assert "hapticbridge[view]" in err

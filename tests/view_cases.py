@@ -1,0 +1,35 @@
+"""A scene and a recording that tests of the view share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from audit_cases import ScriptedDevice, recorded
+from report_runs import LOOSE
+
+FLOOR = """<mujoco model="floor">
+  <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>
+  <statistic center="0 0 0" extent="0.2"/>
+  <worldbody>
+    <light pos="0 0 1"/>
+    <geom type="plane" size="0.1 0.1 0.01"/>
+    <body name="ball" pos="0 0 0.03">
+      <freejoint/>
+      <geom type="sphere" size="0.02" mass="0.1" rgba="1 0 0 1"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def pressed(tick: int) -> tuple[float, ...]:
+    """A hand that moves aside and down."""
+    return (min(1e-4 * tick, 0.04), 0, max(-1e-4 * tick, -0.012), 1, 0, 0, 0)
+
+
+def pressed_floor(folder: Path) -> Path:
+    """Records a ball that is moved aside and pressed onto a floor, and held there."""
+    scene, path = folder / "floor.xml", folder / "floor.mcap"
+    scene.write_text(FLOOR)
+    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5)
+    return path
