@@ -255,7 +255,7 @@ def find_lean(
 
 
 def all_simplifications(original: SceneVariant, motion: Motion) -> list[Simplification]:
-    """Returns the simplifications that leave a scene's motion as it is, the largest first."""
+    """Returns the simplifications that are worth trying on a scene under a motion."""
     seen = witness(original, motion)
     return [
         *contact_simplifications(seen),
