@@ -84,6 +84,9 @@ class Plant:
     file: str = "bench.xml"
 
 
+SMALL = 'size="0.01 0.01 0.01"'
+FIRM, FRICTION = 'solreffriction="0.002 1"', 'solimpfriction="0.999 0.999 0.001"'
+
 PLANTS = (
     Plant("integrator", 'integrator="discrete"', 'integrator="implicitfast"'),
     Plant("time step", 'timestep="0.001"', 'timestep="0.002"'),
@@ -95,52 +98,21 @@ PLANTS = (
     Plant("heavy tool", 'pos="0 0 0.03" gravcomp="1"', 'pos="0 0 0.03"'),
     Plant("far grip", '<site name="grip"/>', '<site name="grip" pos="0 0 0.2"/>'),
     Plant("visual geom with mass", ' pos="0 0 0.03" mass="0"', ' pos="0 0 0.03"', at='name="cap"'),
-    Plant(
-        "density of water",
-        'size="0.01 0.01 0.01" mass="0.1"',
-        'size="0.01 0.01 0.01"',
-        file="parts.xml",
-    ),
-    Plant(
-        "margin",
-        'name="button" type="cylinder"',
-        'name="button" type="cylinder" margin="0.001"',
-        file="parts.xml",
-    ),
     Plant("default contact", 'name="floor"', 'name="floor" priority="1" solref="0.02 1"'),
     Plant("not passive", 'name="stop"', 'name="stop" priority="2" solref="-100000 -10"'),
     Plant("mesh not convex", 'file="wedge.obj"', 'file="cup.obj"', at='name="stop"'),
-    Plant(
-        "starts in contact",
-        "0.1 0.1 0.02",
-        "0.1 0.1 0.019",
-        at='geom name="block"',
-        file="parts.xml",
-    ),
-    Plant("missing inertia", ' mass="0.2"', ' mass="0"', at='body name="block"', file="parts.xml"),
-    Plant(
-        "mass ratio", ' mass="0.05"', ' mass="0.00005"', at='body name="button"', file="parts.xml"
-    ),
-    Plant(
-        "soft limit",
-        'solreflimit="0.002 1"',
-        'solreflimit="0.02 1"',
-        at='joint name="button"',
-        file="parts.xml",
-    ),
-    Plant(
-        "creeping friction",
-        'solreffriction="0.002 1" solimpfriction="0.999 0.999 0.001"',
-        "",
-        at='joint name="slider"',
-        file="parts.xml",
-    ),
-    Plant(
-        "soft equality",
-        'active="false" solref="0.002 1"',
-        'active="true"',
-        at='name="link"',
-        file="parts.xml",
+    *(
+        Plant(kind, old, new, at, "parts.xml")
+        for kind, old, new, at in (
+            ("density of water", f'{SMALL} mass="0.1"', SMALL, None),
+            ("margin", 'type="cylinder"', 'type="cylinder" margin="0.001"', None),
+            ("starts in contact", "0.1 0.1 0.02", "0.1 0.1 0.019", 'geom name="block"'),
+            ("missing inertia", ' mass="0.2"', ' mass="0"', 'body name="block"'),
+            ("mass ratio", ' mass="0.05"', ' mass="0.00005"', 'body name="button"'),
+            ("soft limit", 'mit="0.002 1"', 'mit="0.02 1"', 'joint name="button"'),
+            ("creeping friction", f"{FIRM} {FRICTION}", "", 'joint name="slider"'),
+            ("soft equality", 'active="false" solref="0.002 1"', 'active="true"', 'name="link"'),
+        )
     ),
 )
 """Each alone is found alone; all together are all found."""

@@ -13,10 +13,9 @@ from audit_cases import recorded, tapped
 from cli_cases import Called
 from hypothesis import settings
 from numpy.typing import NDArray
-from outside_scenes import hand_file, mjcf, scene_file
+from outside_scenes import GRIPPED, hand_file, mjcf, scene_file, ticks
 from recording_cases import random_rows, write
 from report_runs import Made
-from scene_cases import GRIPPED, ticks
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.cli import main

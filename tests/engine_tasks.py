@@ -7,13 +7,13 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from closed_forms import swing_from_rest
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.engines.base import Body, Engine, Shape, Simulation, Task, open_engine
-from hapticbridge.theory.rigid_body import exact_mass_response
 
 COUPLING = Coupling(
     stiffness=1000.0, damping=5.0, rotational_stiffness=2.0, rotational_damping=2e-3
@@ -47,18 +47,6 @@ def driven_mass(timestep: float, mass: float = MASS) -> tuple[Task, NDArray[np.f
     return Task("driven_mass", Body(mass, (1e-3,) * 3), coupling=COUPLING, handle=motion), handle
 
 
-def exact_path(timestep: float) -> NDArray[np.float64]:
-    """Where the mass of ``driven_mass`` is: the swing, and what dies away of having begun it."""
-    times = np.arange(round(SECONDS / timestep) + 1) * timestep
-    omega = 2 * np.pi * FREQUENCY
-    swing = complex(exact_mass_response(COUPLING, MASS, FREQUENCY)) * np.exp(1j * omega * times)
-    roots = np.roots([MASS, COUPLING.damping, COUPLING.stiffness])
-    at_start = [swing[0].imag, (1j * omega * swing[0]).imag]
-    first, second = np.linalg.solve(np.vstack([np.ones(2), roots]), -np.array(at_start))
-    dying = first * np.exp(roots[0] * times) + second * np.exp(roots[1] * times)
-    return np.asarray(AMPLITUDE * (swing.imag + dying.real))
-
-
 def driven_path(engine: Engine, timestep: float, mass: float = MASS) -> NDArray[np.float64]:
     task, _ = driven_mass(timestep, mass)
     poses = task.handle_poses(timestep, round(SECONDS / timestep))
@@ -72,8 +60,9 @@ def driven_path(engine: Engine, timestep: float, mass: float = MASS) -> NDArray[
 
 def driven_error(engine: Engine, timestep: float, mass: float = MASS) -> float:
     """RMS error of the driven mass's position as a share of the handle's amplitude."""
-    error = driven_path(engine, timestep, mass) - exact_path(timestep)
-    return float(np.sqrt(np.mean(error**2))) / AMPLITUDE
+    path = driven_path(engine, timestep, mass) / AMPLITUDE
+    times = np.arange(path.size) * timestep
+    return float(np.sqrt(np.mean(np.subtract(path, swing_from_rest(times, COUPLING, MASS)) ** 2)))
 
 
 FLOOR = Shape("box", (0.2, 0.2, 0.05), (0.0, 0.0, -0.05))

@@ -50,9 +50,8 @@ def scene_with_handle(name: str, edit: Edit | None = None) -> tuple[Any, Any]:
     handle.add_site(name="handle")
     for axis in range(6):
         stiffness, damping = (K, B) if axis < 3 else (K_R, B_R)
-        actuator = spec.add_actuator(
-            trntype=mujoco.mjtTrn.mjTRN_SITE, target="grip", refsite="handle"
-        )
+        kind = mujoco.mjtTrn.mjTRN_SITE
+        actuator = spec.add_actuator(trntype=kind, target="grip", refsite="handle")
         actuator.gear = np.eye(6)[axis]
         actuator.gainprm[0] = damping
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
@@ -87,15 +86,8 @@ class Run:
 
 def stored_energy(model: Any, data: Any) -> float:
     """Kinetic plus potential energy of the present state (mj_step leaves the previous one's)."""
-    for refresh in (
-        mujoco.mj_kinematics,
-        mujoco.mj_comPos,
-        mujoco.mj_crb,
-        mujoco.mj_comVel,
-        mujoco.mj_energyPos,
-        mujoco.mj_energyVel,
-    ):
-        refresh(model, data)
+    for name in ("kinematics", "comPos", "crb", "comVel", "energyPos", "energyVel"):
+        getattr(mujoco, f"mj_{name}")(model, data)
     return float(data.energy[0] + data.energy[1])
 
 
@@ -113,11 +105,8 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
     tool, matrix = np.empty((count + 1, 3)), np.empty((count + 1, 9))
     energy, deepest = np.empty(count + 1), np.zeros(count)
     joints = np.empty((count, model.nq))
-    tool[0], matrix[0], energy[0] = (
-        data.site_xpos[site],
-        data.site_xmat[site],
-        stored_energy(model, data),
-    )
+    tool[0], matrix[0] = data.site_xpos[site], data.site_xmat[site]
+    energy[0] = stored_energy(model, data)
     names = [model.geom(i).name for i in range(model.ngeom)]
     touched = {name: np.zeros(count, dtype=bool) for name in names}
     for k in range(count):
@@ -137,6 +126,7 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
     force = K * (handle - tool[1:]) + B / T * (d_handle - d_tool)
     torque = K_R * (turn * rotation[1:].inv()).as_rotvec() + B_R / T * (d_turn - d_rotation)
     by_force, by_torque = (force * d_tool).sum(axis=1), (torque * d_rotation).sum(axis=1)
+    moved, turned = (d_tool**2).sum(axis=1), (d_rotation**2).sum(axis=1)
     return Run(
         handle=handle,
         tool=tool[1:],
@@ -144,10 +134,7 @@ def run_along(model: Any, data: Any, handle: Array, turn: Rotation) -> Run:
         force=force,
         torque=torque,
         gained=np.cumsum(np.diff(energy) - by_force - by_torque),
-        slack=np.cumsum(
-            0.5 * (K + B / T) * (d_tool**2).sum(axis=1)
-            + 0.5 * (K_R + B_R / T) * (d_rotation**2).sum(axis=1)
-        ),
+        slack=np.cumsum(0.5 * (K + B / T) * moved + 0.5 * (K_R + B_R / T) * turned),
         work=np.cumsum(np.abs(by_force) + np.abs(by_torque)),
         touched=touched,
         deepest=deepest,
@@ -170,9 +157,8 @@ def run_along_own_path(name: str, model: Any, data: Any) -> Run:
     rows = path_of(name)
     times = np.arange(1, round(rows[-1, 0] / T) + 1) * T
     offset = np.stack([np.interp(times, rows[:, 0], rows[:, i]) for i in (1, 2, 3)], axis=1)
-    turn = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:], scalar_first=True))(
-        np.minimum(times, rows[-1, 0])
-    )
+    turned = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:], scalar_first=True))
+    turn = turned(np.minimum(times, rows[-1, 0]))
     return run_along(model, data, data.mocap_pos[0] + offset, turn)
 
 
@@ -188,9 +174,8 @@ def moved_through(
         pieces.append(last + s**3 * (10 - 15 * s + 6 * s**2) * (target - last))
         last = target
     motion = np.vstack(pieces)
-    return run_along(
-        model, data, data.mocap_pos[0] + motion[:, :3], Rotation.from_rotvec(motion[:, 3:])
-    )
+    turn = Rotation.from_rotvec(motion[:, 3:])
+    return run_along(model, data, data.mocap_pos[0] + motion[:, :3], turn)
 
 
 def swung(*angles: float) -> list[tuple[float, tuple[float, ...], tuple[float, ...]]]:

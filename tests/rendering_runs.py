@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import AXES, DeviceInfo
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.rendering import method_named, prepare, resolve_contact_stiffness
 from hapticbridge.scene import Scene
 
@@ -89,71 +90,29 @@ def sway(count: int = 2000, amplitude: float = 0.02, frequency: float = 3.0) -> 
     return samples_of(motion)
 
 
-class Rotor:
-    """A free device that only turns about y: I θ̈ = τ − b θ̇, exact under the hold, flicked once.
+class Rotor(SimulatedDevice):
+    """A free device, turned by 1 µrad about y at its start; light, so that damping limits alone.
 
     Args:
         damping: b in N m s/rad.
-        inertia: I in kg m²; light, so that the damping alone limits the stiffness.
-        flick: Angular velocity at the start in rad/s.
         is_real: What its data sheet claims.
     """
 
-    def __init__(
-        self,
-        damping: float = 2e-3,
-        inertia: float = 1e-7,
-        flick: float = 0.02,
-        *,
-        is_real: bool = False,
-    ) -> None:
-        self.info = DeviceInfo(
-            name="rotor",
-            axes=AXES,
-            mass=0.1,
+    def __init__(self, damping: float = 2e-3, *, is_real: bool = False) -> None:
+        super().__init__(
             damping=50.0,
-            rotational_inertia=inertia,
+            rotational_inertia=1e-7,
             rotational_damping=damping,
-            friction=None,
-            resolution=None,
+            hand=None,
             force_limit=100.0,
             torque_limit=10.0,
-            speed_limit=5.0,
-            rate=None,
-            delay=0.0,
-            is_prescribed=False,
-            is_real=is_real,
-            duration=None,
         )
-        self.writes: list[Array] = []
-        self._flick = flick
-        self._torque = 0.0
+        self.info = replace(self.info, is_real=is_real)
 
-    def start(self, period: float) -> NDArray[np.void]:
-        self._angle, self._speed = 0.0, self._flick
-        self._period = period
-        sample = np.zeros(1, SAMPLE_DTYPE)
-        sample["quaternion"][0, 0] = 1.0
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        sample = super().start(period, parts)
+        self.displace(np.array([0, 0, 0, 0, 1e-6, 0]))
         return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        damping, inertia = self.info.rotational_damping or 0.0, self.info.rotational_inertia or 1.0
-        rate = damping / inertia
-        steady = self._torque / damping
-        decay = np.exp(-rate * self._period)
-        self._angle += steady * self._period + (self._speed - steady) * (1 - decay) / rate
-        self._speed = steady + (self._speed - steady) * decay
-        sample["position"] = 0.0
-        half = 0.5 * self._angle
-        sample["quaternion"][0] = np.cos(half), 0.0, np.sin(half), 0.0
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.writes.append(wrench.copy())
-        self._torque = float(wrench[4])
-
-    def close(self) -> None:
-        pass
 
 
 COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)

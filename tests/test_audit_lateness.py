@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from falcon_cases import Bench
+from device_benches import FalconBench
 from report_runs import ANVIL
 
 from hapticbridge.audit import AuditReport, audit
@@ -35,7 +35,7 @@ def held_to_an_anvil(
     """Returns the verdict, and how far the grip swings at the end in m; b = 2 N s/m, 1 kHz."""
     scene, path = folder / "anvil.xml", folder / "run.mcap"
     scene.write_text(ANVIL)
-    bench = Bench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
+    bench = FalconBench(held or SimulatedDevice(mass=0.4, damping=2.0, hand=LOOSE))
     device = bench.opened(damping=2.0)
     if delay is not None:
         device.info = dataclasses.replace(device.info, delay=delay)

@@ -84,14 +84,20 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 1.23e-3])
-@pytest.mark.parametrize("laws", [1, 4])
-def test_the_default_coupling_meets_the_condition_with_margin(delay: float, laws: int) -> None:
+@pytest.mark.parametrize("laws", [1, 2, 8, 32])
+@pytest.mark.parametrize(
+    ("period", "scales"), [(T, (1.0, 1.0)), (1e-4, (3.0, 0.5)), (5e-3, (1, 1))]
+)
+def test_the_default_coupling_meets_the_condition_with_margin(
+    delay: float, laws: int, period: float, scales: tuple[float, float]
+) -> None:
     late = info(delay=delay)
-    felt = default_coupling(late, T, law_evaluations=laws)
-    coupling = default_method(laws).law_coupling(felt, T / laws)
-    (condition,) = device_conditions(late, coupling, T, 1.0, 1.0, laws)
-    assert condition.needed <= NEEDED_SHARE * 2.0 * (1 + 1e-9)
-    assert condition.needed > 0.7 * 2.0
+    felt = default_coupling(late, period, *scales, laws)
+    coupling = default_method(laws).law_coupling(felt, period / laws)
+    conditions = device_conditions(late, coupling, period, *scales, laws)
+    for condition in conditions:
+        assert condition.needed <= NEEDED_SHARE * (condition.available or 0.0) * (1 + 1e-6)
+    assert conditions[0].needed > 0.7 * 2.0
 
 
 def test_a_real_device_of_unknown_damping_is_taken_for_one_of_a_tenth() -> None:

@@ -10,16 +10,8 @@ import pytest
 from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
 from outside_scenes import mjcf
 
-from hapticbridge.check.inventory import (
-    FIXED,
-    MEETS_OTHER,
-    MEETS_TOOL,
-    MOVING,
-    TOOL,
-    VISUAL,
-    Inventory,
-    take_inventory,
-)
+from hapticbridge.check import inventory
+from hapticbridge.check.inventory import Inventory, take_inventory
 from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
 from hapticbridge.scene.contacts import meeting_pairs
@@ -34,16 +26,11 @@ def inventory_of(scene: Path) -> Inventory:
 def test_counts_are_those_of_the_model_without_the_bridge(name: str) -> None:
     path = scene_path(name)
     plain, counted = mujoco.MjModel.from_xml_path(str(path)), inventory_of(path)
-    assert counted.bodies == plain.nbody - 1
-    assert counted.degrees_of_freedom == plain.nv
-    assert sum(counted.geoms.values()) == plain.ngeom
-    assert counted.actuators == plain.nactuator
-    assert counted.equalities == plain.neq
-    assert counted.tendons == plain.ntendon
-    assert counted.geoms[VISUAL] == sum(
-        not (type_ or affinity)
-        for type_, affinity in zip(plain.geom_contype, plain.geom_conaffinity, strict=True)
-    )
+    assert (counted.bodies, counted.degrees_of_freedom) == (plain.nbody - 1, plain.nv)
+    assert (sum(counted.geoms.values()), counted.actuators) == (plain.ngeom, plain.nactuator)
+    assert (counted.equalities, counted.tendons) == (plain.neq, plain.ntendon)
+    is_visual = (plain.geom_contype | plain.geom_conaffinity) == 0
+    assert counted.geoms[inventory.VISUAL] == np.count_nonzero(is_visual)
 
 
 def heap(seed: int) -> str:
@@ -128,17 +115,22 @@ def test_stiffness_seen_is_force_over_depth_at_rest(tmp_path: Path, cone: str, c
     # impedance grows by 0.1 % over this depth
     assert meeting.softest <= 1.001 * force[0] / -data.contact[0].dist
     assert meeting.stiffest == pytest.approx(force[0] / -data.contact[0].dist, rel=2e-3)
-    inventory = take_inventory(case.model, "grip", case.places, case.observation)
-    assert inventory.stiffness == (meeting.softest, meeting.stiffest)
-    assert inventory.deepest == meeting.deepest
+    counted = take_inventory(case.model, "grip", case.places, case.observation)
+    assert counted.stiffness == (meeting.softest, meeting.stiffest)
+    assert counted.deepest == meeting.deepest
 
 
 def test_geoms_are_sorted_by_what_they_met(tmp_path: Path) -> None:
     counted = inventory_of(bench(tmp_path / "scene"))
     # shaft; floor and button; block; slider; stop; cap
-    assert counted.geoms == {
-        TOOL: 1, MEETS_TOOL: 2, MEETS_OTHER: 1, MOVING: 1, FIXED: 1, VISUAL: 1,
-    }  # fmt: skip
+    once = (
+        inventory.TOOL,
+        inventory.MEETS_OTHER,
+        inventory.MOVING,
+        inventory.FIXED,
+        inventory.VISUAL,
+    )
+    assert counted.geoms == {**dict.fromkeys(once, 1), inventory.MEETS_TOOL: 2}
     assert counted.met_pairs == 3
     # of five things four move: all meet all but themselves, the cap nothing
     assert counted.possible_pairs == 4 * 2 + 6
@@ -151,13 +143,16 @@ def test_geoms_are_sorted_by_what_they_met(tmp_path: Path) -> None:
 def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
     scene = bench(tmp_path / "scene")
     idle = {each.place.element: each for each in inventory_of(scene).idle}
-    assert set(idle) == {
-        "body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'",
-    }  # fmt: skip
+    assert set(idle) == {"body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'"}
     assert "never meets the tool" in idle["body 'block'"].reason
-    assert idle["geom 'cap'"].reason == VISUAL
+    assert idle["geom 'cap'"].reason == inventory.VISUAL
     assert idle["geom 'stop'"].reason == "fixed and never met in the motion"
     assert idle["body 'block'"].place.file == "parts.xml"
+
+
+WELD = '<weld body1="tool" body2="a"/>'
+CORD = '<spatial><site site="grip"/><site site="sa"/></spatial>'
+MIX = '<fixed><joint joint="ja" coef="1"/><joint joint="jb" coef="1"/></fixed>'
 
 
 @pytest.mark.parametrize(
@@ -165,18 +160,11 @@ def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
     [
         ("", set()),
         ('<equality><connect body1="a" body2="b" anchor="0 0 0"/></equality>', set()),
-        ('<equality><weld body1="tool" body2="a"/></equality>', {"a"}),
-        (
-            '<equality><weld body1="tool" body2="a"/><joint joint1="ja" joint2="jb"/></equality>',
-            {"a", "b"},
-        ),
+        (f"<equality>{WELD}</equality>", {"a"}),
+        (f"<equality>{WELD}<joint joint1='ja' joint2='jb'/></equality>", {"a", "b"}),
         ('<equality><connect site1="grip" site2="sa"/></equality>', {"a"}),
-        ('<tendon><spatial><site site="grip"/><site site="sa"/></spatial></tendon>', {"a"}),
-        (
-            '<tendon><spatial><site site="grip"/><site site="sa"/></spatial>'
-            '<fixed><joint joint="ja" coef="1"/><joint joint="jb" coef="1"/></fixed></tendon>',
-            {"a", "b"},
-        ),
+        (f"<tendon>{CORD}</tendon>", {"a"}),
+        (f"<tendon>{CORD}{MIX}</tendon>", {"a", "b"}),
     ],
 )
 def test_tendons_and_equalities_influence(tmp_path: Path, joints: str, reached: set[str]) -> None:
@@ -193,11 +181,9 @@ def test_tendons_and_equalities_influence(tmp_path: Path, joints: str, reached: 
 
 
 def test_in_a_scene_with_flexes_nothing_that_moves_is_called_idle(tmp_path: Path) -> None:
-    cloth = (
-        '<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".02 .02 .02" pos="0 0 -.02" '
-        'radius=".002" mass="0.1" dim="2"><contact selfcollide="none"/>'
-        '<edge equality="true"/></flexcomp>'
-    )
+    cloth = """<flexcomp name="c" type="grid" count="3 3 1" spacing=".02 .02 .02" pos="0 0 -.02"
+      radius=".002" mass="0.1" dim="2"><contact selfcollide="none"/><edge equality="true"/>
+      </flexcomp>"""
     case = case_of(written(tmp_path, mjcf(GOOD_OPTION, world=cloth)))
     counted = take_inventory(case.model, "grip", case.places, case.observation)
     assert not [each for each in counted.idle if each.place.element.startswith("body")]
@@ -212,24 +198,16 @@ def test_without_a_motion_what_can_meet_counts_as_met(tmp_path: Path) -> None:
 
 
 def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path) -> None:
-    (tmp_path / "parts.xml").write_text(
-        """<mujoco>
-          <default><geom condim="3"/></default>
-          <worldbody>
-            <geom size="0.01" pos="1 0 0"/>
-            <geom name="named" size="0.01"/>
-            <geom size="0.01" pos="2 0 0"/>
-          </worldbody>
-        </mujoco>""",
-        encoding="utf-8",
-    )
+    parts = """<mujoco><default><geom condim="3"/></default><worldbody>
+      <geom size="0.01" pos="1 0 0"/>
+      <geom name="named" size="0.01"/>
+      <geom size="0.01" pos="2 0 0"/></worldbody></mujoco>"""
+    (tmp_path / "parts.xml").write_text(parts, encoding="utf-8")
     case = case_of(written(tmp_path, mjcf('<include file="parts.xml"/>', GOOD_OPTION)))
     model = case.model
     found = {float(model.geom_pos[g, 0]): case.places.geom(g) for g in range(3)}
-    assert [(found[x].file, found[x].line) for x in (1.0, 2.0)] == [
-        ("parts.xml", 4),
-        ("parts.xml", 6),
-    ]
+    places = [(found[x].file, found[x].line) for x in (1.0, 2.0)]
+    assert places == [("parts.xml", 2), ("parts.xml", 4)]
 
 
 def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:

@@ -20,10 +20,10 @@ from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import read_scene
 
+Array = NDArray[np.float64]
 
-def records(
-    force: NDArray[np.float64], torque: NDArray[np.float64] | None = None
-) -> NDArray[np.void]:
+
+def records(force: Array, torque: Array | None = None) -> NDArray[np.void]:
     rows = np.zeros(len(force), TICK_DTYPE)
     rows["wrench_on_tool"][:, :3] = force
     rows["wrench_on_tool"][:, 3:] = 0.0 if torque is None else torque

@@ -11,15 +11,11 @@ import pytest
 from check_scenes import CUP_DEPTH, CUP_ROOM, GOOD_OPTION, case_of, cup_obj, written
 from outside_scenes import hand_rows, mjcf
 
+from hapticbridge.check import physics
 from hapticbridge.check.contact_faults import inertia_of
 from hapticbridge.check.fault import length, number, weight
 from hapticbridge.check.model_faults import creep_speed, dent_of, mesh_of
-from hapticbridge.check.physics import (
-    body_inertia,
-    constraint_stiffness,
-    depth_under,
-    joint_inertia,
-)
+from hapticbridge.check.physics import constraint_stiffness, depth_under
 from hapticbridge.scene import scene_path
 from hapticbridge.scene.contacts import settings_among
 
@@ -108,9 +104,9 @@ def test_inertia_of_joint_and_body_has_their_armature() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     about_hinge = 0.2 + 0.1 + 2 * 0.5**2
-    assert joint_inertia(model, data, 0) == pytest.approx(0.1005)
-    assert joint_inertia(model, data, 1) == pytest.approx(about_hinge)
-    found = {name: body_inertia(model, data, model.body(name).id) for name in
+    assert physics.joint_inertia(model, data, 0) == pytest.approx(0.1005)
+    assert physics.joint_inertia(model, data, 1) == pytest.approx(about_hinge)
+    found = {name: physics.body_inertia(model, data, model.body(name).id) for name in
              ("nail", "door", "ball", "post")}  # fmt: skip
     assert found["nail"] == pytest.approx(0.1005)
     assert found["door"] == pytest.approx(about_hinge / 0.5**2)

@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import json
 import math
+import re
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -13,21 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import PERIOD, FalconBench, HaplyBench, paddle
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.hid_device import HidDevice
-from emulated.hid_seam import HidSeam
+from emulated.hid_seam import HidSeam, Timed
 from emulated.pid_layouts import ODD
 from emulated.pid_model import PidStick
 from emulated.rawhid_model import RawHid
 from emulated.spacemouse_model import SpaceMouse
-from emulated.ticking import Ticking
-from emulated.timed import Timed
-from falcon_cases import Bench
-from haply_cases import Bench as HaplyBench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from rawhid_cases import paddle
 
 import hapticbridge as hb
 from hapticbridge.device import (
@@ -46,7 +43,6 @@ from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 
-PERIOD = 1e-3
 TICKS = 300
 
 
@@ -71,6 +67,40 @@ def pushed(when: float) -> tuple[float, ...]:
     return (0.5, -0.2, 0.3, 0.4, 0.1, 1.0) if when < 0.2 else (0.0,) * 6
 
 
+class Ticking:
+    """A real driver and an emulated device as one, moved by one period before each read.
+
+    Each start takes a new device out of the box, so that two runs can be alike.
+
+    Args:
+        build: Makes the driver and what its device is plugged into.
+    """
+
+    def __init__(self, build: Callable[[], tuple[Device, Timed]]) -> None:
+        self.build, self.is_used = build, False
+        self.device, self.seam = build()
+        self.info = self.device.info
+
+    def start(self, period: float) -> NDArray[np.void]:
+        if self.is_used:
+            self.device, self.seam = self.build()
+        sample, self.is_used = self.device.start(period), True
+        self.period, self.next = period, self.seam.now
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if self.is_used:
+            self.seam.advance(self.next)
+            self.next += self.period
+        return self.device.read(sample)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.device.write(wrench)
+
+    def close(self) -> None:
+        self.device.close()
+
+
 def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> Device:
     """Returns a real driver on an emulated device that lives in virtual time."""
 
@@ -82,7 +112,7 @@ def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> De
 
 
 def falcon(_: Path) -> Device:
-    bench = Bench()
+    bench = FalconBench()
     device = bench.opened()
     bench.link.pace = PERIOD
     return device
@@ -210,27 +240,21 @@ unknown_or_positive = st.none() | st.floats(1e-300, 1e300)
 at_least_zero = st.floats(0.0, 1e300)
 
 
+unknown_or_not_negative = st.none() | at_least_zero
+some_axes = st.sets(st.sampled_from(AXES), min_size=1)
+
+
 @given(
     st.builds(
         DeviceInfo,
         name=st.text(min_size=1),
-        axes=st.sets(st.sampled_from(AXES), min_size=1).map(
-            lambda axes: tuple(axis for axis in AXES if axis in axes)
-        ),
-        mass=unknown_or_positive,
-        damping=st.none() | at_least_zero,
-        rotational_inertia=unknown_or_positive,
-        rotational_damping=st.none() | at_least_zero,
-        friction=st.none() | at_least_zero,
-        resolution=st.none() | at_least_zero,
-        force_limit=at_least_zero,
-        torque_limit=at_least_zero,
-        speed_limit=at_least_zero,
-        rate=unknown_or_positive,
-        delay=st.none() | at_least_zero,
+        axes=some_axes.map(lambda axes: tuple(axis for axis in AXES if axis in axes)),
         is_prescribed=st.booleans(),
         is_real=st.booleans(),
-        duration=st.none() | at_least_zero,
+        **dict.fromkeys(("mass", "rotational_inertia", "rate"), unknown_or_positive),
+        **dict.fromkeys(("damping", "rotational_damping", "friction"), unknown_or_not_negative),
+        **dict.fromkeys(("resolution", "delay", "duration"), unknown_or_not_negative),
+        **dict.fromkeys(("force_limit", "torque_limit", "speed_limit"), at_least_zero),
     )
 )
 def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
@@ -260,9 +284,8 @@ def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
 )
 def test_a_bad_data_sheet_is_refused(change: dict[str, object], words: str) -> None:
     values: dict[str, object] = {**dataclasses.asdict(INFO), **change}
-    with pytest.raises(DeviceError) as error:
+    with pytest.raises(DeviceError, match=re.escape(words)):
         DeviceInfo(**values)  # type: ignore[arg-type]
-    assert words in str(error.value)
     with pytest.raises(DeviceError):
         DeviceInfo.from_json(json.dumps(values))
 
@@ -278,9 +301,8 @@ def test_a_bad_data_sheet_is_refused(change: dict[str, object], words: str) -> N
     ],
 )
 def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:
-    with pytest.raises(DeviceError) as error:
+    with pytest.raises(DeviceError, match=re.escape(words)):
         DeviceInfo.from_json(text)
-    assert words in str(error.value)
 
 
 def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Path) -> None:
@@ -298,22 +320,14 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        (
-            "falcn",
-            {},
-            "unknown device 'falcn'; choose one of 'falcon', 'forcedimension', 'haply', 'pid'",
-        ),
+        ("falcn", {}, "unknown device 'falcn'; choose one of 'falcon', 'forcedimension', 'haply'"),
         ("haply:colour=red", {}, "unknown option 'colour' of the haply device; choose one of 'd"),
         ("forcedimension:colour=red", {}, "unknown option 'colour' of the forcedimension dev"),
         ("rawhid:colour=red", {}, "unknown option 'colour' of the rawhid device; choose one of 'd"),
         ("spacemouse", {"colour": 1}, "unknown option 'colour' of the spacemouse device"),
         ("spacemouse:speed=fast", {}, "speed = 'fast': must be a number"),
         ("", {}, "unknown device ''"),
-        (
-            "simulated:dampng=5",
-            {},
-            "unknown option 'dampng' of the simulated device; choose one of 'd",
-        ),
+        ("simulated:dampng=5", {}, "unknown option 'dampng' of the simulated device; choose one"),
         ("simulated", {"colour": 1}, "unknown option 'colour'"),
         ("simulated:damping", {}, "'damping' is not an option; write options as name=value"),
         ("simulated:damping=5,damping=6", {}, "option 'damping' is set twice"),
@@ -330,9 +344,8 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
     ],
 )
 def test_bad_specifications_are_refused(spec: str, options: dict[str, Any], words: str) -> None:
-    with pytest.raises(DeviceError) as error:
+    with pytest.raises(DeviceError, match=re.escape(words)):
         open_device(spec, **options)
-    assert words in str(error.value)
 
 
 def test_the_device_in_the_protocols_description_is_a_whole_one(tmp_path: Path) -> None:

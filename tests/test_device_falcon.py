@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from falcon_cases import PERIOD, Bench
+from device_benches import PERIOD, FalconBench
+from emulated.falcon_model import Faults
 from numpy.typing import NDArray
 
 from hapticbridge.device import SimulatedDevice
@@ -22,16 +23,16 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 STALE = int(TickFlag.STALE_SAMPLE)
 
 
-def started(mechanics: SimulatedDevice | None = None) -> tuple[Bench, FalconDevice]:
-    bench = Bench(mechanics)
+def started(mechanics: SimulatedDevice | None = None) -> tuple[FalconBench, FalconDevice]:
+    bench = FalconBench(mechanics)
     device = bench.opened()
     device.start(PERIOD)
     return bench, device
 
 
 def looped(
-    bench: Bench, device: FalconDevice, ticks: int, force: tuple[float, ...] = (0.0, 0.0, 0.0),
-    drift: float = 0.0,
+    bench: FalconBench, device: FalconDevice, ticks: int,
+    force: tuple[float, ...] = (0.0, 0.0, 0.0), drift: float = 0.0,
 ) -> tuple[NDArray[np.void], NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
     """Runs a bare loop; returns samples, flags, and where the grip really was at each read."""
     samples, flags = np.zeros(ticks, SAMPLE_DTYPE), np.zeros(ticks, np.int64)
@@ -69,10 +70,9 @@ def test_a_force_beyond_the_motors_keeps_its_direction() -> None:
     looped(bench, device, 5, (40.0, 10.0, -20.0))
     assert max(abs(units) for units in bench.model.motors) == 4096
     got = bench.model.handle.force[:3]
-    np.testing.assert_allclose(
-        got / np.linalg.norm(got), np.array([4, 1, -2]) / np.sqrt(21), atol=2e-3
-    )
-    assert 3.0 < np.linalg.norm(got) < 20.0
+    size = np.linalg.norm(got)
+    np.testing.assert_allclose(got / size, np.array([4, 1, -2]) / np.sqrt(21), atol=2e-3)
+    assert 3.0 < size < 20.0
 
 
 def test_a_force_that_is_not_finite_is_no_force() -> None:
@@ -221,7 +221,7 @@ def test_an_unplugged_or_halted_falcon_is_lost_in_the_same_tick(fault: str) -> N
 
 
 def test_a_rate_below_50_hz_and_encoders_that_no_grip_has_are_refused() -> None:
-    bench = Bench()
+    bench = FalconBench()
     device = bench.opened()
     with pytest.raises(DeviceError, match="the rate must be at least 50 Hz, not 40 Hz"):
         device.start(0.025)
@@ -243,13 +243,13 @@ def _program(tmp_path: Path) -> str:
 
 
 def test_a_falcon_with_its_program_is_not_loaded_again(program: str) -> None:
-    bench = Bench()
+    bench = FalconBench()
     bench.opened(firmware=program).close()
     assert (bench.model.uploaded, bench.told) == (b"", [])
 
 
 def test_the_program_arrives_byte_for_byte_and_its_progress_is_told(program: str) -> None:
-    bench = Bench(program=None, valid=PROGRAM)
+    bench = FalconBench(program=None, valid=PROGRAM)
     device = bench.opened(firmware=program, name="falcon 7")
     assert bench.model.uploaded == PROGRAM
     assert bench.told == [f"falcon 7: firmware {n} % loaded" for n in (25, 50, 75, 100)]
@@ -257,7 +257,7 @@ def test_the_program_arrives_byte_for_byte_and_its_progress_is_told(program: str
 
 
 def test_without_program_and_file_the_option_is_named() -> None:
-    bench = Bench(program=None)
+    bench = FalconBench(program=None)
     with pytest.raises(DeviceError, match=r"has no firmware .*: falcon:firmware=FILE$"):
         bench.opened()
     assert bench.link.is_closed
@@ -274,12 +274,9 @@ ECHO = rf"sent back 0x{PROGRAM[1234] ^ 0x40:02x} for byte 1234 \(0x{PROGRAM[1234
         ({"is_deaf": True}, PROGRAM, "its loader does not answer; switch its power off"),
     ],
 )
-def test_a_program_that_does_not_arrive_or_run_is_told(
-    program: str, fault: dict[str, Any], valid: bytes, words: str
-) -> None:
-    bench = Bench(program=None, valid=valid)
-    for name, value in fault.items():
-        setattr(bench.model.faults, name, value)
+def test_bad_program_is_told(program: str, fault: Any, valid: bytes, words: str) -> None:
+    bench = FalconBench(program=None, valid=valid)
+    bench.model.faults = Faults(**fault)
     with pytest.raises(DeviceError, match=words):
         bench.opened(firmware=program)
     assert bench.time.now < 15.0
@@ -301,23 +298,21 @@ def test_a_file_that_is_no_program_is_refused(tmp_path: Path) -> None:
 def test_an_unhomed_falcon_waits_until_the_grip_has_passed_its_zeros(tmp_path: Path) -> None:
     path = tmp_path / "hand.csv"
     path.write_text(IN_AND_OUT)
-    bench = Bench(SimulatedDevice(mass=0.4, damping=2.0, path=path), is_homed=False)
+    bench = FalconBench(SimulatedDevice(mass=0.4, damping=2.0, path=path), is_homed=False)
     device = bench.opened()
-    assert [words.partition(": ")[2] for words in bench.told] == [
-        "pull the grip all the way out and push it back in, slowly",
-        "homed",
-    ]
+    asked, done = (words.partition(": ")[2] for words in bench.told)
+    assert asked == "pull the grip all the way out and push it back in, slowly"
+    assert done == "homed"
     sample = device.start(1e-3)
     bench.time.until(bench.time.now)
     # an encoder that kept its offset would be hundreds of counts, some 10 mm, off
-    np.testing.assert_allclose(
-        sample["position"][0], bench.model.handle.pose()[0], rtol=0, atol=2e-4
-    )
+    place = bench.model.handle.pose()[0]
+    np.testing.assert_allclose(sample["position"][0], place, rtol=0, atol=2e-4)
 
 
 def test_a_grip_that_nobody_moves_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(falcon_start, "HOMING_TIME", 2.0)
-    bench = Bench(SimulatedDevice(hand=None), is_homed=False)
+    bench = FalconBench(SimulatedDevice(hand=None), is_homed=False)
     with pytest.raises(DeviceError, match="was not homed within 2 s"):
         bench.opened()
     assert 2.0 < bench.time.now < 2.2
@@ -325,7 +320,7 @@ def test_a_grip_that_nobody_moves_is_given_up(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_falcon_that_falls_silent_while_it_is_homed_is_lost() -> None:
-    bench = Bench(is_homed=False)
+    bench = FalconBench(is_homed=False)
 
     def silenced(_: str) -> None:
         bench.model.faults.is_mute = True
@@ -335,7 +330,7 @@ def test_a_falcon_that_falls_silent_while_it_is_homed_is_lost() -> None:
 
 
 def test_rate_and_delay_are_those_of_the_bridges_timer() -> None:
-    info = Bench().opened().info
+    info = FalconBench().opened().info
     # one delivery a millisecond; a reply takes 2 x 107 µs on the line, 20 µs to think, and then
     # waits for up to 1 ms
     assert info.rate == pytest.approx(1000.0, rel=1e-3)
@@ -344,7 +339,7 @@ def test_rate_and_delay_are_those_of_the_bridges_timer() -> None:
 
 
 def test_a_bridge_that_heeds_the_event_character_is_four_times_as_prompt() -> None:
-    info = Bench(heeds_events=True).opened().info
+    info = FalconBench(heeds_events=True).opened().info
     assert info.rate is not None
     assert info.rate > 2500.0
     # twice 107 µs on the line and 20 µs to think
@@ -352,7 +347,7 @@ def test_a_bridge_that_heeds_the_event_character_is_four_times_as_prompt() -> No
 
 
 def test_the_data_sheet_says_what_is_known_and_nothing_else() -> None:
-    info = Bench().opened(damping=1.5).info
+    info = FalconBench().opened(damping=1.5).info
     assert (info.axes, info.is_real, info.damping) == (("x", "y", "z"), True, 1.5)
     assert (info.mass, info.friction, info.rotational_damping) == (None, None, None)
     assert info.force_limit == 8.0
@@ -362,8 +357,8 @@ def test_the_data_sheet_says_what_is_known_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("lost", [1, 10_000])
 def test_one_lost_reply_is_measured_again_and_silence_is_not_borne(lost: int) -> None:
-    info = Bench().opened().info
-    bench = Bench()
+    info = FalconBench().opened().info
+    bench = FalconBench()
     write, packets = bench.link.write, 0
 
     def lossy(packet: array.array[int], timeout_ms: int = 1) -> bool:

@@ -22,9 +22,8 @@ def places(count: int, radius: float = 0.04) -> Array:
     """Places within the workspace: a cylinder of this radius, 0.08 to 0.165 m from the base."""
     rng = np.random.default_rng(4)
     turn, way = rng.uniform(0, 2 * np.pi, count), radius * np.sqrt(rng.uniform(0, 1, count))
-    return np.column_stack(
-        [way * np.cos(turn), way * np.sin(turn), rng.uniform(0.08, 0.165, count)]
-    )
+    height = rng.uniform(0.08, 0.165, count)
+    return np.column_stack([way * np.cos(turn), way * np.sin(turn), height])
 
 
 def angles_of(place: Array) -> Array:
@@ -74,10 +73,8 @@ def test_the_jacobian_is_the_slope_of_the_angles() -> None:
     for place in places(200):
         matrix = np.empty((3, 3))
         assert kinematics.jacobian(place, angles_of(place), matrix)
-        slopes = [
-            (angles_of(place + step * axis) - angles_of(place - step * axis)) / (2 * step)
-            for axis in np.eye(3)
-        ]
+        ways = step * np.eye(3)
+        slopes = [(angles_of(place + w) - angles_of(place - w)) / (2 * step) for w in ways]
         # central differences: truncation of order step², rounding of order 1e-16/step
         np.testing.assert_allclose(matrix, np.transpose(slopes), rtol=1e-6, atol=1e-6)
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import PERIOD, ticks
 from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
 
 from hapticbridge.device import open_device
@@ -23,21 +24,7 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-PERIOD = 1e-3
 WRENCH = np.array([1.0, -0.5, 0.3, 0.01, -0.02, 0.005])
-
-
-def ticks(
-    stub: Stub, device: ForceDimensionDevice, count: int, wrench: np.ndarray = WRENCH
-) -> list[int]:
-    """Runs a loop of that many ticks; returns the flags of its reads."""
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    flags = []
-    for _ in range(count):
-        stub.advance(stub.now + PERIOD)
-        flags.append(device.read(sample))
-        device.write(wrench)
-    return flags
 
 
 def started(kind: int = OMEGA3, **options: object) -> tuple[Stub, ForceDimensionDevice]:
@@ -53,7 +40,7 @@ def test_an_omega_has_three_axes_and_obeys_forces_on_them() -> None:
     stub, device = started()
     assert (device.info.name, device.info.axes) == ("omega.3", ("x", "y", "z"))
     assert device.info.serial == "4711"
-    assert ticks(stub, device, 20) == [0] * 20
+    assert ticks(device, stub, 20, WRENCH) == [0] * 20
     np.testing.assert_allclose(stub.force(), [1.0, -0.5, 0.3, 0, 0, 0])
     stub.call("buttons", 0b101)
     sample = np.zeros(1, SAMPLE_DTYPE)
@@ -68,7 +55,7 @@ def test_a_sigma_turns_and_its_orientation_is_that_of_the_matrix() -> None:
     stub, device = started(SIGMA7)
     assert device.info.axes == ("x", "y", "z", "rx", "ry", "rz")
     begin = stub.now + PERIOD + CALL
-    ticks(stub, device, 100, np.array([0, 0, 0, 0, 0.01, 0]))
+    ticks(device, stub, 100, np.array([0, 0, 0, 0, 0.01, 0]))
     np.testing.assert_allclose(stub.force(), [0, 0, 0, 0, 0.01, 0])
     sample = np.zeros(1, SAMPLE_DTYPE)
     device.read(sample)
@@ -164,12 +151,12 @@ def test_a_device_without_a_watchdog_says_so_and_runs() -> None:
     device = stub.opened(notify=said.append)
     device.start(PERIOD)
     assert "has no watchdog (feature not available)" in said[-1]
-    assert ticks(stub, device, 3) == [0] * 3
+    assert ticks(device, stub, 3, WRENCH) == [0] * 3
 
 
 def test_warnings_are_a_repeated_sample_and_a_counted_saturation() -> None:
     stub, device = started()
-    ticks(stub, device, 5)
+    ticks(device, stub, 5, WRENCH)
     stub.call("stale", 2)
     stale = int(TickFlag.STALE_SAMPLE)
     before = np.zeros(1, SAMPLE_DTYPE)
@@ -177,20 +164,20 @@ def test_warnings_are_a_repeated_sample_and_a_counted_saturation() -> None:
     again = np.full(1, -7, SAMPLE_DTYPE)
     assert device.read(again) == stale
     assert again.tobytes() == before.tobytes()
-    assert ticks(stub, device, 3) == [0] * 3
+    assert ticks(device, stub, 3, WRENCH) == [0] * 3
     assert device.saturated == 0
-    ticks(stub, device, 4, np.array([30.0, 0, 0, 0, 0, 0]))
+    ticks(device, stub, 4, np.array([30.0, 0, 0, 0, 0, 0]))
     assert device.saturated == 4
     assert np.linalg.norm(stub.force()) == pytest.approx(12.0)
 
 
 def test_no_fresh_sample_for_50_ms_is_a_lost_device_and_not_before() -> None:
     stub, device = started()
-    ticks(stub, device, 5)
+    ticks(device, stub, 5, WRENCH)
     stub.call("stale", 10_000)
-    ticks(stub, device, 35)
+    ticks(device, stub, 35, WRENCH)
     with pytest.raises(DeviceLost, match="no fresh sample for 50 ms"):
-        ticks(stub, device, 20)
+        ticks(device, stub, 20, WRENCH)
 
 
 def test_an_error_is_a_lost_device_in_the_librarys_words() -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from device_benches import PERIOD, HaplyBench, ticks
 from emulated.haply_service import CENTRE, HaplyService, serving
-from haply_cases import PERIOD, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,26 +27,15 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 FORCE = np.array([0.4, -0.3, 0.2, 9.0, 9.0, 9.0])
 
 
-def ticks(bench: Bench, device: HaplyDevice, count: int, wrench: np.ndarray = FORCE) -> list[int]:
-    """Runs a loop of that many ticks; returns the flags of its reads."""
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    flags = []
-    for _ in range(count):
-        bench.time.advance(bench.time.now + PERIOD)
-        flags.append(device.read(sample))
-        device.write(wrench)
-    return flags
-
-
-def started(*mechanics: SimulatedDevice, **options: float) -> tuple[Bench, HaplyDevice]:
-    bench = Bench(*mechanics, **options)
+def started(*mechanics: SimulatedDevice, **options: float) -> tuple[HaplyBench, HaplyDevice]:
+    bench = HaplyBench(*mechanics, **options)
     device = bench.opened()
     device.start(PERIOD)
     return bench, device
 
 
 def test_the_filters_are_set_and_said() -> None:
-    bench = Bench()
+    bench = HaplyBench()
     (inverse,) = bench.service.devices.values()
     inverse.damping = 5.0  # somebody's
     bench.opened(force_gate=0.1)
@@ -59,11 +48,11 @@ def test_the_filters_are_set_and_said() -> None:
 
 
 def test_a_service_of_before_is_spoken_to_in_its_own_words() -> None:
-    bench = Bench()
+    bench = HaplyBench()
     bench.service.is_old = True
     device = bench.opened()
     device.start(PERIOD)
-    ticks(bench, device, 3)
+    ticks(device, bench.time, 3, FORCE)
     assert "older than 3.5" in bench.told[0]
     assert bench.service.forces[-1] == FORCE[:3].tolist()
 
@@ -71,7 +60,7 @@ def test_a_service_of_before_is_spoken_to_in_its_own_words() -> None:
 def test_each_tick_sends_one_force_and_reads_one_state() -> None:
     bench, device = started(resolution=1e-5)
     before = bench.service.messages
-    assert ticks(bench, device, 50)[1:] == [0] * 49
+    assert ticks(device, bench.time, 50, FORCE)[1:] == [0] * 49
     bench.time.advance(bench.time.now + PERIOD)
     assert bench.service.messages - before == 50
     assert bench.service.forces[-50:] == [FORCE[:3].tolist()] * 50
@@ -79,12 +68,12 @@ def test_each_tick_sends_one_force_and_reads_one_state() -> None:
 
 
 def test_the_pose_is_the_services_and_nothing_turns() -> None:
-    bench = Bench()
+    bench = HaplyBench()
     device = bench.opened()
     sample = device.start(PERIOD)
     (inverse,) = bench.service.devices.values()
     bench.service.buttons = {"a": True, "b": False, "c": True}
-    ticks(bench, device, 30)
+    ticks(device, bench.time, 30, FORCE)
     bench.time.advance(bench.time.now + PERIOD)
     told = CENTRE + inverse.handle.pose()[0]
     device.read(sample)
@@ -96,7 +85,7 @@ def test_the_pose_is_the_services_and_nothing_turns() -> None:
 def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> None:
     bench, device = started(work=2.7e-3)
     assert device.info.rate == pytest.approx(1 / 2.7e-3, rel=0.01)
-    flags = ticks(bench, device, 300)
+    flags = ticks(device, bench.time, 300, FORCE)
     missed = 300 * (1 - 1 / 2.7)
     assert np.count_nonzero(flags) == pytest.approx(missed, abs=4)
     assert device.held_back == pytest.approx(missed, abs=6)
@@ -114,7 +103,7 @@ def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> 
 
 @pytest.mark.parametrize(("travel", "work"), [(1e-4, 5e-5), (4e-4, 1e-4), (8e-4, 5e-4)])
 def test_rate_and_delay_are_measured(travel: float, work: float) -> None:
-    device = Bench(travel=travel, work=work).opened()
+    device = HaplyBench(travel=travel, work=work).opened()
     round_trip = 2 * travel + work
     assert device.info.delay == pytest.approx(round_trip, rel=0.02)
     assert device.info.rate == pytest.approx(min(1 / work, 2 / round_trip), rel=0.05)
@@ -122,7 +111,7 @@ def test_rate_and_delay_are_measured(travel: float, work: float) -> None:
 
 def test_the_force_that_answers_a_sample_acts_within_the_delay_that_is_stated() -> None:
     bench, device = started(travel=2e-4)
-    ticks(bench, device, 5, np.zeros(6))
+    ticks(device, bench.time, 5, np.zeros(6))
     (inverse,) = bench.service.devices.values()
     device.write(FORCE)
     assert not inverse.force.any()
@@ -132,7 +121,7 @@ def test_the_force_that_answers_a_sample_acts_within_the_delay_that_is_stated() 
 
 def test_closing_leaves_no_force_and_may_be_done_twice() -> None:
     bench, device = started()
-    ticks(bench, device, 20)
+    ticks(device, bench.time, 20, FORCE)
     (inverse,) = bench.service.devices.values()
     assert inverse.force.any()
     device.close()
@@ -143,22 +132,22 @@ def test_closing_leaves_no_force_and_may_be_done_twice() -> None:
 
 def test_a_silent_service_is_lost_after_50_ms_and_not_before() -> None:
     bench, device = started()
-    ticks(bench, device, 5)
+    ticks(device, bench.time, 5, FORCE)
     bench.link.is_silent = True
     stale = int(TickFlag.STALE_SAMPLE)
-    assert ticks(bench, device, 45)[3:] == [stale] * 42
+    assert ticks(device, bench.time, 45, FORCE)[3:] == [stale] * 42
     with pytest.raises(DeviceLost, match="has not answered for 50 ms"):
-        ticks(bench, device, 10)
+        ticks(device, bench.time, 10, FORCE)
 
 
 def test_a_loop_that_was_away_finds_the_service_alive() -> None:
     bench, device = started()
-    ticks(bench, device, 5)
+    ticks(device, bench.time, 5, FORCE)
     bench.time.advance(bench.time.now + 0.5)
-    assert ticks(bench, device, 5) == [0] * 5
+    assert ticks(device, bench.time, 5, FORCE) == [0] * 5
     device.start(PERIOD)
     bench.time.advance(bench.time.now + 0.5)  # before the loop's first question
-    assert ticks(bench, device, 5) == [0] * 5
+    assert ticks(device, bench.time, 5, FORCE) == [0] * 5
 
 
 @pytest.mark.parametrize(("stall", "is_asked_anew"), [(0.04, False), (0.2, True)])
@@ -166,7 +155,7 @@ def test_after_a_stall_pose_and_force_are_fresh(stall: float, is_asked_anew: boo
     path = Motion([0.0, 2.0], [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0)])
     # slower than the loop: a force waits
     bench, device = started(SimulatedDevice(path=path), work=3e-3)
-    ticks(bench, device, 300)
+    ticks(device, bench.time, 300, FORCE)
     end = bench.time.now + stall
     bench.time.advance(end)
     late, sample = len(bench.service.forces), np.zeros(1, SAMPLE_DTYPE)
@@ -201,31 +190,18 @@ def at(**place: str) -> str:
 )  # fmt: skip
 def test_answer_that_is_none_ends_run(answer: str, error: type[DeviceError], words: str) -> None:
     bench, device = started()
-    ticks(bench, device, 5)
+    ticks(device, bench.time, 5, FORCE)
     bench.service.spoil[bench.service.messages + 2] = answer
     with pytest.raises(error, match=words):
-        ticks(bench, device, 5)
+        ticks(device, bench.time, 5, FORCE)
 
 
 number = st.floats() | st.integers() | st.booleans() | st.text(max_size=3) | st.none()
 vector = st.dictionaries(st.sampled_from("xyz"), number)
-told = st.fixed_dictionaries(
-    {
-        "inverse3": st.lists(
-            st.fixed_dictionaries(
-                {
-                    "device_id": st.sampled_from(["049D", "x"]),
-                    "state": st.dictionaries(
-                        st.sampled_from(["cursor_position", "other"]), vector | number
-                    )
-                    | number,
-                }
-            ),
-            max_size=2,
-        )
-        | number
-    }
-)
+places = st.dictionaries(st.sampled_from(["cursor_position", "other"]), vector | number)
+entry = {"device_id": st.sampled_from(["049D", "x"]), "state": places | number}
+entries = st.lists(st.fixed_dictionaries(entry), max_size=2)
+told = st.fixed_dictionaries({"inverse3": entries | number})
 
 
 @given(st.text() | told.map(json.dumps))
@@ -241,7 +217,7 @@ def test_whatever_comes_the_position_is_finite_or_there_is_none(message: str) ->
 
 
 def test_one_of_several_is_chosen_by_its_number() -> None:
-    bench = Bench(SimulatedDevice(), SimulatedDevice())
+    bench = HaplyBench(SimulatedDevice(), SimulatedDevice())
     with pytest.raises(DeviceError, match="choose one with serial=, one of '049D', '049E'"):
         bench.opened()
     assert bench.link.is_closed
@@ -249,7 +225,7 @@ def test_one_of_several_is_chosen_by_its_number() -> None:
         bench.opened(serial="77")
     device = bench.opened(serial="049E")
     device.start(PERIOD)
-    ticks(bench, device, 10)
+    ticks(device, bench.time, 10, FORCE)
     assert device.info.serial == "049E"
     assert [inverse.force.any() for inverse in bench.service.devices.values()] == [False, True]
     bench.service.devices.clear()
@@ -265,7 +241,7 @@ def test_a_number_that_is_no_name_is_refused(device_id: object) -> None:
 
 
 def test_scaled_positions_are_refused_because_their_work_is_none() -> None:
-    bench = Bench()
+    bench = HaplyBench()
     told = json.loads(bench.service.inventory())
     told["inverse3"][0]["config"]["mount"]["scale"]["y"] = 2
     (listed,) = messages.inventory(json.dumps(told))
@@ -277,18 +253,18 @@ def test_scaled_positions_are_refused_because_their_work_is_none() -> None:
 
 
 def test_numbers_and_limits_come_from_whoever_knows_them() -> None:
-    info = Bench().opened().info
+    info = HaplyBench().opened().info
     assert (info.mass, info.damping, info.friction, info.resolution) == (None,) * 4
     assert (info.force_limit, info.axes, info.is_real) == (FORCE_LIMIT, ("x", "y", "z"), True)
-    info = Bench().opened(damping=1.2, force_limit=5.0).info
+    info = HaplyBench().opened(damping=1.2, force_limit=5.0).info
     assert (info.damping, info.force_limit) == (1.2, 5.0)
     with pytest.raises(DeviceError, match="damping = -1"):
-        Bench().opened(damping=-1)
+        HaplyBench().opened(damping=-1)
 
 
 def test_a_slow_loop_is_refused() -> None:
     with pytest.raises(DeviceError, match="the rate must be at least 50 Hz"):
-        Bench().opened().start(0.021)
+        HaplyBench().opened().start(0.021)
 
 
 def test_real_sockets_run_and_are_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,22 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import device_benches as benches
 import numpy as np
 import pytest
+from device_benches import NEWTONS, PERIOD, opened_rawhid
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
+from emulated.handle import planar_hand
 from emulated.hid_seam import DrivingClock, HidSeam
 from emulated.pid_model import PidStick
-from emulated.planar_hand import planar_hand
 from emulated.rawhid_model import Claims, RawHid
 from emulated.spacemouse_model import SpaceMouse
-from falcon_cases import Bench
-from haply_cases import Bench as HaplyBench
-from identified_devices import DRIVERS, identified, mechanics
 from numpy.typing import NDArray
-from pid_cases import LAYOUTS, NEWTONS, TRAVEL
-from pid_cases import opened as opened_stick
-from rawhid_cases import opened as opened_rawhid
-from rawhid_cases import paddle
 
 import hapticbridge as hb
 from hapticbridge.clock import Clock
@@ -39,7 +34,6 @@ from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.scene import load_scene, scene_path
 
-PERIOD = 1e-3
 WIDE = 0.12
 OWN_PATH = scene_path("peg_in_hole").with_suffix(".csv")
 
@@ -76,24 +70,23 @@ class Rig:
 def falcon() -> Rig:
     hand = device_for(load_scene("peg_in_hole"), "simulated:mass=0.4,damping=2")
     assert isinstance(hand, SimulatedDevice)
-    bench = Bench(hand)
+    bench = benches.FalconBench(hand)
     device = bench.opened(damping=2.0)
     clock, later = bench.clock(2e-4), lambda s: bench.time.until(bench.time.now + s)
     return Rig(device, clock, bench.model, bench, lambda: bench.model.motors, later)
 
 
 def rawhid(model: RawHid | None = None) -> Rig:
-    device, model, seam = opened_rawhid(
-        model or RawHid(SimulatedDevice(path=OWN_PATH, friction=0.05))
-    )
+    mine = SimulatedDevice(path=OWN_PATH, friction=0.05)
+    device, model, seam = opened_rawhid(model or RawHid(mine))
     later = lambda s: model.advance(seam.now + s)  # noqa: E731
     return Rig(device, DrivingClock(seam), model, seam, lambda: model.wrench, later)
 
 
 def stick(name: str = "usual", model: PidStick | None = None) -> Rig:
     moved = SimulatedDevice(mass=0.25, damping=4.0, friction=0.05, path=planar_hand("planar_peg"))
-    model = model or PidStick(moved, LAYOUTS[name], newtons=NEWTONS, travel=WIDE)
-    device, model, seam = opened_stick(model, damping=4.0, mass=0.25, travel=WIDE)
+    model = model or PidStick(moved, benches.LAYOUTS[name], newtons=NEWTONS, travel=WIDE)
+    device, model, seam = benches.opened_stick(model, damping=4.0, mass=0.25, travel=WIDE)
     # the scene lies in x and z, the stick in x and y
     axes = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     scene = {"scene": "planar_peg", "workspace": Workspace(axes=axes)}
@@ -103,7 +96,7 @@ def stick(name: str = "usual", model: PidStick | None = None) -> Rig:
 
 def haply() -> Rig:
     hand = SimulatedDevice(path=OWN_PATH, mass=0.2, damping=2.0, friction=0.05)
-    bench = HaplyBench(hand, resolution=1e-5)
+    bench = benches.HaplyBench(hand, resolution=1e-5)
     device = bench.opened(damping=2.0)
     (inverse,) = bench.service.devices.values()
     later = lambda s: bench.time.advance(bench.time.now + s)  # noqa: E731
@@ -225,17 +218,14 @@ def test_what_was_felt_was_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert any(np.array_equal(got[-len(sent) - k : -k], sent) for k in range(1, 6))
 
 
+def slow_stick() -> Rig:
+    moved = SimulatedDevice(mass=0.25, damping=4.0)
+    return stick(model=PidStick(moved, rate=125.0, travel=WIDE))
+
+
 @pytest.mark.parametrize(
     ("make", "stale"),
-    [
-        (lambda: rawhid(RawHid(SimulatedDevice(), Claims(rate=250.0))), 300),
-        (
-            lambda: stick(
-                model=PidStick(SimulatedDevice(mass=0.25, damping=4.0), rate=125.0, travel=WIDE)
-            ),
-            350,
-        ),
-    ],
+    [(lambda: rawhid(RawHid(SimulatedDevice(), Claims(rate=250.0))), 300), (slow_stick, 350)],
 )
 def test_repeated_samples_are_flagged(make: Callable[[], Rig], stale: int, tmp_path: Path) -> None:
     make().run(tmp_path / "run.mcap", 0.4)
@@ -256,7 +246,7 @@ def test_lost_and_damaged_frames_are_flagged_and_the_run_stays_passive(tmp_path:
 
 
 def test_a_paddle_of_one_axis_runs_a_scene_and_its_other_axes_stay(tmp_path: Path) -> None:
-    rig = rawhid(paddle())
+    rig = rawhid(benches.paddle())
     summary = rig.run(tmp_path / "run.mcap", 0.5)
     ticks = rows(tmp_path / "run.mcap")
     assert np.ptp(ticks["device_position"][:, 0]) > 1e-4
@@ -292,11 +282,11 @@ def test_a_device_in_a_hand_refuses_a_clock_that_runs_ahead_of_it() -> None:
     assert [device.info.is_real for device in devices] == [True, False]
 
 
-@pytest.mark.parametrize("driver", sorted(set(DRIVERS) - {"simulated"}))
+@pytest.mark.parametrize("driver", sorted(set(benches.DRIVERS) - {"simulated"}))
 @pytest.mark.parametrize(("seed", "axis"), [(0, "x"), (1, "y")])
 def test_identify_finds_what_is_behind_a_driver(driver: str, seed: int, axis: str) -> None:
-    true = mechanics(seed)
-    fit = identified(driver, seed, axis, 6.0)
+    true = benches.mechanics(seed)
+    fit = benches.identified(driver, seed, axis, 6.0)
     for name, tolerance in (("mass", 0.05), ("damping", 0.05), ("friction", 0.1)):
         assert getattr(fit, name).value == pytest.approx(true[name], rel=tolerance)
     # as the drivers say: a Falcon's answer is one tick old, and the next is asked a tick later
@@ -314,22 +304,19 @@ def test_identify_finds_inertia_and_damping_of_a_wrist() -> None:
     assert fit.damping.value == pytest.approx(4e-3, rel=0.05)
 
 
-def test_identified_numbers_keep_their_scale(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_identified_scale_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Assumed 10 N and 0.1 m: all that is measured is off by the same factors as the force."""
     monkeypatch.setattr(sheet, "profile_of", lambda device, serial, model: None)
     moved = SimulatedDevice(hand=None, mass=0.3, damping=2.0)
-    seam = HidSeam(PidStick(moved, newtons=NEWTONS, travel=TRAVEL))
+    seam = HidSeam(PidStick(moved, newtons=NEWTONS, travel=benches.TRAVEL))
     device = open_pid({}, ignore_message, seam)
     result = identify(device, DrivingClock(seam), period=PERIOD, axes=("x",), duration=5.0)
     device.close()
     # N per m, and per m/s, in the assumed units of both
-    factor = (sheet.ASSUMED_NEWTONS / NEWTONS) / (sheet.ASSUMED_TRAVEL / TRAVEL)
+    factor = (sheet.ASSUMED_NEWTONS / NEWTONS) / (sheet.ASSUMED_TRAVEL / benches.TRAVEL)
     assert result.fits["x"].damping.value == pytest.approx(factor * 2.0, rel=0.05)
-    profile = measured_profile(
-        result, device="pid", serial="P1", date="today", duration=5.0, workspace=device.workspace
-    )
+    told_of: Any = {"device": "pid", "serial": "P1", "date": "today", "duration": 5.0}
+    profile = measured_profile(result, workspace=device.workspace, **told_of)
     file = tmp_path / "pid-P1.toml"
     file.write_text(profile.to_toml())
     told: list[str] = []

@@ -7,19 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, read
+from device_benches import opened_stick as opened
 from emulated.hid_seam import HidSeam
-from emulated.pid_layouts import USUAL
 from emulated.pid_model import PidStick
-from hypothesis import given
-from hypothesis import strategies as st
-from pid_cases import LAYOUTS, NEWTONS, PERIOD, SCALE, TRAVEL, opened
 
-from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.driver import ignore_message
-from hapticbridge.device.pid import device as driver
 from hapticbridge.device.pid import device as sheet
 from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
+from hapticbridge.device.transport.hid import HidLink, find
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
@@ -34,12 +31,6 @@ def started(model: PidStick, **options: object) -> tuple[PidDevice, PidStick, Hi
     device, model, seam = opened(model, **options)
     device.start(PERIOD)
     return device, model, seam
-
-
-def read(device: PidDevice, seam: HidSeam, seconds: float = PERIOD) -> tuple[int, np.void]:
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    seam.advance(seam.now + seconds)
-    return device.read(sample), sample[0]
 
 
 @pytest.fixture(autouse=True)
@@ -69,8 +60,7 @@ def test_a_reversed_axis_pushes_the_other_way() -> None:
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_the_pose_is_the_deflection_times_the_travel(name: str) -> None:
     device, model, seam = started(PidStick(layout=LAYOUTS[name], buttons=0b10011))
-    step = device.info.resolution
-    assert step is not None
+    step = device.info.resolution or 0.0
     for place in ((0.0, 0.0), (0.5, -0.25), (1.0, 1.0), (-1.0, -1.0), (3.0, 0.1)):
         model.place = place
         flag, sample = read(device, seam)
@@ -102,9 +92,8 @@ def test_a_stick_that_says_nothing_at_rest_is_asked_where_it_stands() -> None:
     while model.take_report():
         pass
     sample = device.start(PERIOD)
-    np.testing.assert_allclose(
-        sample["position"][0], [-0.25 * TRAVEL, -0.125 * TRAVEL, 0.0], rtol=1e-4
-    )
+    place = [-0.25 * TRAVEL, -0.125 * TRAVEL, 0.0]
+    np.testing.assert_allclose(sample["position"][0], place, rtol=1e-4)
 
     class Mute(PidStick):
         def input_report(self, number: int, now: float) -> bytes | None:
@@ -133,11 +122,12 @@ def test_a_host_that_dies_lets_go_of_the_stick(name: str) -> None:
 
 def test_the_faster_the_bus_the_shorter_the_life() -> None:
     for interval, restart in ((1e-3, RESTART), (2e-3, RESTART), (8e-3, 0.08)):
-        device, model, _seam = opened()
-        device = PidDevice(
-            device._link, "fast", scale=sheet.Scale(NEWTONS, TRAVEL, np.ones(2)),
-            intervals=(1e-3, interval),
-        )  # fmt: skip
+        model = PidStick()
+        seam, scale = HidSeam(model), sheet.Scale(NEWTONS, TRAVEL, np.ones(2))
+        seam.advance(0.0)
+        (plugged,) = find(sheet.DRIVER, seam)
+        link = HidLink.open(plugged, seam, is_overlapped=False, slots=sheet.SLOTS)
+        device = PidDevice(link, "fast", scale=scale, intervals=(1e-3, interval))
         device.start(PERIOD)
         assert [e.duration for e in model.effects.values()] == pytest.approx([LIFE * restart] * 2)
         assert device.info.rate == pytest.approx(1.0 / (2 * interval))
@@ -174,7 +164,7 @@ def test_closing_stops_and_frees_the_effects_and_switches_the_motors_off() -> No
 
 def test_another_process_holds_what_takes_the_force_away(monkeypatch: pytest.MonkeyPatch) -> None:
     held: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(driver, "guard_device_node", lambda *given: held.append(given))
+    monkeypatch.setattr(sheet, "guard_device_node", lambda *given: held.append(given))
     device, model, seam = started(PidStick())
     device.leave_last_word("/dev/hidraw7")
     device.write(wrench(1.0, 1.0))
@@ -258,12 +248,10 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
     assert asked == [("pid", "P1", device.info.name)]
     assert device.info.force_limit == 7.0
     assert device.start(PERIOD)["position"][0, 0] == pytest.approx(0.025)
-    for option, words in (
-        ({"newtons": 3.0}, r"newtons = 3\.0: .* was measured with 7, .* leave out"),
-        ({"travel": 0.1}, r"travel = 0\.1: .* was measured with 0\.05"),
-    ):
-        with pytest.raises(DeviceError, match=words):
-            open_pid(option, ignore_message, HidSeam(model))
+    with pytest.raises(DeviceError, match=r"newtons = 3\.0: .* was measured with 7, .* leave out"):
+        open_pid({"newtons": 3.0}, ignore_message, HidSeam(model))
+    with pytest.raises(DeviceError, match=r"travel = 0\.1: .* was measured with 0\.05"):
+        open_pid({"travel": 0.1}, ignore_message, HidSeam(model))
     other = open_pid({"newtons": 3.0, "profile": "none"}, ignore_message, HidSeam(model))
     assert other.info.force_limit == 3.0
 
@@ -282,26 +270,3 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
 def test_options_that_cannot_be_are_refused(options: dict[str, object], words: str) -> None:
     with pytest.raises(DeviceError, match=words):
         open_pid(options, ignore_message, HidSeam(PidStick()))
-
-
-@given(st.lists(st.binary(min_size=1, max_size=64), max_size=8))
-def test_arbitrary_reports_never_make_a_pose_that_is_none(reports: list[bytes]) -> None:
-    device, model, _ = started(PidStick())
-    for report in reports:
-        model.push(report)
-    sample = np.zeros(1, SAMPLE_DTYPE)
-    device.read(sample)
-    assert np.isfinite(sample["position"]).all()
-    assert np.abs(sample["position"]).max() <= 0.5 * TRAVEL
-    assert sample["quaternion"].tolist() == [[1.0, 0.0, 0.0, 0.0]]
-
-
-def test_the_model_moves_as_its_mechanics_do_under_the_force_it_is_sent() -> None:
-    """The handle behind the model is free; F = 1 N on 0.1 kg with b = 2 N s/m, closed form."""
-    device, _, seam = started(PidStick(SimulatedDevice(hand=None), USUAL))
-    seconds, decay = 0.02, 0.1 / 2.0
-    for _ in range(20):
-        device.write(wrench(1.0, -0.5))
-        _, sample = read(device, seam)
-    expected = (seconds - decay * (1.0 - math.exp(-seconds / decay))) / 2.0
-    np.testing.assert_allclose(sample["position"][:2], [expected, -0.5 * expected], rtol=0.02)

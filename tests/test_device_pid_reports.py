@@ -7,25 +7,16 @@ import re
 from collections.abc import Mapping
 
 import pytest
+from device_benches import LAYOUTS, MOUSE
+from device_benches import opened_stick as opened
 from emulated.pid_layouts import OUT, PID, Part, Report, descriptor
 from emulated.pid_model import PidStick
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, MOUSE, opened
 
+from hapticbridge.device.pid import reports as wire
 from hapticbridge.device.pid.device import Stick
-from hapticbridge.device.pid.reports import (
-    DISABLE,
-    ENABLE,
-    FULL,
-    LOADED,
-    RESET,
-    START,
-    STOP,
-    STOP_ALL,
-    PidReports,
-    has_force_feedback,
-)
+from hapticbridge.device.pid.reports import PidReports, has_force_feedback
 from hapticbridge.device.transport.hid_descriptor import Layout
 from hapticbridge.errors import DeviceError
 
@@ -68,14 +59,14 @@ def said(layout: Mapping[str, Report], name: str, report: bytes | None) -> dict[
 
 def test_each_report_says_what_it_should_in_the_tables_words(layout: Mapping[str, Report]) -> None:
     reports = PidReports(Layout(descriptor(layout.values())))
-    for usage in (ENABLE, DISABLE, STOP_ALL, RESET):
+    for usage in (wire.ENABLE, wire.DISABLE, wire.STOP_ALL, wire.RESET):
         value = said(layout, "control", reports.control(usage))["control"]
         assert layout["control"].chosen("control", value) == usage & 0xFFFF
     gain = layout["gain"].part("gain").high
     assert said(layout, "gain", reports.full_gain())["gain"] == gain
     kind = said(layout, "create", reports.create())["type"]
     assert layout["create"].chosen("type", kind) == 0x26
-    for usage in (START, STOP):
+    for usage in (wire.START, wire.STOP):
         values = said(layout, "operation", reports.operate(7, usage))
         assert layout["operation"].chosen("operation", values["operation"]) == usage & 0xFFFF
         assert (values["index"], values["loops"]) == (7, 1)
@@ -116,9 +107,9 @@ def test_block_load_is_read_back(layout: Mapping[str, Report], usage: int, is_th
     answer = layout["load"].packed(index=4, status=status, memory=9)
     assert reports.load == (layout["load"].number, layout["load"].length)
     assert reports.loaded(answer) == (PID | usage, 4)
-    assert (reports.loaded(answer)[0] == LOADED) is is_there
+    assert (reports.loaded(answer)[0] == wire.LOADED) is is_there
     assert reports.loaded(layout["load"].packed(index=4, status=0))[0] is None
-    assert FULL == PID | 0x8D
+    assert wire.FULL == PID | 0x8D
     assert reports.max_effects(layout["pool"].packed(most=2)) == 2
     assert reports.max_effects(layout["pool"].packed(most=0)) is None
 
@@ -126,15 +117,8 @@ def test_block_load_is_read_back(layout: Mapping[str, Report], usage: int, is_th
 def test_flags_do_for_choices_where_a_device_has_flags() -> None:
     layout = dict(LAYOUTS["usual"])
     usages = (0x97, 0x98, 0x99, 0x9A)
-    layout["control"] = Report(
-        kind=OUT,
-        number=12,
-        usage=PID | 0x95,
-        parts=tuple(
-            Part(name=f"u{usage:x}", usage=PID | usage, bits=1, high=1, within=PID | 0x96)
-            for usage in usages
-        ),
-    )
+    flags = tuple(Part(f"u{usage:x}", PID | usage, 1, 0, 1, PID | 0x96) for usage in usages)
+    layout["control"] = Report(kind=OUT, number=12, usage=PID | 0x95, parts=flags)
     reports = PidReports(Layout(descriptor(layout.values())))
     for usage in usages:
         values = said(layout, "control", reports.control(PID | usage))

@@ -17,18 +17,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.device import spacemouse as driver
 from hapticbridge.device.driver import ignore_message
-from hapticbridge.device.spacemouse import (
-    DRIVER,
-    HELD,
-    Buttons,
-    Deflection,
-    SpaceMouseDevice,
-    decoded,
-    open_spacemouse,
-    share,
-)
-from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.device.spacemouse import SpaceMouseDevice, decoded, open_spacemouse
+from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
@@ -53,18 +45,18 @@ def run(device: SpaceMouseDevice, seam: HidSeam, ticks: int) -> Any:
 
 @given(st.tuples(*[counts] * 6))
 def test_length_tells_the_layouts_apart(values: tuple[int, ...]) -> None:
-    assert decoded(struct.pack("<B6h", 1, *values)) == Deflection(0, values)
-    assert decoded(struct.pack("<B3h", 1, *values[:3])) == Deflection(0, values[:3])
-    assert decoded(struct.pack("<B3h", 2, *values[3:])) == Deflection(3, values[3:])
+    assert decoded(struct.pack("<B6h", 1, *values)) == driver.Deflection(0, values)
+    assert decoded(struct.pack("<B3h", 1, *values[:3])) == driver.Deflection(0, values[:3])
+    assert decoded(struct.pack("<B3h", 2, *values[3:])) == driver.Deflection(3, values[3:])
 
 
 @given(st.binary(max_size=80))
 def test_arbitrary_bytes_are_read_without_a_crash(data: bytes) -> None:
     news = decoded(data)
     assert news is None or data[0] in (1, 2, 3)
-    if isinstance(news, Deflection):
-        assert all(abs(share(count, 0.05)) <= 1.0 for count in news.counts)
-    elif isinstance(news, Buttons):
+    if isinstance(news, driver.Deflection):
+        assert all(abs(driver.share(count, 0.05)) <= 1.0 for count in news.counts)
+    elif isinstance(news, driver.Buttons):
         assert 0 <= news.bits < 2**48
 
 
@@ -73,13 +65,13 @@ def test_arbitrary_bytes_are_read_without_a_crash(data: bytes) -> None:
     [("0302", 2), ("030200", 2), ("0300004001", 0x01400000), ("03" + "ff" * 9, 2**48 - 1)],
 )
 def test_buttons_are_a_little_endian_bitmap_of_any_length(report: str, bits: int) -> None:
-    assert decoded(bytes.fromhex(report)) == Buttons(bits)
+    assert decoded(bytes.fromhex(report)) == driver.Buttons(bits)
 
 
 @given(st.integers(-40000, 40000), st.floats(0.0, 0.9))
 def test_deflection_beyond_the_dead_band_is_linear_odd_and_clamped(count: int, band: float) -> None:
-    value = share(count, band)
-    assert share(-count, band) == -value
+    value = driver.share(count, band)
+    assert driver.share(-count, band) == -value
     assert value * count >= 0.0
     if abs(count) >= 350:
         assert abs(value) == 1.0
@@ -100,13 +92,13 @@ AXES = [
 ]
 
 
-@pytest.mark.parametrize("has_long_reports", [False, True])
+Three = tuple[int, int, int]
+
+
+@pytest.mark.parametrize("is_long", [False, True])
 @pytest.mark.parametrize(("push", "way", "turn"), AXES)
-def test_full_deflection_moves_at_the_speed_asked_for_in_both_layouts(
-    push: tuple[int, ...], way: tuple[int, ...], turn: tuple[int, ...], has_long_reports: bool
-) -> None:
-    model = SpaceMouse(has_long_reports=has_long_reports)
-    device, model, seam = opened(model, speed=0.1, turn=0.5)
+def test_deflection_is_speed(push: Any, way: Three, turn: Three, is_long: bool) -> None:
+    device, model, seam = opened(SpaceMouse(has_long_reports=is_long), speed=0.1, turn=0.5)
     device.start(PERIOD)
     model.deflect(*push)
     sample = run(device, seam, 401)  # the first read only takes the deflection
@@ -149,7 +141,7 @@ def test_a_puck_that_falls_silent_while_deflected_stops_the_handle() -> None:
     device.start(PERIOD)
     model.deflect(350, 0, 0, 0, 0, 0)
     sample = run(device, seam, 3000)
-    assert sample["position"][0] == pytest.approx(0.1 * HELD, abs=2e-4)
+    assert sample["position"][0] == pytest.approx(0.1 * driver.HELD, abs=2e-4)
 
 
 def test_buttons_and_light() -> None:
@@ -186,16 +178,6 @@ def test_starting_again_goes_back_to_the_origin() -> None:
         assert run(device, seam, 50)["position"].all()
 
 
-def test_unplugging_is_seen_by_the_next_read() -> None:
-    device, model, seam = opened()
-    device.start(PERIOD)
-    run(device, seam, 2)
-    seam.unplug(model)
-    with pytest.raises(DeviceLost, match="is gone: unplugged"):
-        run(device, seam, 1)
-    device.close()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -207,17 +189,16 @@ def test_unplugging_is_seen_by_the_next_read() -> None:
     ],
 )
 def test_options_out_of_range_are_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(DeviceError) as error:
+    with pytest.raises(DeviceError, match=words):
         opened(**options)
-    assert words in str(error.value)
 
 
 CADMOUSE = (0xC650, 0xC651, *range(0xC654, 0xC659), 0xC664, 0xC665, 0xC668)
 
 
 def test_flat_mice_of_the_same_maker_are_not_taken_for_one() -> None:
-    products = {(usb_id.vendor, usb_id.product) for usb_id in DRIVER.ids}
-    assert len(products) == len(DRIVER.ids) == 22
+    products = {(usb_id.vendor, usb_id.product) for usb_id in driver.DRIVER.ids}
+    assert len(products) == len(driver.DRIVER.ids) == 22
     assert not products & {(0x256F, product) for product in CADMOUSE}
     assert {(0x046D, 0xC626), (0x256F, 0xC635), (0x256F, 0xC652)} <= products
 

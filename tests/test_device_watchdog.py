@@ -9,10 +9,11 @@ from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 PERIOD = 1e-3
 
 
-def test_a_device_is_silent_just_after_fifty_milliseconds_without_a_sample() -> None:
-    watch = SilenceDetector(3.0)
-    verdicts = [watch.is_silent(3.0 + PERIOD * k, is_new=False) for k in range(1, 60)]
-    assert verdicts.index(True) == pytest.approx(SILENCE / PERIOD, abs=1)
+@pytest.mark.parametrize("step", [PERIOD, 10 * PERIOD, 45 * PERIOD, 0.1])
+def test_a_device_is_silent_after_fifty_milliseconds_at_any_rate(step: float) -> None:
+    watch = SilenceDetector(3.0, step)
+    verdicts = [watch.is_silent(3.0 + step * k, is_new=False) for k in range(1, 60)]
+    assert SILENCE < step * (verdicts.index(True) + 1) < SILENCE + step + 1e-9
     assert all(verdicts[verdicts.index(True) :])
 
 

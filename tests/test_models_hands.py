@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,22 +13,18 @@ from model_runs import BOTTOMED_HEIGHT, HOME_HEIGHT, MODELS, Array
 from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
+from hapticbridge import scene as scenes
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice, device_for, scene_hand
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.record import TickFlag
-from hapticbridge.scene import (
-    Parameter,
-    plain_model,
-    read_scene,
-    scene_names,
-    scene_parameters,
-    scene_path,
-)
+from hapticbridge.scene import scene_names, scene_path
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device
 
-HANDS: list[tuple[str, dict[str, float], float, int]] = [
+Values = dict[str, float]
+
+HANDS: list[tuple[str, Values, float, int]] = [
     ("point_mass", {}, 0.0, 0),
     ("virtual_wall", {}, 0.0, 800),
     ("planar_peg", {}, 0.0, 800),
@@ -67,7 +63,7 @@ STRONG = Hand(stiffness=1000.0, damping=20.0, rotational_stiffness=3.0)
 PARAMETERS = [
     (name, parameter)
     for name in sorted({hand[0] for hand in HANDS})
-    for parameter in scene_parameters(scene_path(name))
+    for parameter in scenes.scene_parameters(scene_path(name))
 ]
 
 
@@ -90,9 +86,7 @@ def norms(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("name", "values", "first", "least"), HANDS, ids=str)
-def test_hands_leave_it_whole(
-    name: str, values: dict[str, float], first: float, least: int
-) -> None:
+def test_hands_leave_it_whole(name: str, values: Values, first: float, least: int) -> None:
     loop = ClosedLoop(hb.load_scene(name, "grip", **values))
     contacts, strongest, worst = 0, -1.0, 0
     begin = SEED.get(name, 0)
@@ -111,14 +105,11 @@ def test_hands_leave_it_whole(
         assert norms(sent)[1].max() == pytest.approx(TORQUE_LIMIT, rel=1e-9)
 
 
-def within_limits(
-    name: str, values: dict[str, float], motion: Motion
-) -> tuple[np.ndarray, np.ndarray]:
+def within_limits(name: str, values: Values, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Runs the bridge as its user does; returns what it sent, shape (n, 6), and its flags."""
     device = SimulatedDevice(path=motion)
-    with hb.Bridge(
-        hb.load_scene(name, "grip", **values), device, clock=hb.SimulatedClock()
-    ) as bridge:
+    scene = hb.load_scene(name, "grip", **values)
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock()) as bridge:
         summary = bridge.run(duration=motion.duration)
         rows = bridge.latest_records(round(motion.duration / T))
     assert summary.verdict == "passive"
@@ -139,7 +130,9 @@ def within_limits(
 @pytest.mark.parametrize(
     ("name", "parameter"), PARAMETERS, ids=[f"{name} {p.name}" for name, p in PARAMETERS]
 )
-def test_both_ends_of_a_parameter_are_passive_in_any_hand(name: str, parameter: Parameter) -> None:
+def test_both_ends_of_a_parameter_are_passive_in_any_hand(
+    name: str, parameter: scenes.Parameter
+) -> None:
     used = 0
     for value in (parameter.minimum, parameter.maximum):
         loop = ClosedLoop(hb.load_scene(name, "grip", **{parameter.name: value}))
@@ -152,18 +145,16 @@ def test_both_ends_of_a_parameter_are_passive_in_any_hand(name: str, parameter: 
             assert outcome.environment in {"strict", "within slack"}
             assert outcome.peak_force < FORCE_LIMIT or name in FIRST
             assert not any(warning.number for warning in loop.scene.data.warning)
-            used += int(
-                np.count_nonzero(outcome.records["contacts"] > (3 if name == "lock" else 0))
-            )
+            touching = outcome.records["contacts"] > (3 if name == "lock" else 0)
+            used += int(np.count_nonzero(touching))
     assert used > (300 if name in {*FIRST, *TOWARDS} else -1)
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a scene did on its own path: its joints and contacts tick by tick, and how it ended."""
+    """What a scene did on its own path: its joints tick by tick, and how it ended."""
 
     joints: Array
-    contacts: Array
     sent: Array
     summary: hb.Summary
     warnings: int
@@ -172,17 +163,11 @@ class Done:
 @functools.cache
 def default_run(name: str) -> Done:
     joints: list[Array] = []
-    contacts: list[int] = []
-
-    def look(_tick: int) -> None:
-        joints.append(bridge.scene.data.qpos.copy())
-        contacts.append(bridge.scene.data.ncon)
-
     with hb.Bridge(name, "simulated", clock=hb.SimulatedClock()) as bridge:
-        summary = bridge.run(on_tick=look)
+        summary = bridge.run(on_tick=lambda _: joints.append(bridge.scene.data.qpos.copy()))
         sent = bridge.latest_records(summary.ticks)["wrench_on_device"]
         warnings = sum(warning.number for warning in bridge.scene.data.warning)
-    return Done(np.array(joints), np.array(contacts), sent, summary, warnings)
+    return Done(np.array(joints), sent, summary, warnings)
 
 
 @pytest.mark.parametrize("name", scene_names())
@@ -197,101 +182,39 @@ def test_default_run_is_passive_and_sends_what_the_device_can(name: str) -> None
     assert np.linalg.norm(done.sent[:, 3:], axis=1).max() < 0.9 * TORQUE_LIMIT
 
 
-def point_mass(done: Done) -> None:
-    assert np.ptp(done.joints[:, :2], axis=0) == pytest.approx([0.08, 0.04], abs=0.01)
-    assert 2 * np.degrees(np.arccos(done.joints[:, 3].min())) > 35.0
+END, BOTTOM = slice(-1, None), slice(6480, 6600)
+SHOWN: list[tuple[str, slice, int, float, float]] = [
+    ("virtual_wall", slice(2400, 3300), 0, 0.01, 0.1e-3),
+    ("virtual_wall", END, 0, 0.0, 1e-3),
+    ("planar_peg", BOTTOM, 1, BOTTOMED_HEIGHT - HOME_HEIGHT, 0.3e-3),
+    ("planar_peg", END, 1, 0.0, 1e-3),
+    ("peg_in_hole", BOTTOM, 2, BOTTOMED_HEIGHT, 0.3e-3),
+    ("peg_in_hole", END, 2, HOME_HEIGHT, 1e-3),
+    ("round_peg", BOTTOM, 2, BOTTOMED_HEIGHT, 0.3e-3),
+    ("round_peg", END, 2, HOME_HEIGHT, 1e-3),
+    ("drawer", slice(3800, 4300), 0, 0.2, 1e-4),
+    ("drawer", END, 0, -0.001, 1e-4),
+    ("hammer", END, 0, -7.2e-3, 0.4e-3),
+    ("open_wrench", END, 0, math.radians(60.0), math.radians(2.0)),
+    *(("open_wrench", END, joint, 0.0, 2e-4) for joint in (2, 3, 4)),
+    ("ratchet", END, 0, math.radians(-88.0), math.radians(2.0)),
+    ("pliers", END, 0, 0.33e-3, 0.06e-3),
+    ("pliers", END, 1, 0.0, 2e-3),
+    ("lock", slice(2800, 5800), 4, 0.016, 1e-4),
+    ("lock", slice(4400, 4700), 0, math.radians(90.0), math.radians(2.0)),
+    ("lock", END, 0, 0.0, math.radians(0.5)),
+    ("lock", END, 4, 0.0, 0.5e-3),
+    ("screwdriver", END, 1, math.radians(180.0), math.radians(2.0)),
+    ("hex_key", END, 1, math.radians(120.0), math.radians(2.0)),
+]
+"""Scene, ticks, joint, where that must stand, tolerance; in m and rad, from the start."""
 
 
-def virtual_wall(done: Done) -> None:
-    assert (done.contacts[2400:3300] == 1).all()
-    away = done.joints[4200:7000, 0] < 0.009
-    assert np.count_nonzero(~away[1:] & away[:-1]) == 3
-    assert done.contacts[4200:7000].any()
-
-
-def peg_in_hole(done: Done) -> None:
-    height = done.joints[:, 2]
-    assert height.min() == pytest.approx(BOTTOMED_HEIGHT, abs=5e-5)
-    assert height[6480:6600] == pytest.approx(BOTTOMED_HEIGHT, abs=0.3e-3)
-    assert height[-1] == pytest.approx(HOME_HEIGHT, abs=1e-3)
-
-
-def planar_peg(done: Done) -> None:
-    assert done.joints[:, 1].min() == pytest.approx(BOTTOMED_HEIGHT - HOME_HEIGHT, abs=5e-5)
-    assert done.joints[-1] == pytest.approx([0.0, 0.0, 0.0], abs=1e-3)
-
-
-def drawer(done: Done) -> None:
-    opening = done.joints[:, 0]
-    assert opening[3800:4300] == pytest.approx(0.2, abs=1e-4)
-    assert (done.contacts[3900:4400] > 0).all()
-    assert opening[-1] == pytest.approx(-0.001, abs=1e-4)
-    assert (done.contacts[6600:6800] > 0).all()
-
-
-def hammer(done: Done) -> None:
-    depth = -done.joints[:, 0]
-    assert depth[-1] == pytest.approx(7.2e-3, abs=0.4e-3)
-    # seven blows, half a second or more apart, each takes it on by 0.5 mm or more
-    assert np.count_nonzero(np.diff(depth[200::800]) > 0.5e-3) == 7
-
-
-def open_wrench(done: Done) -> None:
-    nut, _, x, y, angle = done.joints.T
-    assert np.degrees(nut[-1]) == pytest.approx(60.0, abs=2.0)
-    assert (np.hypot(x, y)[3700:5200] > 0.02).all()
-    assert (np.hypot(x, y)[-1], angle[-1]) == pytest.approx((0.0, 0.0), abs=2e-4)
-
-
-def ratchet(done: Done) -> None:
-    gear, _, pawl = done.joints.T
-    assert np.count_nonzero((pawl[1:] < 0.06) & (pawl[:-1] >= 0.06)) == 6
-    assert np.degrees(gear[0] - gear[-1]) == pytest.approx(88.0, abs=2.0)
-
-
-def pliers(done: Done) -> None:
-    crushed = done.joints[:, 0]
-    assert crushed.max() == pytest.approx(0.34e-3, abs=0.03e-3)
-    assert crushed[-1] == pytest.approx(crushed.max(), abs=0.06e-3)
-    assert done.joints[-1, 1] == pytest.approx(0.0, abs=2e-3)
-
-
-def lock(done: Done) -> None:
-    plug, key = np.degrees(done.joints[:, 0]), done.joints[:, 4]
-    assert key[2800:5800] == pytest.approx(0.016, abs=1e-4)
-    assert plug[4400:4700] == pytest.approx(90.0, abs=2.0)
-    assert abs(plug[-1]) < 0.5
-    assert key[-1] == pytest.approx(0.0, abs=0.5e-3)
-
-
-def screw(done: Done, turn: float) -> None:
-    assert np.degrees(done.joints[-1, 1]) == pytest.approx(turn, abs=2.0)
-    # the tool is seated again, and was out
-    height = done.joints[:, 6] - done.joints[:, 0]
-    assert height[-1] == pytest.approx(0.0, abs=0.1e-3)
-    assert height.max() > 4e-3
-
-
-TASKS: dict[str, Callable[[Done], None]] = {
-    "point_mass": point_mass,
-    "virtual_wall": virtual_wall,
-    "planar_peg": planar_peg,
-    "peg_in_hole": peg_in_hole,
-    "round_peg": peg_in_hole,
-    "drawer": drawer,
-    "hammer": hammer,
-    "open_wrench": open_wrench,
-    "ratchet": ratchet,
-    "pliers": pliers,
-    "lock": lock,
-    "screwdriver": functools.partial(screw, turn=180.0),
-    "hex_key": functools.partial(screw, turn=120.0),
-}
-
-
-@pytest.mark.parametrize("name", scene_names())
-def test_default_run_does_the_task(name: str) -> None:
-    TASKS[name](default_run(name))
+@pytest.mark.parametrize(("name", "ticks", "joint", "expected", "tolerance"), SHOWN)
+def test_default_run_does_the_task(
+    name: str, ticks: slice, joint: int, expected: float, tolerance: float
+) -> None:
+    assert default_run(name).joints[ticks, joint] == pytest.approx(expected, abs=tolerance)
 
 
 # --- which hand it is -----------------------------------------------------------------------------
@@ -314,24 +237,24 @@ def hand_of(scene: hb.Scene, spec: str = "simulated") -> object:
     return device.hand
 
 
-def test_a_scene_that_asks_for_none_gets_the_default_hand(tmp_path: Path) -> None:
-    assert hand_of(scene_with_hand(tmp_path, None)) == DEFAULT_HAND
+ROTATION = {"rotational_stiffness": 3.0, "rotational_damping": 0.05}
+FIRM = Hand(stiffness=700.0, damping=12.0, **ROTATION)
 
 
-def test_two_numbers_are_of_translation_and_four_of_both(tmp_path: Path) -> None:
-    hand = hand_of(scene_with_hand(tmp_path, "700 12"))
-    assert hand == type(DEFAULT_HAND)(stiffness=700.0, damping=12.0)
-    hand = hand_of(scene_with_hand(tmp_path, "700 12 3 0.05"))
-    assert hand == type(DEFAULT_HAND)(
-        stiffness=700.0, damping=12.0, rotational_stiffness=3.0, rotational_damping=0.05
-    )
-
-
-def test_options_go_before_what_the_scene_asks_for(tmp_path: Path) -> None:
-    scene = scene_with_hand(tmp_path, "700 12")
-    changed = hand_of(scene, "simulated:hand_stiffness=50,friction=0.1")
-    assert changed == type(DEFAULT_HAND)(stiffness=50.0, damping=12.0)
-    assert hand_of(scene, "simulated:hand=none") is None
+@pytest.mark.parametrize(
+    ("numbers", "spec", "expected"),
+    [
+        (None, "simulated", DEFAULT_HAND),
+        ("700 12", "simulated", Hand(stiffness=700.0, damping=12.0)),
+        ("700 12 3 0.05", "simulated", FIRM),
+        ("700 12", "simulated:hand_stiffness=50,friction=0.1", Hand(stiffness=50.0, damping=12.0)),
+        ("700 12", "simulated:hand=none", None),
+    ],
+)
+def test_the_hand_is_the_options_then_the_scenes_then_the_default(
+    numbers: str | None, spec: str, expected: Hand | None, tmp_path: Path
+) -> None:
+    assert hand_of(scene_with_hand(tmp_path, numbers), spec) == expected
 
 
 @pytest.mark.parametrize(
@@ -355,7 +278,7 @@ def test_numbers_that_are_no_hand_are_refused(numbers: str, says: str, tmp_path:
 
 
 def own_hand(name: str) -> Hand:
-    return scene_hand(plain_model(read_scene(name)), scene_path(name))
+    return scene_hand(scenes.plain_model(scenes.read_scene(name)), scene_path(name))
 
 
 @pytest.mark.parametrize("name", [n for n in scene_names() if own_hand(n) != DEFAULT_HAND])

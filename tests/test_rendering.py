@@ -28,26 +28,20 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import (
-    default_coupling,
-    device_conditions,
-    required_damping,
-    run_conditions,
-)
+from hapticbridge.certificate import default_coupling, required_damping, run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.codes import OK
-from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import IMPLICIT, check_prepared, default_method, method_named, prepare
+from hapticbridge.rendering import IMPLICIT, check_prepared, method_named, prepare
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.rigid_body import exact_mass_response
 from hapticbridge.theory.sampled_loop import WorstHand
@@ -149,37 +143,6 @@ def test_a_scene_that_a_method_cannot_render_is_refused(
     prepare(loaded, COUPLING, T, 1)
 
 
-PARAMETERS: dict[str, Any] = {
-    "grip": "grip",
-    "period": T,
-    "substeps": 1,
-    "coupling": COUPLING,
-    "force_limit": 1.0,
-    "torque_limit": 1.0,
-    "ramp_ticks": 0,
-    "device_origin": (0, 0, 0, 1, 0, 0, 0),
-    "handle_origin": (0, 0, 0, 1, 0, 0, 0),
-    "device_start": (0, 0, 0, 1, 0, 0, 0),
-}
-MASSLESS = METHODS["direct"].scheme
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"scheme": 7}, "scheme is 7"),
-        ({"scheme": MASSLESS}, r"contact stiffness is 0\.0"),
-        ({"contact_stiffness": 5.0}, r"contact stiffness is 5\.0"),
-        ({"scheme": MASSLESS, "contact_stiffness": 5.0, "substeps": 2}, "substeps is 2"),
-    ],
-)
-def test_parameters_that_contradict_each_other_are_refused(
-    changes: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(HapticBridgeError, match=message):
-        RunParameters(**(PARAMETERS | changes))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -276,8 +239,6 @@ def test_contact_force_of_a_massless_tool_is_its_stiffness_times_penetration() -
     [
         ("direct", 0.98, "passive"),
         ("direct", 1.2, "active"),
-        ("implicit", 0.98, "passive"),
-        ("implicit", 1.2, "passive"),
         ("implicit", 2.0, "passive"),
     ],
 )
@@ -462,8 +423,10 @@ def test_ports_of_a_separate_arm_close_to_its_dissipation(method: str) -> None:
     assert abs(binding.state["energy"]["external_work"][0]) > 1e-5
 
 
-@pytest.mark.parametrize("substeps", [2, 4, 8])
-def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) -> None:
+@pytest.mark.parametrize("substeps", [1, 2, 4, 8])
+def test_free_mass_follows_implicit_euler_and_the_mean_wrench_does_the_work_of_all(
+    substeps: int,
+) -> None:
     """So a free mass is strict: Σ E = −Σ ½ m (Δv)², step by step, whatever the substeps."""
     run = rendered("implicit", COUPLING, sway(500), substeps=substeps)
     assert run.ticks["environment_energy"].max() <= 0
@@ -484,29 +447,6 @@ def test_mean_over_substeps_does_the_work_of_the_single_wrenches(substeps: int) 
     assert sent == pytest.approx(work_on_handle, rel=1e-9)
 
 
-@pytest.mark.parametrize("substeps", [2, 4])
-def test_torque_over_substeps_is_the_mean_of_the_single_laws(substeps: int) -> None:
-    """About one axis: J ω̇ = K_r φ + B_r (turn of the handle per time − ω), step by step."""
-    count, inertia = 300, 0.4 * 0.05 * 0.01**2
-    stiff = Coupling(2000.0, 2.0, 2e-2, 1e-4)
-    angle = 0.2 * np.sin(2 * np.pi * 3 * T * np.arange(1, count + 1))
-    turning = Rotation.from_rotvec(angle[:, None] * [0, 0, 1])
-    run = rendered("implicit", stiff, samples_of(np.zeros((count, 3)), turning), substeps=substeps)
-    h, k_, b_ = T / substeps, stiff.rotational_stiffness, stiff.rotational_damping
-    step = np.diff(angle, prepend=0.0) / substeps
-    x = v = position = 0.0
-    for k in range(count):
-        mean = 0.0
-        for _ in range(substeps):
-            position += step[k]
-            v = (inertia * v / h + k_ * (position - x) + b_ * step[k] / h) / (
-                inertia / h + k_ * h + b_
-            )
-            x += h * v
-            mean += (k_ * (position - x) + b_ * (step[k] / h - v)) / substeps
-        assert run.ticks["wrench_on_tool"][k, 5] == pytest.approx(mean, abs=1e-8)
-
-
 def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_delay() -> None:
     assert required_damping(COUPLING, T) == pytest.approx(3.0, rel=1e-12)
     undamped = Coupling(2000.0, 0.0, 2.0, 0.0)
@@ -518,31 +458,6 @@ def test_needed_damping_with_one_law_is_that_of_the_theory_and_grows_with_the_de
         [2.6429, 2.4423, 2.3350], abs=1e-4
     )
     assert required_damping(damped, T, 4, "rotation") == pytest.approx(2.4423e-3, abs=1e-7)
-    with pytest.raises(CouplingError, match="substeps"):
-        required_damping(damped, T, 0)
-
-
-def test_needed_damping_bounds_random_motions_behind_substeps() -> None:
-    """The inequality that defines it holds for motions that return to rest, and fails below."""
-    coupling, n = Coupling(2000.0, 1.0, 0.0, 0.0), 4
-    needed = required_damping(coupling, T, n)
-    rng = np.random.default_rng(3)
-    k_, b_ = coupling.stiffness, coupling.damping * n / T
-    for _ in range(50):
-        ticks = 40
-        d = rng.normal(size=ticks) * 1e-3
-        d[[0, -1]] = 0.0
-        d[-2] -= d.sum()
-        h = np.cumsum(np.repeat(d / n, n))
-        e = rng.normal(size=ticks * n) * 1e-3 * rng.uniform(0, 2)
-        e[: 2 * n], e[-2 * n :] = 0.0, 0.0
-        x = h - e
-        step_e, step_x = np.diff(e, prepend=0.0), np.diff(x, prepend=0.0)
-        f = k_ * e + b_ * step_e
-        mean = f.reshape(ticks, n).mean(axis=1)
-        sides = np.sum(mean[:-1] * d[1:]) - np.sum(f * step_x)
-        sides -= 0.25 * (k_ + b_) * np.sum(step_x**2)
-        assert sides + needed / T * np.sum(d**2) > -1e-12
 
 
 @pytest.mark.parametrize(
@@ -796,14 +711,11 @@ def test_error_of_a_free_mass_falls_with_the_number_of_substeps(laws: int, perce
 
 
 def test_strict_environments_need_less_than_the_form_grants() -> None:
-    masses = (RIGID, 1.0, 0.2, 0.05, 0.02, 0.01)
-    for laws, wall, most in ((1, 1.70, 1.70), (2, 1.30, 1.30), (4, 1.60, 1.65), (8, 1.75, 2.03)):
-        found = [worst(laws, mass)[0] for mass in masses]
-        assert found[0] == pytest.approx(wall, abs=6e-3)
-        assert max(found) == pytest.approx(most, abs=6e-3)
-        assert max(found) <= required_damping(LIGHT, T, laws) * (1 + 1e-9)
     needed = [required_damping(LIGHT, T, n) for n in (1, 2, 4, 8)]
     assert needed == pytest.approx([1.70, 1.63, 1.90, 2.42], abs=6e-3)  # what is printed
+    for laws, granted in zip((1, 2, 4, 8), needed, strict=True):
+        found = max(worst(laws, mass)[0] for mass in (RIGID, 1.0, 0.2, 0.05, 0.02, 0.01))
+        assert 0.75 * granted < found <= granted * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("laws", "mass"), [(4, 0.05), (8, 0.05)])
@@ -832,17 +744,3 @@ def test_worst_hand_behind_substeps_diverges_below_the_limit_and_not_above(
     assert (below.is_stable, above.is_stable) == (False, True)
     assert below.environment == above.environment == "strict"
     assert run(required_damping(LIGHT, T, laws)).is_stable
-
-
-@pytest.mark.parametrize("laws", [1, 2, 8, 32])
-@pytest.mark.parametrize("period", [1e-4, 5e-3])
-def test_default_coupling_is_certified_with_any_number_of_substeps(
-    laws: int, period: float
-) -> None:
-    info = SimulatedDevice().info
-    for scales in ((1.0, 1.0), (3.0, 0.5)):
-        coupling = default_coupling(info, period, *scales, laws)
-        used = default_method(laws).law_coupling(coupling, period / laws)
-        conditions = device_conditions(info, used, period, *scales, laws)
-        assert all(c.needed <= 0.85 * (c.available or 0.0) * (1 + 1e-6) for c in conditions)
-        assert laws == 2 or conditions[0].needed == pytest.approx(0.85 * 2.0)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from outside_scenes import FREE_TOOL, mjcf, scene_file
-from scene_cases import HINGE_TOOL, refusal, refusal_of
+from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
@@ -82,16 +81,15 @@ def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Pa
     assert "no site ''" in refusal(path, "")
 
 
+WELD = "<weld name='handle_weld' body1='arm'/>"
+
+
 @pytest.mark.parametrize(
     ("world", "actuator", "culprit"),
     [
         ("<body name='handle'/>", "", "body 'handle'"),
         ("<site name='handle'/>", "", "site 'handle'"),
-        (
-            "",
-            "<equality><weld name='handle_weld' body1='arm'/></equality>",
-            "equality constraint 'handle_weld'",
-        ),
+        ("", f"<equality>{WELD}</equality>", "equality constraint 'handle_weld'"),
         *[
             ("", f"<actuator><motor name='{name}' joint='elbow'/></actuator>", f"actuator '{name}'")
             for name in COUPLING_ACTUATORS
@@ -153,10 +151,8 @@ def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:
 
 
 def test_options_and_timestep_are_set_whatever_the_file_says(tmp_path: Path) -> None:
-    option = (
-        "<option integrator='Euler' solver='CG' timestep='0.01'><flag energy='disable' "
-        "diagexact='disable' autoreset='enable' fwdinv='enable' midphase='disable'/></option>"
-    )
+    option = """<option integrator='Euler' solver='CG' timestep='0.01'><flag energy='disable'
+      diagexact='disable' autoreset='enable' fwdinv='enable' midphase='disable'/></option>"""
     scene = load_scene(scene_file(tmp_path, mjcf(option)))
     opt = scene.model.opt
     enable, disable = mujoco.mjtEnableBit, mujoco.mjtDisableBit
@@ -276,10 +272,8 @@ def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:
 def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not(tmp_path: Path) -> None:
     sunk = "<body pos='1 0 .005'><freejoint/><geom size='.01'/></body>"
     load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)))
-    cloth = (
-        "<flexcomp name='cloth' type='grid' count='4 4 1' spacing='.05 .05 .05' mass='1' "
-        "radius='.001'><edge equality='true'/></flexcomp>"
-    )
+    cloth = """<flexcomp name='cloth' type='grid' count='4 4 1' spacing='.05 .05 .05' mass='1'
+      radius='.001'><edge equality='true'/></flexcomp>"""
     message = refusal_of(tmp_path, mjcf(world=cloth))
     assert "geom 'ball' and flex 'cloth'" in message
 
@@ -289,11 +283,8 @@ def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not(tmp_pat
 )
 def test_start_that_mujoco_would_not_step_is_refused(tmp_path: Path, key: str) -> None:
     world = "<body pos='1 0 0'><joint name='j' type='slide'/><geom size='.01'/></body>"
-    text = mjcf(
-        "<actuator><motor joint='j'/></actuator>",
-        f"<keyframe><key name='home' {key}/></keyframe>",
-        world=world,
-    )
+    keys = f"<keyframe><key name='home' {key}/></keyframe>"
+    text = mjcf("<actuator><motor joint='j'/></actuator>", keys, world=world)
     assert f"in {key.split('=', maxsplit=1)[0]}" in refusal_of(tmp_path, text)
 
 

@@ -16,15 +16,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.rendering import prepare
-from hapticbridge.scene import load_scene, scene_names
-from hapticbridge.scene.contacts import (
-    SUGGESTED,
-    check_contacts,
-    contact_concerns,
-    contact_numbers,
-    contact_settings,
-    suggested_solref,
-)
+from hapticbridge.scene import contacts, load_scene, scene_names
+from hapticbridge.scene.contacts import check_contacts, contact_concerns, contact_numbers
 
 H = 1e-3
 SOLIMP = (0.9, 0.95, 0.001)
@@ -67,16 +60,12 @@ def test_shipped_setting_relaxes_within_3_8_steps_and_is_within_the_slack() -> N
 
 
 @given(st.floats(1e-5, 0.1), st.floats(0.05, 100), st.floats(1e-4, 1e-2), st.floats(0.01, 0.999))
-def test_both_formats_agree(
-    timeconst: float, ratio: float, timestep: float, impedance: float
-) -> None:
-    direct = (-1 / (timeconst * ratio) ** 2, -2 / timeconst)
-    one = contact_numbers((timeconst, ratio), (impedance,), timestep)
+def test_both_formats_agree(time: float, ratio: float, timestep: float, impedance: float) -> None:
+    direct = (-1 / (time * ratio) ** 2, -2 / time)
+    one = contact_numbers((time, ratio), (impedance,), timestep)
     other = contact_numbers(direct, (impedance,), timestep)
-
-    assert other.relaxation == pytest.approx(one.relaxation, rel=1e-9)
-    assert other.resolved == pytest.approx(one.resolved, rel=1e-9)
-    assert other.stiffness == pytest.approx(one.stiffness, rel=1e-9)
+    for name in ("relaxation", "resolved", "stiffness"):
+        assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-9)
 
 
 @given(st.floats(1e-4, 0.1), st.floats(0.05, 100), st.floats(1, 10), st.floats(1, 10))
@@ -88,10 +77,10 @@ def test_softer_is_never_worse(timeconst: float, ratio: float, longer: float, mo
 
 @given(st.floats(1e-5, 1e-1))
 def test_suggestion_is_strict_and_silent_at_every_time_step(timestep: float) -> None:
-    first, second = SUGGESTED[0] * timestep, SUGGESTED[1]
+    first, second = contacts.SUGGESTED[0] * timestep, contacts.SUGGESTED[1]
     assert contact_numbers((first, second), SOLIMP, timestep).grade == "strict"
     assert contact_concerns((first, second), SOLIMP, timestep, diagexact=False) == []
-    words = suggested_solref(timestep).split('"')[1].split()
+    words = contacts.suggested_solref(timestep).split('"')[1].split()
     assert [float(word) for word in words] == pytest.approx([first, second], rel=1e-5)
 
 
@@ -108,9 +97,7 @@ NOT_MET = f'<geom name="lamp" size="0.01" pos="3 3 3" contype="4" conaffinity="4
         ((0.02, 1.0), SOLIMP, ("is soft: a steady force sinks in 100 times as deep",)),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_told_with_what_to_write(
-    solref: tuple[float, float], solimp: tuple[float, ...], words: tuple[str, ...]
-) -> None:
+def test_what_to_write_is_told(solref: Any, solimp: Any, words: tuple[str, ...]) -> None:
     (said, *_) = contact_concerns(solref, solimp, H)
     assert all(word in said for word in words)
     assert (contact_numbers(solref, solimp, H).grade == "active") == (len(words) > 1)
@@ -158,49 +145,43 @@ def concerns_of(path: Path, *, is_thorough: bool = False) -> list[str]:
     return check_contacts(loaded.model, loaded.grip, is_thorough=is_thorough)
 
 
-def test_an_active_contact_is_named_by_its_geom_and_setting(tmp_path: Path) -> None:
-    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=HARD))
-    assert "geom 'tip' with geom 'floor'" in said
-    assert 'solref "-1e+06 -500"' in said
-    assert 'write solref="0.0005 8"' in said
+PAIR = f'<contact><pair geom1="tip" geom2="floor" {HARD}/></contact>'
+OVERRIDE = '<option o_solref="-1000000 -500"><flag override="enable"/></option>'
+SLIPPERY, ROUGH = GOOD + ' friction="0.05"', GOOD + ' friction="0.8"'
+PLAIN = "geom 'tip' with geom 'floor'"
 
 
-def test_a_pair_is_named_by_both_geoms(tmp_path: Path) -> None:
-    pair = f'<contact><pair geom1="tip" geom2="floor" {HARD}/></contact>'
-    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=GOOD, more=pair))
-    assert "geom 'floor' with geom 'tip'" in said
+@pytest.mark.parametrize(
+    ("floor", "tip", "more", "cone", "words"),
+    [
+        (GOOD, HARD, "", "elliptic", (PLAIN, 'solref "-1e+06 -500"', 'write solref="0.0005 8"')),
+        (GOOD, GOOD, PAIR, "elliptic", ("geom 'floor' with geom 'tip'",)),
+        (GOOD, GOOD, OVERRIDE, "elliptic", ('solref "-1e+06 -500"',)),
+        (SLIPPERY, SLIPPERY, "", "pyramidal", (PLAIN, "friction of 0.05")),
+        (SLIPPERY + ' priority="1"', GOOD, "", "pyramidal", ("friction of 0.05",)),
+        (GOOD, SLIPPERY + ' priority="1"', "", "pyramidal", ("friction of 0.05",)),
+        (ROUGH, SLIPPERY, "", "pyramidal", None),
+        ("", "", "", "pyramidal", None),  # defaults that nobody chose
+    ],
+)
+def test_a_contact_at_fault_is_named_by_its_geoms_and_setting(
+    tmp_path: Path, floor: str, tip: str, more: str, cone: str, words: tuple[str, ...] | None
+) -> None:
+    told = concerns_of(scene(tmp_path, floor=floor, tip=tip, more=more, cone=cone))
+    assert len(told) == (words is not None)
+    assert all(word in told[0] for word in words or ())
 
 
-def test_defaults_that_nobody_chose_are_mentioned_only_when_asked(tmp_path: Path) -> None:
+def test_defaults_and_an_approximate_diagonal_are_mentioned_only_when_asked(tmp_path: Path) -> None:
     path = scene(tmp_path, floor="", tip="", cone="pyramidal")
-    assert concerns_of(path) == []
     said = " ".join(concerns_of(path, is_thorough=True))
-    assert "is soft" in said
-    assert "geom 'tip' with geom 'floor'" in said
-
-
-def test_approximate_diagonal_of_a_model_is_mentioned_when_asked(tmp_path: Path) -> None:
+    assert "is soft" in said and PLAIN in said
     loaded = load_scene(scene(tmp_path, floor=GOOD, tip=GOOD))
     assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []
     loaded.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_DIAGEXACT)
     assert check_contacts(loaded.model, loaded.grip) == []
     (said,) = check_contacts(loaded.model, loaded.grip, is_thorough=True)
     assert "approximate diagonal" in said
-
-
-def test_the_global_override_is_what_counts(tmp_path: Path) -> None:
-    more = '<option o_solref="-1000000 -500"><flag override="enable"/></option>'
-    (said,) = concerns_of(scene(tmp_path, floor=GOOD, tip=GOOD, more=more))
-    assert 'solref "-1e+06 -500"' in said
-
-
-def test_a_slippery_pyramid_is_named_unless_its_partner_is_rough(tmp_path: Path) -> None:
-    slippery = GOOD + ' friction="0.05"'
-    (said,) = concerns_of(scene(tmp_path, floor=slippery, tip=slippery, cone="pyramidal"))
-    assert "geom 'tip' with geom 'floor'" in said
-    assert "friction of 0.05" in said
-    rough = GOOD + ' friction="0.8"'
-    assert concerns_of(scene(tmp_path, floor=rough, tip=slippery, cone="pyramidal")) == []
 
 
 def prepared(path: Path, rate: float, substeps: int = 1, method: str = "implicit") -> list[str]:
@@ -254,9 +235,7 @@ def test_a_method_that_solves_contacts_in_its_own_way_is_not_judged(tmp_path: Pa
         ((0.002, 1.4), (0.5, 0.5, 0.001), "within slack", "active"),
     ],
 )
-def test_grades_beside_every_line(
-    solref: tuple[float, float], solimp: tuple[float, float, float], grade: str, light: str
-) -> None:
+def test_grades_beside_every_line(solref: Any, solimp: Any, grade: str, light: str) -> None:
     numbers = contact_numbers(solref, solimp, H)
     assert (numbers.grade, numbers.light_grade) == (grade, light)
 
@@ -313,13 +292,6 @@ def test_settings_unmet_untold(tmp_path: Path, floor: str, tip: str, more: str, 
     assert concerns_of(path) == []
 
 
-@pytest.mark.parametrize("smooth", ["floor", "tip"])
-def test_slippery_geom_of_priority_makes_rough_one_slippery(tmp_path: Path, smooth: str) -> None:
-    settings_of = {"floor": GOOD, "tip": GOOD, smooth: GOOD + ' priority="1" friction="0.05"'}
-    (said,) = concerns_of(scene(tmp_path, cone="pyramidal", **settings_of))
-    assert "friction of 0.05" in said
-
-
 def test_without_refsafe_a_setting_is_judged_as_written(tmp_path: Path) -> None:
     hard = 'solref="0.0001 2"'
     (said,) = concerns_of(scene(tmp_path, floor=hard, tip=hard))
@@ -371,15 +343,13 @@ def test_settings_are_mujocos(geoms: list[dict[str, object]], flag: str, more: s
     mujoco.mj_forward(model, data)
     tool = {model.geom("a").id, model.geom("b").id}
     expected = {
-        frozenset(contact.geom.tolist()): (
-            *contact.solref, *contact.solimp, contact.dim, contact.friction[0]
-        )
-        for contact in data.contact
-        if tool & set(contact.geom.tolist())
-    }  # fmt: skip
+        frozenset(c.geom.tolist()): (*c.solref, *c.solimp, c.dim, c.friction[0])
+        for c in data.contact
+        if tool & set(c.geom.tolist())
+    }
     found = {
         frozenset((first, second)): (*one.solref, *one.solimp, one.condim, one.friction)
-        for first, second, one in contact_settings(model, "grip")
+        for first, second, one in contacts.contact_settings(model, "grip")
     }
     assert found.keys() == expected.keys()
     for key, values in expected.items():

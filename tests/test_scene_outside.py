@@ -7,23 +7,11 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import outside_scenes as outside
 import pytest
 from cli_cases import Called
 from numpy.typing import NDArray
-from outside_scenes import (
-    BALL_JOINT_TOOL,
-    DRAWER,
-    DRAWER_FRICTION,
-    DRAWER_LENGTH,
-    PIN_DEPTH,
-    PIN_GAP,
-    PIN_PRELOAD,
-    PIN_STIFFNESS,
-    SHOULDER,
-    SPRING_PIN,
-    hand_file,
-    scene_file,
-)
+from outside_scenes import hand_file, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
@@ -55,9 +43,8 @@ def outcome(folder: Path, text: str, grip: str, stops: Stops) -> Outcome:
     path, hand = scene_file(folder, text), hand_file(folder, stops)
     scene = hb.load_scene(path, grip=grip)
     recording, qpos = folder / "run.mcap", []
-    with hb.Bridge(
-        scene, f"trajectory:{hand}", clock=hb.SimulatedClock(), recording=recording
-    ) as bridge:
+    clock, device = hb.SimulatedClock(), f"trajectory:{hand}"
+    with hb.Bridge(scene, device, clock=clock, recording=recording) as bridge:
         summary = bridge.run(on_tick=lambda _tick: qpos.append(scene.data.qpos.copy()))
     assert summary.ticks == round(sum(seconds for seconds, _ in stops) * 1000) + 1
     report = hb.audit(recording)
@@ -70,40 +57,24 @@ def outcome(folder: Path, text: str, grip: str, stops: Stops) -> Outcome:
 
 @pytest.fixture(scope="module")
 def pointer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    stops: Stops = [
-        (0.5, (-0.05, 0.03, 0.02)),
-        (0.5, (-0.05, 0.03, 0.02)),
-        (0.5, (-0.02, -0.05, 0.05)),
-        (0.5, (-0.02, -0.05, 0.05)),
-        (0.8, (0.0, 0.0, 0.0)),
-        (0.2, (0.0, 0.0, 0.0)),
-    ]
-    return outcome(tmp_path_factory.mktemp("pointer"), BALL_JOINT_TOOL, "tip", stops)
+    one, other, home = (-0.05, 0.03, 0.02), (-0.02, -0.05, 0.05), (0.0, 0.0, 0.0)
+    stops = [*[(0.5, one)] * 2, *[(0.5, other)] * 2, (0.8, home), (0.2, home)]
+    return outcome(tmp_path_factory.mktemp("pointer"), outside.BALL_JOINT_TOOL, "tip", stops)
 
 
 @pytest.fixture(scope="module")
 def pin(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    depth = -(PIN_GAP + 0.005)
-    stops: Stops = [
-        (0.8, (0.0, 0.0, depth)),
-        (0.6, (0.0, 0.0, depth)),
-        (0.8, (0.0, 0.0, 0.0)),
-        (0.8, (0.0, 0.0, -(PIN_GAP + PIN_DEPTH + 0.003))),
-        (0.4, (0.0, 0.0, -(PIN_GAP + PIN_DEPTH + 0.003))),
-    ]
-    return outcome(tmp_path_factory.mktemp("pin"), SPRING_PIN, "stylus", stops)
+    depth, beyond = -(outside.PIN_GAP + 0.005), -(outside.PIN_GAP + outside.PIN_DEPTH + 0.003)
+    heights = (0.8, depth), (0.6, depth), (0.8, 0.0), (0.8, beyond), (0.4, beyond)
+    stops = [(seconds, (0.0, 0.0, height)) for seconds, height in heights]
+    return outcome(tmp_path_factory.mktemp("pin"), outside.SPRING_PIN, "stylus", stops)
 
 
 @pytest.fixture(scope="module")
 def drawer(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    stops: Stops = [
-        (1.0, (0.1, 0.0, 0.0)),
-        (0.4, (0.1, 0.0, 0.0)),
-        (0.8, (0.125, 0.004, -0.002)),
-        (0.4, (0.125, 0.004, -0.002)),
-        (0.8, (-0.005, 0.0, 0.0)),
-    ]
-    return outcome(tmp_path_factory.mktemp("drawer"), DRAWER, "knob", stops)
+    half, wide, shut = (0.1, 0.0, 0.0), (0.125, 0.004, -0.002), (-0.005, 0.0, 0.0)
+    stops = [(1.0, half), (0.4, half), (0.8, wide), (0.4, wide), (0.8, shut)]
+    return outcome(tmp_path_factory.mktemp("drawer"), outside.DRAWER, "knob", stops)
 
 
 def test_tool_on_ball_joint_is_strict_and_its_moments_about_joint_balance(pointer: Outcome) -> None:
@@ -113,12 +84,10 @@ def test_tool_on_ball_joint_is_strict_and_its_moments_about_joint_balance(pointe
         row = pointer.ticks[tick]
         data.qpos[:] = pointer.qpos[tick]
         mujoco.mj_forward(pointer.model, data)
-        weight = sum(
-            np.cross(data.xipos[i] - SHOULDER, [0, 0, -9.81 * pointer.model.body_mass[i]])
-            for i in (1, 2)
-        )
+        weights = -9.81 * np.outer(pointer.model.body_mass[1:3], [0, 0, 1])
+        weight = np.cross(data.xipos[1:3] - outside.SHOULDER, weights).sum(axis=0)
         wrench = row["wrench_on_tool"]
-        hand = np.cross(row["tool_position"] - SHOULDER, wrench[:3]) + wrench[3:]
+        hand = np.cross(row["tool_position"] - outside.SHOULDER, wrench[:3]) + wrench[3:]
         # all but at rest after 0.4 s of damping; the moments themselves are 0.1 N m
         assert np.linalg.norm(weight) > 0.05
         assert hand + weight == pytest.approx(np.zeros(3), abs=5e-4)
@@ -133,7 +102,7 @@ def test_tip_on_a_ball_joint_follows_the_hand_as_far_as_its_links_reach(pointer:
     assert force.max() < K * 0.01
     # the links keep their lengths: the elbow stays 0.15 m from the shoulder
     elbow = ticks["tool_position"] - 0.08 * down(ticks)
-    assert np.linalg.norm(elbow - SHOULDER, axis=1) == pytest.approx(0.15, abs=1e-9)
+    assert np.linalg.norm(elbow - outside.SHOULDER, axis=1) == pytest.approx(0.15, abs=1e-9)
 
 
 def down(ticks: NDArray[np.void]) -> Array:
@@ -151,13 +120,14 @@ def test_pin_gives_way_by_what_its_spring_says_and_comes_back(pin: Outcome) -> N
     pressed = 1390
     force = -pin.ticks["wrench_on_tool"][pressed, 2]
     # spring at rest: preload + k · travel, and the coupling's own stretch of force / K
-    assert force == pytest.approx(PIN_PRELOAD - PIN_STIFFNESS * travel[pressed], rel=1e-4)
+    spring = outside.PIN_PRELOAD - outside.PIN_STIFFNESS * travel[pressed]
+    assert force == pytest.approx(spring, rel=1e-4)
     # beyond that, the contact of so light a pin gives way by 36 µm
     assert -travel[pressed] == pytest.approx(0.005 - force / K, abs=60e-6)
     assert travel[2100] == pytest.approx(0.0, abs=60e-6)
     assert pin.ticks["contacts"][2190] == 0
     # pushed beyond its stop it holds the hand: contact, spring and stop carry 3 mm · K
-    assert travel[-1] == pytest.approx(-PIN_DEPTH, abs=0.2e-3)
+    assert travel[-1] == pytest.approx(-outside.PIN_DEPTH, abs=0.2e-3)
     last = pin.ticks[-1]
     assert -last["wrench_on_tool"][2] == pytest.approx(0.003 * K, rel=0.1)
 
@@ -166,10 +136,10 @@ def test_pin_run_stays_within_slack_and_meters_the_springs_energy(pin: Outcome) 
     assert pin.report.environment in {"strict", "within slack"}
     assert pin.ticks["contacts"].max() >= 1
     pressed = pin.ticks[1390]
-    rest = PIN_PRELOAD / PIN_STIFFNESS
+    rest = outside.PIN_PRELOAD / outside.PIN_STIFFNESS
 
     def stored(q: float) -> float:
-        return 0.5 * PIN_STIFFNESS * (rest - q) ** 2
+        return 0.5 * outside.PIN_STIFFNESS * (rest - q) ** 2
 
     assert pin.ticks["potential"][0] == pytest.approx(stored(pin.qpos[1, 0]), rel=1e-9)
     assert pressed["potential"] == pytest.approx(stored(pin.qpos[1391, 0]), rel=1e-9)
@@ -178,24 +148,23 @@ def test_pin_run_stays_within_slack_and_meters_the_springs_energy(pin: Outcome) 
 def test_drawer_opens_against_its_friction_and_ends_at_its_stops(drawer: Outcome) -> None:
     assert drawer.report.environment in {"strict", "within slack"}
     opening = drawer.qpos[:, 0]
-    assert opening[1390] == pytest.approx(0.1, abs=DRAWER_FRICTION / K + 1e-5)
+    assert opening[1390] == pytest.approx(0.1, abs=outside.DRAWER_FRICTION / K + 1e-5)
     force = drawer.ticks["wrench_on_tool"]
     # in mid-motion, without acceleration; frictionloss is soft by a few per cent
-    assert force[500, 0] == pytest.approx(DRAWER_FRICTION, rel=0.05)
-    assert opening[2590] == pytest.approx(DRAWER_LENGTH, abs=50e-6)
-    assert force[2590] == pytest.approx(
-        [0.005 * K, 0.004 * K, -0.002 * K, 0, 0, 0], rel=0.01, abs=1e-9
-    )
+    assert force[500, 0] == pytest.approx(outside.DRAWER_FRICTION, rel=0.05)
+    assert opening[2590] == pytest.approx(outside.DRAWER_LENGTH, abs=50e-6)
+    stretched = [0.005 * K, 0.004 * K, -0.002 * K, 0, 0, 0]
+    assert force[2590] == pytest.approx(stretched, rel=0.01, abs=1e-9)
     assert opening[-1] == pytest.approx(0.0, abs=3e-3)
-    assert opening.max() < DRAWER_LENGTH + 50e-6
+    assert opening.max() < outside.DRAWER_LENGTH + 50e-6
 
 
 def test_work_on_the_drawer_is_its_friction_times_its_way(drawer: Outcome) -> None:
     way = np.abs(np.diff(drawer.qpos[:, 0])).sum()
     assert way > 0.22
-    assert drawer.ticks["coupling_work"][-1] == pytest.approx(DRAWER_FRICTION * way, rel=0.03)
-    assert drawer.ticks["external_work"][-1] == 0
-    assert drawer.ticks["actuator_work"][-1] == 0
+    last = drawer.ticks[-1]
+    assert last["coupling_work"] == pytest.approx(outside.DRAWER_FRICTION * way, rel=0.03)
+    assert last["external_work"] == last["actuator_work"] == 0
 
 
 def test_handle_starts_in_the_frame_of_a_turned_grip(pointer: Outcome, drawer: Outcome) -> None:
@@ -212,7 +181,7 @@ def test_handle_starts_in_the_frame_of_a_turned_grip(pointer: Outcome, drawer: O
 
 def test_command_runs_scene(tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "Meine Szenen – größer"
-    scene_file(folder, DRAWER, "Schublade 1.xml")
+    scene_file(folder, outside.DRAWER, "Schublade 1.xml")
     hand_file(folder, [(0.3, (0.02, 0.0, 0.0))])
     monkeypatch.chdir(folder)
     how = ("--grip", "knob", "--device", "trajectory:hand.csv", "--fast", "--duration", "0.5")
@@ -220,4 +189,4 @@ def test_command_runs_scene(tmp_path: Path, call: Called, monkeypatch: pytest.Mo
     assert (code, "passive" in out) == (0, True), err
     report, recording = hb.audit("lauf 1.mcap"), hb.read_recording("lauf 1.mcap")
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    assert recording.attachments["scene/Schublade 1.xml"] == DRAWER.encode()
+    assert recording.attachments["scene/Schublade 1.xml"] == outside.DRAWER.encode()

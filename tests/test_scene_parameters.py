@@ -14,18 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import hapticbridge as hb
+from hapticbridge import scene as scenes
 from hapticbridge.cli import main
 from hapticbridge.run_description import compiled_model
-from hapticbridge.scene import (
-    Parameter,
-    load_scene,
-    scene_names,
-    scene_parameters,
-    scene_path,
-    settings_from,
-)
+from hapticbridge.scene import load_scene, scene_path
 
-PARAMETERS = [(name, p) for name in scene_names() for p in scene_parameters(scene_path(name))]
+PARAMETERS = [
+    (name, p) for name in scenes.scene_names() for p in scenes.scene_parameters(scene_path(name))
+]
 each_parameter = pytest.mark.parametrize(
     ("name", "parameter"), PARAMETERS, ids=[f"{name} {p.name}" for name, p in PARAMETERS]
 )
@@ -118,38 +114,35 @@ SLIDE = '{ kind = "joint", name = "slide", field = "stiffness", index = 0'
     [({}, 20.0), ({"gap": 0.1}, 90.0), ({"less": 0.01}, 40.0), ({"gap": 0.1, "less": 0.01}, 110.0)],
 )
 def test_numbers_add_up(tmp_path: Path, values: dict[str, float], stiffness: float) -> None:
-    path = scene_with(
-        tmp_path,
-        table(SLIDE + ", factor = 1000.0 }", default="0.03")
-        + table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03"),
-    )
+    more = table(SLIDE + ", factor = 1000.0 }", default="0.03")
+    less = table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03")
+    path = scene_with(tmp_path, more + less)
     scene = load_scene(path, "grip", **values)
     assert scene.model.joint("slide").stiffness[0] == pytest.approx(stiffness, rel=1e-12)
     assert scene.parameters == {"gap": 0.03, "less": 0.03} | values
 
 
+FIELDS = (
+    "geom_pos", "geom_size", "geom_friction", "body_pos", "body_mass", "body_inertia", "mesh_vert",
+    "dof_frictionloss", "jnt_stiffness",
+)  # fmt: skip
+
+
 @each_parameter
-def test_a_shipped_default_gives_the_scene_of_the_file(name: str, parameter: Parameter) -> None:
+def test_a_shipped_default_gives_the_scene_of_the_file(
+    name: str, parameter: scenes.Parameter
+) -> None:
     plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
     assert plain.parameters == asked.parameters
-    for field in (
-        "geom_pos",
-        "geom_size",
-        "geom_friction",
-        "body_pos",
-        "body_mass",
-        "body_inertia",
-        "mesh_vert",
-        "dof_frictionloss",
-        "jnt_stiffness",
-    ):
-        assert getattr(asked.model, field) == pytest.approx(
-            getattr(plain.model, field), rel=1e-9, abs=1e-12
-        )
+    for field in FIELDS:
+        expected = pytest.approx(getattr(plain.model, field), rel=1e-9, abs=1e-12)
+        assert getattr(asked.model, field) == expected
 
 
 @each_parameter
-def test_both_ends_of_a_shipped_range_load_and_differ(name: str, parameter: Parameter) -> None:
+def test_both_ends_of_a_shipped_range_load_and_differ(
+    name: str, parameter: scenes.Parameter
+) -> None:
     low = load_scene(name, "grip", **{parameter.name: parameter.minimum})
     high = load_scene(name, "grip", **{parameter.name: parameter.maximum})
     assert low.parameters[parameter.name] == parameter.minimum
@@ -215,10 +208,7 @@ def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
     assert "no parameter 'clearence'" in message
     assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
     path = scene_with(tmp_path, "")
-    assert refusal(path, mass=1.0) == (
-        "scene 'bench' has no parameters, so 'mass' cannot be set; define parameters in "
-        "'bench.toml' beside it"
-    )
+    assert refusal(path, mass=1.0).startswith("scene 'bench' has no parameters, so 'mass' cannot")
 
 
 @pytest.mark.parametrize(
@@ -264,12 +254,12 @@ def test_a_toml_file_of_somebody_else_is_passed_over(tmp_path: Path) -> None:
 
 
 def test_words_become_values_and_a_name_comes_once() -> None:
-    assert settings_from(["a=1e-4", "b=-2"]) == {"a": 1e-4, "b": -2.0}
+    assert scenes.settings_from(["a=1e-4", "b=-2"]) == {"a": 1e-4, "b": -2.0}
     with pytest.raises(hb.SceneError, match="twice"):
-        settings_from(["a=1", "a=1"])
+        scenes.settings_from(["a=1", "a=1"])
     for word in ("", "gap", "gap=", "=1", "gap=wide", "grip=1", "gap=1=2"):
         with pytest.raises(hb.SceneError, match="a parameter of the scene and a number"):
-            settings_from([word])
+            scenes.settings_from([word])
 
 
 def test_values_are_recorded_and_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

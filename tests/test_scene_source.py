@@ -10,8 +10,7 @@ import pytest
 from audit_cases import recorded
 from hypothesis import given
 from hypothesis import strategies as st
-from outside_scenes import mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
-from scene_cases import RICH
+from outside_scenes import RICH, mjcf, obj_bytes, png_bytes, scene_file, stl_bytes
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import SceneError
@@ -27,6 +26,8 @@ MESH = '<asset><mesh name="m" file="{}"/></asset>'
 
 
 PART = "<mujocoinclude>{}</mujocoinclude>"
+STRIP = "<compiler meshdir='m' strippath='true'/>"
+LOW = "<option gravity='0 0 -3'/>"
 
 
 Layout = dict[str, str | bytes]
@@ -51,10 +52,8 @@ LAYOUTS: dict[str, Layout] = {
     },
     "assetdir for mesh, texture and height field": {
         "main.xml": mjcf(
-            "<compiler assetdir='assets'/>",
-            MESH.format("a.obj"),
-            "<asset><texture name='t' type='2d' file='t.png'/>"
-            "<hfield name='h' file='h.png' size='1 1 .1 .1'/></asset>",
+            "<compiler assetdir='assets'/><asset><texture name='t' type='2d' file='t.png'/>"
+            "<hfield name='h' file='h.png' size='1 1 .1 .1'/></asset>" + MESH.format("a.obj"),
             body=MESHED,
             world="<geom type='hfield' hfield='h' pos='0 0 -2'/>",
         ),
@@ -71,18 +70,14 @@ LAYOUTS: dict[str, Layout] = {
         **{f"t/{name}.png": png_bytes(number) for number, name in enumerate("rldb")},
     },
     "strippath": {
-        "main.xml": mjcf(
-            "<compiler meshdir='m' strippath='true'/>",
-            MESH.format("/home/somebody/cad/a.stl"),
-            body=MESHED,
-        ),
+        "main.xml": mjcf(STRIP, MESH.format("/home/somebody/cad/a.stl"), body=MESHED),
         "m/a.stl": stl_bytes(),
     },
     "nested includes, relative to the main file or to their own": {
         "main.xml": mjcf("<include file='parts/one.xml'/>", body=MESHED),
         "parts/one.xml": PART.format("<include file='deep/two.xml'/>"),
         "parts/deep/two.xml": PART.format("<include file='common.xml'/>" + MESH.format("a.stl")),
-        "common.xml": PART.format("<option gravity='0 0 -3'/>"),
+        "common.xml": PART.format(LOW),
         "parts/deep/a.stl": stl_bytes(),
     },
     "compiler in one include, mesh in another": {
@@ -111,13 +106,13 @@ LAYOUTS: dict[str, Layout] = {
             MESH.format("../shared/a.stl"), "<include file='../common.xml'/>", body=MESHED
         ),
         "shared/a.stl": stl_bytes(),
-        "common.xml": PART.format("<option gravity='0 0 -3'/>"),
+        "common.xml": PART.format(LOW),
     },
     "comments and names that only MuJoCo's parser accepts": {
         "main.xml": "<!-- a -- b <include file='gone.xml'/> -->\n"
         + mjcf(MESH.format("R&D.stl"), "<include file='a&amp;b.xml'/>", body=MESHED),
         "R&D.stl": stl_bytes(),
-        "a&b.xml": PART.format("<option gravity='0 0 -3'/>"),
+        "a&b.xml": PART.format(LOW),
     },
     "spaces, other letters, byte-order mark and declaration": {
         "Zähne und Löcher/main.xml": b"\xef\xbb\xbf<?xml version='1.0'?><!-- first -->"
@@ -167,11 +162,6 @@ def test_sources_are_every_file_and_rebuild_the_same_model(tmp_path: Path, layou
     assert model == compiled_model(scene.model)
 
 
-def test_compiled_model_is_the_same_in_every_compilation(tmp_path: Path) -> None:
-    path = scene_file(tmp_path, RICH)
-    assert compiled_model(load_scene(path).model) == compiled_model(load_scene(path).model)
-
-
 def test_relative_path_works_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, content in LAYOUTS["assets above the scene's folder"].items():
         scene_file(tmp_path, content, name)
@@ -196,18 +186,13 @@ def test_elements_are_read_with_their_lines_and_values() -> None:
 def test_compiled_model_does_not_depend_on_the_folder_or_tell_it(tmp_path: Path) -> None:
     compiled = []
     for folder in (tmp_path / "a", tmp_path / "elsewhere" / "b"):
-        (folder / "meshes").mkdir(parents=True)
-        (folder / "meshes" / "t.obj").write_text(
-            "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-        )
-        (folder / "s.xml").write_text(
-            """<mujoco><compiler meshdir="meshes"/><asset><mesh name="t" file="t.obj"/></asset>
-            <worldbody><body><freejoint/><geom type="mesh" mesh="t" mass=".1"/><site name="grip"/>
-            </body></worldbody></mujoco>"""
-        )
-        compiled.append(compiled_model(load_scene(folder / "s.xml").model))
+        for name, content in LAYOUTS["obj and meshdir"].items():
+            scene_file(folder, content, name)
+        compiled.append(compiled_model(load_scene(folder / "main.xml").model))
     assert compiled[0] == compiled[1]
     assert str(tmp_path).encode() not in compiled[0]
+    path = scene_file(tmp_path, RICH)
+    assert compiled_model(load_scene(path).model) == compiled_model(load_scene(path).model)
 
 
 def built_spec() -> mujoco.MjSpec:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
@@ -26,7 +26,6 @@ from hapticbridge.theory.device_limits import quantization_limit
 from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of, search_grid
 from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid, Discretization
 from hapticbridge.theory.virtual_mass import (
-    FORCE_DELAY,
     Integrator,
     environment_minimum_damping,
     minimum_mass,
@@ -46,19 +45,6 @@ def test_largest_stiffness_at_1_khz_is_2000_per_unit_of_damping(damping: float) 
 def test_default_coupling_of_the_default_device() -> None:
     coupling = dataclasses.astuple(stiffest_coupling(2.0, 2e-3, T))
     assert coupling == pytest.approx((2400, 0.5, 2.4, 5e-4), rel=1e-15)
-
-
-@given(st.floats(1, 1e5), st.floats(0, 100), st.floats(1e-4, 1e-2))
-def test_bound_is_supremum_of_condition(stiffness: float, damping: float, period: float) -> None:
-    """b > (T/2)(1 − cos θ)/Re{(1 − e^{−jθ})/C}, C = K + (B/T)(1 − e^{−jθ}), over 0 < θ <= π."""
-    theta = np.linspace(1e-3, np.pi, 2000)
-    backward = 1 - np.exp(-1j * theta)
-    transfer = stiffness + damping / period * backward
-    needed = period / 2 * (1 - np.cos(theta)) / np.real(backward / transfer)
-    bound = minimum_damping(Coupling(stiffness, damping, 0, 0), period)
-    # the supremum is attained at Nyquist, the grid's last point; 1e-9 for cancellation at small θ
-    assert needed.max() == pytest.approx(bound, rel=1e-9)
-    assert needed[-1] == pytest.approx(bound, rel=1e-9)
 
 
 @given(positive, st.floats(0, 0.999), st.floats(1e-5, 1))
@@ -90,34 +76,11 @@ def test_axes_do_not_mix() -> None:
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")
 INTEGRATORS: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
 WALL = Coupling(1000, 1, 0, 0)
-FAR_APART = CouplingGrid([1e-30, 1000], [1e30, 1])
+EYE = np.eye(2)
+RAGGED: Any = [[1, 2], [3]]
 UNKNOWN = SimpleNamespace(damping=1.0, friction=None, resolution=0.0)
 THETA = np.union1d(np.linspace(1e-4, np.pi, 8001), np.geomspace(1e-5, 1, 2001))
 stiffnesses = st.floats(1, 1e5)
-dampings = st.floats(0, 50)
-
-
-def needed_behind(transfer: np.ndarray, theta: np.ndarray, period: float) -> np.ndarray:
-    """(2), written as it is printed."""
-    backward = 1 - np.exp(-1j * theta)
-    return np.asarray(period / 2 * (1 - np.cos(theta)) / np.real(backward / transfer))
-
-
-@given(stiffnesses, dampings, st.floats(1e-5, 1e-1), st.sampled_from(SCHEMES))
-@settings(max_examples=40)
-def test_low_passed_bounds_are_the_supremum_of_their_spectra(
-    stiffness: float, damping: float, tau: float, scheme: Discretization
-) -> None:
-    coupling = Coupling(stiffness, damping, 0, 0)
-    bound = minimum_damping(coupling, T, discretization=scheme, filter_time=tau)
-    z = np.exp(1j * THETA[THETA > 1e-2])
-    low = (1 - 1 / z) / T if scheme == "backward" else 2 / T * (z - 1) / (z + 1)
-    needed = needed_behind(stiffness + damping * low / (1 + tau * low), np.angle(z), T)
-    # (z − 1)/(z + 1) loses digits beside Nyquist: 1e-6; the closed spectrum does not: 1e-9
-    assert needed[:-1].max() == pytest.approx(bound, rel=2e-3)
-    assert needed[:-1].max() <= bound * (1 + 1e-6)
-    spectrum = damping_spectrum(coupling, T, THETA / T, discretization=scheme, filter_time=tau)
-    assert spectrum.max() == pytest.approx(bound, rel=1e-9)
 
 
 @given(stiffnesses, st.floats(1e-3, 50))
@@ -134,32 +97,13 @@ def test_tustins_damper_has_no_bound_but_a_closed_form(stiffness: float, damping
     assert minimum_damping(coupling, T, discretization="tustin", delay=2) == np.inf
 
 
-@given(stiffnesses, dampings, st.integers(1, 6))
-@settings(max_examples=40)
-def test_bound_at_a_wall_is_dirichlets(stiffness: float, damping: float, delay: int) -> None:
-    needed = stiffness * T / 2 * np.sin((2 * delay + 1) * THETA / 2) / np.sin(
-        THETA / 2
-    ) - damping * np.cos((delay + 1) * THETA)
-    bound = minimum_damping(Coupling(stiffness, damping, 0, 0), T, delay=delay)
-    assert isinstance(bound, float)
-    # the sweep misses a maximum by at most (curvature) · (half a grid step)²
-    assert needed.max() == pytest.approx(bound, rel=2e-5)
-    assert needed.max() <= bound * (1 + 1e-9)
-    if damping == 0:
-        assert bound == pytest.approx(stiffness * (T / 2 + delay * T), rel=1e-9)
-    else:
-        assert minimum_damping(Coupling(stiffness, 0, 0, 0), T, delay=delay) == pytest.approx(
-            stiffness * (T / 2 + delay * T), rel=1e-9
-        )
-
-
-def test_one_sample_of_delay_against_a_wall_has_a_closed_form() -> None:
-    # a(1 + 2x) − B(2x² − 1), x = cos θ, a = KT/2: maximum at x = a/(2B) for a < 2B
-    stiffness, damping = 1000.0, 2.0
-    a = stiffness * T / 2
-    closed = a + a**2 / (2 * damping) + damping
-    bound = minimum_damping(Coupling(stiffness, damping, 0, 0), T, delay=1)
-    assert bound == pytest.approx(closed, rel=1e-9)
+def test_delay_against_a_wall_has_closed_forms() -> None:
+    for delay in range(4):  # Colgate & Schenkel
+        bound = minimum_damping(Coupling(1000, 0, 0, 0), T, delay=delay)
+        assert bound == pytest.approx(1000 * (T / 2 + delay * T), rel=1e-9)
+    # a(1 + 2x) − B(2x² − 1), x = cos θ, a = KT/2 = 0.5: maximum at x = a/(2B) for a < 2B
+    bound = minimum_damping(Coupling(1000, 2, 0, 0), T, delay=1)
+    assert bound == pytest.approx(0.5 + 0.5**2 / 4 + 2, rel=1e-9)
 
 
 def test_no_damping_suffices_for_every_environment_behind_a_delayed_coupling() -> None:
@@ -196,44 +140,6 @@ def test_mass_behind_coupling_needs_printed_damping(mass: float, needed: tuple[f
     coupling = Coupling(1000, 2, 0, 0)
     found = [environment_minimum_damping(coupling, T, mass, scheme) for scheme in INTEGRATORS]
     assert found == pytest.approx(needed, abs=5e-5)
-
-
-@given(st.floats(1, 5), st.floats(-2, 2), st.floats(-3, 1), st.sampled_from(INTEGRATORS))
-@settings(max_examples=60)
-def test_mass_bound_is_sup(
-    log_k: float, log_b: float, log_m: float, integrator: Integrator
-) -> None:
-    k, b, mass = 10.0**log_k, 10.0**log_b, 10.0**log_m
-    bound = environment_minimum_damping(Coupling(k, b, 0, 0), T, mass, integrator)
-    delay = FORCE_DELAY[integrator]
-    denominator = [1.0, -2.0, 1.0]
-    # F = C (h − x), x = (T²/m) z^{−j} F / (1 − z⁻¹)²; characteristic polynomial in z⁻¹
-    loop = np.zeros(5)
-    loop[:3] = denominator
-    loop[delay] += (k + b / T) * T**2 / mass
-    loop[delay + 1] -= b / T * T**2 / mass
-    radius = np.abs(np.roots(loop)).max()
-    if abs(radius - 1) < 1e-9:
-        return
-    assert np.isinf(bound) == (radius > 1)
-    if np.isinf(bound):
-        return
-
-    def needed(theta: np.ndarray) -> np.ndarray:
-        z = np.exp(1j * theta)
-        transfer = k + b / T * (1 - 1 / z)
-        felt = transfer / (1 + transfer * T**2 / mass * z ** (2.0 - delay) / (z - 1) ** 2)
-        return np.asarray(T / 2 * np.real((1 - 1 / z) * felt) / (1 - np.cos(theta)))
-
-    resonance = min(2.0, np.sqrt(k / mass) * T)
-    near = resonance * np.linspace(0.5, 1.5, 4001)
-    theta = np.union1d(THETA, near[near < np.pi])
-    # a lightly damped resonance is narrower than any grid: zoom in on its top
-    for _ in range(5):
-        top = int(needed(theta).argmax())
-        low, high = theta[max(top - 1, 0)], theta[min(top + 1, theta.size - 1)]
-        theta = np.linspace(low, high, 1001)
-    assert needed(theta).max() == pytest.approx(bound, rel=1e-5)
 
 
 def test_smallest_mass_is_where_the_environment_turns_unstable() -> None:
@@ -293,50 +199,40 @@ def test_grid_agrees_with_single_couplings() -> None:
     assert damping_spectrum(grid, T, np.ones(7)).shape == (2, 3, 7)
 
 
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda v: minimum_damping(WALL, v), "period is"),
-        (lambda v: maximum_stiffness(1, v), "period is"),
-        (lambda v: maximum_stiffness(v, T), "device damping is"),
-        (lambda v: maximum_stiffness(1, T, damping=v), "coupling damping is"),
-        (lambda v: stiffest_coupling(v, 1, T), "device damping is"),
-        (lambda v: stiffest_coupling(1, v, T), "device damping is"),
-        (lambda v: minimum_damping(WALL, T, filter_time=v), "filter time is"),
-        (lambda v: damping_spectrum(WALL, T, [100.0, v]), "frequency is"),
-        (lambda v: environment_minimum_damping(WALL, T, [0.1, v]), "mass is"),
-        (lambda v: CouplingGrid([1.0, v]), "coupling stiffness is"),
-    ],
-)
-def test_out_of_range_is_refused(call: Callable[[Any], Any], words: str, value: float) -> None:
-    with pytest.raises(CouplingError, match=words):
-        call(value)
+OUT_OF_RANGE: list[tuple[Callable[[Any], Any], str]] = [
+    (lambda v: minimum_damping(WALL, v), "period is"),
+    (lambda v: maximum_stiffness(1, v), "period is"),
+    (lambda v: maximum_stiffness(v, T), "device damping is"),
+    (lambda v: maximum_stiffness(1, T, damping=v), "coupling damping is"),
+    (lambda v: stiffest_coupling(v, 1, T), "device damping is"),
+    (lambda v: stiffest_coupling(1, v, T), "device damping is"),
+    (lambda v: minimum_damping(WALL, T, filter_time=v), "filter time is"),
+    (lambda v: damping_spectrum(WALL, T, [100.0, v]), "frequency is"),
+    (lambda v: environment_minimum_damping(WALL, T, [0.1, v]), "mass is"),
+    (lambda v: CouplingGrid([1.0, v]), "coupling stiffness is"),
+]
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    *((partial(call, bad), words) for call, words in OUT_OF_RANGE for bad in (-1, np.nan, np.inf)),
+    (lambda: minimum_damping(WALL, 0.0), "period is"),
+    (lambda: maximum_stiffness(2, T / 2, damping=2), "no stiffness is passive"),
+    (lambda: minimum_damping(WALL, T, axis="x"), "choose one of 'rotation', 'translation'"),  # type: ignore[call-overload]
+    (lambda: CouplingGrid([1.0, 2.0], [1.0, 2.0, 3.0]), "do not broadcast"),
+    (lambda: minimum_damping(WALL, T, delay=0.5), "whole number of samples"),  # type: ignore[call-overload]
+    (lambda: minimum_damping(WALL, T, delay=True), "delay is True"),
+    (lambda: minimum_damping(WALL, T, delay=51), r"delay is 51; it must be .* >= 0 and <= 50"),
+    (lambda: z_width(2, T, delay=10**30), "delay is"),
+    (lambda: minimum_damping(WALL, T, discretization="euler"), "one of 'backward', 'tustin'"),  # type: ignore[call-overload]
+    (lambda: minimum_mass(WALL, T, "rk4"), "one of 'explicit', 'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
+    (lambda: damping_spectrum(WALL, T, 4 / T), "half the sampling rate"),
+    (lambda: quantization_limit(UNKNOWN, WALL, T), "friction is not known"),
+    (
+        lambda: environment_minimum_damping(CouplingGrid([1e-30, 1000], [1e30, 1]), 1e-30, 1e30),
+        "too far apart for double precision",
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: minimum_damping(WALL, 0.0), "period is"),
-        (lambda: maximum_stiffness(2, T / 2, damping=2), "no stiffness is passive"),
-        (lambda: minimum_damping(WALL, T, axis="x"), "choose one of 'rotation', 'translation'"),  # type: ignore[call-overload]
-        (lambda: CouplingGrid([1.0, 2.0], [1.0, 2.0, 3.0]), "do not broadcast"),
-        (lambda: minimum_damping(WALL, T, delay=0.5), "whole number of samples"),  # type: ignore[call-overload]
-        (lambda: minimum_damping(WALL, T, delay=True), "delay is True"),
-        (lambda: minimum_damping(WALL, T, delay=51), r"delay is 51; it must be .* >= 0 and <= 50"),
-        (lambda: z_width(2, T, delay=10**30), "delay is"),
-        (lambda: minimum_damping(WALL, T, discretization="euler"), "one of 'backward', 'tustin'"),  # type: ignore[call-overload]
-        (lambda: minimum_mass(WALL, T, "rk4"), "one of 'explicit', 'implicit', 'semi_implicit'"),  # type: ignore[arg-type]
-        (lambda: damping_spectrum(WALL, T, 4 / T), "half the sampling rate"),
-        (lambda: quantization_limit(UNKNOWN, WALL, T), "friction is not known"),
-        (
-            lambda: environment_minimum_damping(
-                CouplingGrid([1e-30, 1000], [1e30, 1]), 1e-30, 1e30
-            ),
-            "too far apart for double precision",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("call", "words"), REFUSED)
 def test_what_has_no_meaning_is_refused(call: Callable[[], Any], words: str) -> None:
     with pytest.raises(CouplingError, match=words):
         call()
@@ -374,44 +270,48 @@ FINE = np.union1d(np.linspace(1e-4, np.pi, 20_001), np.geomspace(1e-6, 1e-1, 400
 
 
 @given(
-    st.floats(0, 5), st.floats(-2, 2), st.sampled_from(SCHEMES), st.integers(0, 6), st.floats(-3, 2)
+    st.floats(1, 1e5),
+    st.floats(0, 50),
+    st.sampled_from(SCHEMES),
+    st.integers(0, 6),
+    st.one_of(st.just(0.0), st.floats(-3, 2).map(lambda log: 10**log)),
 )
-@settings(max_examples=60)
+@settings(max_examples=100)
+@example(1000, 0.5606992373916568, "backward", 2, 1e-3)  # a maximum near the first cell
 def test_bound_and_worst_frequency_are_those_of_a_dense_sweep(
-    log_k: float, log_b: float, scheme: Discretization, delay: int, log_lag: float
+    stiffness: float, damping: float, scheme: Discretization, delay: int, lag: float
 ) -> None:
-    coupling = Coupling(10**log_k, 10**log_b, 0, 0)
-    how: Any = {"discretization": scheme, "delay": delay, "filter_time": T * 10**log_lag}
+    assume(scheme == "backward" or damping == 0 or lag > 0)  # Tustin's damper alone has no bound
+    coupling = Coupling(stiffness, damping, 0, 0)
+    how: Any = {"discretization": scheme, "delay": delay, "filter_time": lag * T}
     bound = minimum_damping(coupling, T, **how)
     swept = damping_spectrum(coupling, T, FINE / T, **how)
-    scale = 10**log_k * T * (delay + 1) + 10**log_b
+    scale = stiffness * T * (delay + 1) + damping
     # between its points the sweep misses a maximum by (7 · half a step)²/2, 2e-7 of the ripple
-    assert swept.max() == pytest.approx(bound, abs=1e-6 * scale)
-    assert swept.max() <= bound + 1e-9 * scale
+    assert swept.max() == pytest.approx(bound, rel=1e-6, abs=1e-6 * scale)
+    assert swept.max() <= bound * (1 + 1e-9) + 1e-9 * scale
     worst = worst_frequency(coupling, T, **how)
     there = damping_spectrum(coupling, T, worst or 1e-6 / T, **how)
-    assert float(there) == pytest.approx(bound, abs=1e-8 * scale)
+    assert float(there) == pytest.approx(bound, rel=1e-7, abs=1e-8 * scale)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize(("tau", "delay"), [(0.0, 1), (3e-4, 4), (1e-2, 1)])
-def test_late_spectrum_is_as_printed(scheme: Discretization, tau: float, delay: int) -> None:
+@pytest.mark.parametrize(("tau", "delay"), [(0, 0), (3e-4, 0), (0, 1), (3e-4, 4), (1e-2, 1)])
+def test_spectrum_is_the_condition_as_printed(
+    scheme: Discretization, tau: float, delay: int
+) -> None:
     theta = np.linspace(1e-2, 3.1, 300)
     z = np.exp(1j * theta)
     rate = (1 - 1 / z) / T if scheme == "backward" else 2 / T * (z - 1) / (z + 1)
     late = (1500 + 0.7 * rate / (1 + tau * rate)) * z**-delay
-    needed = T / 2 * np.real((1 - 1 / z) * late) / (1 - np.cos(theta))
+    if delay:  # against a wall
+        needed = T / 2 * np.real((1 - 1 / z) * late) / (1 - np.cos(theta))
+    else:  # (2), any environment
+        needed = T / 2 * (1 - np.cos(theta)) / np.real((1 - 1 / z) / late)
     law = Coupling(1500, 0.7, 0, 0)
     options: Any = {"discretization": scheme, "delay": delay, "filter_time": tau}
     found = damping_spectrum(law, T, theta / T, **options)
     np.testing.assert_allclose(found, needed, rtol=1e-8, atol=1e-8)
-
-
-def test_a_weak_low_pass_hides_no_maximum_near_the_first_cell() -> None:
-    grid = CouplingGrid(1000, 0.5606992373916568)
-    bound = minimum_damping(grid, T, delay=2, filter_time=1e-6)
-    swept = damping_spectrum(grid, T, FINE / T, delay=2, filter_time=1e-6)
-    assert bound == pytest.approx(swept.max(), rel=1e-8)
 
 
 @given(st.integers(1, MAX_DELAY), st.floats(1e-3, 1e6))
@@ -445,9 +345,3 @@ def test_tustins_damper_is_worst_at_nyquist_unless_there_is_none_or_a_low_pass()
         for scheme in SCHEMES
     )
     assert backward != pytest.approx(tustin, rel=1e-3)
-
-
-def test_thirty_samples_of_delay_are_computed_in_two_seconds() -> None:
-    began = time.process_time()
-    z_width(2, T, mass=0.1, delay=30)
-    assert time.process_time() - began < 2

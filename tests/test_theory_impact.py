@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from hapticbridge.theory.impact import ImpactBody, Law, Mode, resolve_impact
 Array = NDArray[np.float64]
 LAWS: tuple[Law, ...] = ("newton", "poisson", "stronge")
 ROD = ImpactBody(1, 1 / 12, np.array([-0.5, -0.5]) / np.sqrt(2))
-TWO = ImpactBody([1, 2], 1, [0, 0])
+TWO, THREE = ImpactBody([1, 2], 1, [0, 0]), ImpactBody([1] * 3, 1, [0, 0])
 
 
 class Cases(NamedTuple):
@@ -57,21 +56,6 @@ def test_rod_at_45_degrees(
     impact = resolve_impact(ROD, [0.8, -1.0], 0.75, 0.9, law)
     assert impact.impulse == pytest.approx(np.array([tangential, normal]), abs=tolerance)
     assert float(impact.energy_change) == pytest.approx(energy, abs=tolerance)
-
-
-def test_rod_by_hand() -> None:
-    """A = D = 2.5, G = 1.5: slides until P_s = 0.8/(0.75·2.5 + 1.5), then sticks."""
-    start, first, second = -1.0, 2.5 + 0.75 * 1.5, 2.5 - 1.5**2 / 2.5
-    corner = 0.8 / (0.75 * 2.5 + 1.5)
-    at_corner = start + first * corner
-    compression = corner - at_corner / second
-    taken = 0.5 * (start + at_corner) * corner + 0.5 * at_corner * (compression - corner)
-    normal = compression + 0.9 * np.sqrt(-2 * taken / second)
-    tangential = -0.75 * corner + 0.6 * (normal - corner)
-    impact = resolve_impact(ROD, [0.8, -1.0], 0.75, 0.9, "stronge")
-    assert impact.impulse == pytest.approx(np.array([tangential, normal]), abs=1e-12)
-    assert float(impact.compression) == pytest.approx(0.325, abs=1e-12)
-    assert impact.mode == Mode.STICKS_IN_COMPRESSION
 
 
 def marched(cases: Cases, law: Law, steps: int = 10_000) -> Array:
@@ -121,9 +105,7 @@ def test_impulse_is_that_of_coulombs_law_followed_in_small_steps(law: Law, two: 
 @pytest.mark.parametrize("two", [False, True])
 def test_of_200_000_impacts_only_newton_ever_gains_energy(law: Law, two: bool) -> None:
     cases = random_cases(200_000, 4, two=two)
-    began = time.perf_counter()
     impact = resolve_impact(cases.body, *cases[2:], law, cases.other)
-    assert time.perf_counter() - began < 2
     scale = np.sum(np.abs(impact.impulse * (np.abs(cases.velocity) + np.abs(impact.velocity))), -1)
     gained = float((impact.energy_change > 1e-12 * scale).mean())
     assert 1e-4 < gained < 0.1 if law == "newton" else gained == 0
@@ -171,19 +153,6 @@ def test_energy_change_is_that_of_the_bodies_own_motion(two: bool) -> None:
         motions = kept
 
 
-def test_each_mode_leaves_the_contact_as_its_name_says() -> None:
-    cases = random_cases(50_000, 7, two=False)
-    impact = resolve_impact(cases.body, *cases[2:], "stronge")
-    v_t, before = impact.velocity[:, 0], cases.velocity[:, 0]
-    moving = before != 0
-    sticks = np.isin(impact.mode, (Mode.STICKS_IN_COMPRESSION, Mode.STICKS_IN_RESTITUTION))
-    back = np.isin(impact.mode, (Mode.REVERSES_IN_COMPRESSION, Mode.REVERSES_IN_RESTITUTION))
-    slides = impact.mode == Mode.SLIDING
-    assert np.abs(v_t[sticks]).max() < 1e-9
-    assert np.all(v_t[back] * before[back] <= 0)
-    assert np.all(v_t[slides & moving] * before[slides & moving] >= -1e-9)
-
-
 def test_laws_agree_without_friction_and_for_central_impact() -> None:
     body = ImpactBody(2, 0.1, [0.3, -0.4])
     for arm, friction in (([0.3, -0.4], 0.0), ([0.0, -0.4], 0.7)):
@@ -218,42 +187,34 @@ def test_a_jam_goes_on_until_the_slip_is_over() -> None:
     assert impact.energy_change < 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        ({"restitution": 1.01}, r"restitution is 1.01 \(no unit\); it must be in \[0, 1\]"),
-        ({"restitution": -0.1}, r"in \[0, 1\]"),
-        ({"friction": -0.1}, r"friction is -0.1 \(no unit\); it must be finite and >= 0"),
-        ({"friction": np.inf}, "friction is inf .* finite"),
-        ({"velocity": [0.0, 0.5]}, "normal velocity is 0.5 m/s; it must be < 0"),
-        ({"velocity": [0.0, 0.0]}, "normal velocity is 0 m/s"),
-        ({"velocity": [np.nan, -1]}, "velocity is nan m/s; it must be finite"),
-        ({"velocity": [1, 2, -3]}, r"velocity has shape \(3,\)"),
-        ({"friction": [0.1, 0.2], "restitution": [0.1, 0.2, 0.3]}, "do not broadcast"),
-        ({"law": "hertz"}, "choose one of 'newton', 'poisson', 'stronge'"),
-    ],
-)
-def test_impossible_impacts_are_refused(arguments: dict[str, object], sentence: str) -> None:
-    valid = {"velocity": [0.8, -1.0], "friction": 0.5, "restitution": 0.5}
-    with pytest.raises(MechanicsError, match=sentence):
-        resolve_impact(ROD, **(valid | arguments))  # type: ignore[arg-type]
+def hit(velocity: Any = (0.8, -1.0), friction: Any = 0.5, *rest: Any, **named: Any) -> Any:
+    return resolve_impact(ROD, velocity, friction, *(rest or (0.5,)), **named)
 
 
 @pytest.mark.parametrize(
     ("call", "words"),
     [
+        (lambda: hit((1, -1), 0.5, 1.01), r"restitution is 1.01 \(no unit\); it must be in \[0, 1"),
+        (lambda: hit((1, -1), 0.5, -0.1), r"in \[0, 1\]"),
+        (lambda: hit(friction=-0.1), r"friction is -0.1 \(no unit\); it must be finite and >= 0"),
+        (lambda: hit(friction=np.inf), "friction is inf .* finite"),
+        (lambda: hit([0.0, 0.5]), "normal velocity is 0.5 m/s; it must be < 0"),
+        (lambda: hit([0.0, 0.0]), "normal velocity is 0 m/s"),
+        (lambda: hit([np.nan, -1]), "velocity is nan m/s; it must be finite"),
+        (lambda: hit([1, 2, -3]), r"velocity has shape \(3,\)"),
+        (lambda: hit((1, -1), [0.1, 0.2], [0.1, 0.2, 0.3]), "do not broadcast"),
+        (lambda: hit(law="hertz"), "choose one of 'newton', 'poisson', 'stronge'"),
         (lambda: ImpactBody(0, 1, [0, 0]), "mass is 0 kg; it must be finite and > 0"),
         (lambda: ImpactBody(1, -1, [0, 0]), "inertia is -1 kg m²"),
         (lambda: ImpactBody(1, 1, [0, np.inf]), "arm is inf m"),
         (lambda: ImpactBody(1, 1, [0, 0, 0]), r"arm has shape \(3,\)"),
         (lambda: ImpactBody([1, 2], [1, 2, 3], [0, 0]), "do not broadcast"),
-        (lambda: resolve_impact(TWO, [0, -1], 0, 0, other=ImpactBody([1] * 3, 1, [0, 0])),
-         "do not broadcast"),
+        (lambda: resolve_impact(TWO, [0, -1], 0, 0, other=THREE), "do not broadcast"),
         (lambda: TWO.velocity_change([1, 2, 3]), r"impulse has shape \(3,\)"),
         (lambda: TWO.velocity_change(1.0), r"impulse has shape \(\)"),
         (lambda: TWO.velocity_change(np.ones((3, 2))), "do not broadcast"),
     ],
-)  # fmt: skip
-def test_impossible_bodies_are_refused_in_a_sentence(call: Callable[[], Any], words: str) -> None:
+)
+def test_impossible_impacts_and_bodies_are_refused(call: Callable[[], Any], words: str) -> None:
     with pytest.raises(MechanicsError, match=words):
         call()

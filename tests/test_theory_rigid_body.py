@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from closed_forms import swing_from_rest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -58,19 +59,6 @@ def test_energy_gain_is_closed(seed: int, mass: float, period: float, velocity: 
             gain = np.diff(kinetic)[1:] - force[1:-1] * np.diff(motion.position)[:-1]
             expected = 0.5 * mass * np.diff(v)[1:] ** 2
         assert gain == pytest.approx(expected, rel=1e-9, abs=rounding)
-
-
-@given(seeds)
-def test_only_the_implicit_schemes_are_passive_under_any_force(seed: int) -> None:
-    # at rest, a force that opposes every motion: the schemes that lag behind it gain from it
-    motion = {s: integrate_particle(0.1, random_force(seed, 200), T, s) for s in ALL}
-    assert motion["implicit"].energy_gain.max() <= 1e-15
-    assert np.abs(motion["midpoint"].energy_gain).max() <= 1e-15
-    late = motion["semi_implicit"]
-    storage = late.kinetic_energy[2:] - late.kinetic_energy[1]
-    work = np.cumsum(late.force[1:-1] * np.diff(late.position)[:-1])
-    assert np.all(storage - work >= -1e-15)
-    assert (storage - work)[-1] > 0
 
 
 @pytest.mark.parametrize("scheme", ALL)
@@ -137,16 +125,10 @@ def test_driven_mass_follows_the_transfer_function_of_its_scheme(scheme: Coupled
 @pytest.mark.parametrize("scheme", ERRORS)
 def test_accuracy_behind_the_coupling_is_as_the_theory_prints(scheme: CoupledScheme) -> None:
     """From rest, 2 s of a 2 Hz sine of amplitude 1, against the closed form with its transient."""
-    omega = 4 * np.pi
-    gain = complex(exact_mass_response(COUPLING, 1.0, 2.0))
-    roots = np.roots([1.0, COUPLING.damping, COUPLING.stiffness])
-    initial = [-gain.imag, -(1j * omega * gain).imag]  # takes the forced motion's start away
-    free = np.linalg.solve(np.array([[1, 1], roots]), initial)
     for period, percent in zip((4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4), ERRORS[scheme], strict=True):
         time = np.arange(round(2 / period) + 1) * period
-        exact = np.imag(gain * np.exp(1j * omega * time))
-        exact += np.real(np.exp(np.outer(time, roots)) @ free)
-        motion = drive_mass(COUPLING, 1.0, np.sin(omega * time), period, scheme)
+        motion = drive_mass(COUPLING, 1.0, np.sin(4 * np.pi * time), period, scheme)
+        exact = swing_from_rest(time, COUPLING, 1.0)
         error = 100 * np.sqrt(np.mean((motion.position - exact) ** 2))
         # printed to one or two digits: half a unit of the last one
         assert error == pytest.approx(percent, abs=0.5 * last_digit(percent) + 1e-3 * percent)
@@ -154,16 +136,6 @@ def test_accuracy_behind_the_coupling_is_as_the_theory_prints(scheme: CoupledSch
 
 def last_digit(value: float) -> float:
     return float(10.0 ** -len(repr(value).partition(".")[2]))
-
-
-def test_midpoint_is_of_second_order_and_the_rest_of_first() -> None:
-    exact = complex(exact_mass_response(COUPLING, 1.0, 2.0))
-    for scheme in ERRORS:
-        errors = [abs(steady_response(scheme, 1.0, period, 2.0) - exact) for period in (1e-4, 5e-5)]
-        order = np.log2(errors[0] / errors[1])
-        # the compensated scheme's first-order term is small at 2 Hz, so both orders show
-        tolerance = 0.5 if scheme == "compensated" else 0.02
-        assert order == pytest.approx(2 if scheme == "midpoint" else 1, abs=tolerance)
 
 
 @given(seeds, st.floats(1e-3, 10), st.floats(1, 1e5), st.floats(0, 100))
@@ -180,22 +152,6 @@ def test_only_held_forces_create(seed: int, mass: float, stiffness: float, dampi
         else:
             lost = -0.5 * mass * np.diff(motion.velocity) ** 2
             assert gain == pytest.approx(lost, rel=1e-9, abs=rounding)
-
-
-def test_held_force_on_a_light_mass_diverges_where_midpoint_keeps_its_energy() -> None:
-    undamped = Coupling(1000, 0, 0, 0)
-    handle = np.zeros(2001)
-    start = {"position": 1e-3}
-    held = drive_mass(undamped, 2e-4, handle[:100], T, "held", **start)  # T²K/m = 5 > 4: unstable
-    free = drive_mass(undamped, 2e-4, handle, T, "midpoint", **start)
-    damped = drive_mass(undamped, 2e-4, handle, T, "implicit", **start)
-    stored = {
-        name: 0.5 * 2e-4 * m.velocity**2 + 0.5 * 1000 * m.position**2
-        for name, m in (("midpoint", free), ("implicit", damped))
-    }
-    assert np.abs(held.position).max() > 1e3
-    assert stored["midpoint"] == pytest.approx(np.full(2001, 5e-4), rel=1e-10)
-    assert stored["implicit"][-1] < 1e-6 * stored["implicit"][0]
 
 
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
@@ -232,16 +188,6 @@ def test_midpoint_keeps_energy_and_momentum_over_ten_seconds_of_tumbling() -> No
     assert drift <= 1e-9 * np.linalg.norm(momentum[0])
 
 
-def test_explicit_schemes_gain_energy_and_implicit_loses_it() -> None:
-    motions = {s: integrate_rotation(INERTIA, SPIN, 1e-3, 10_000, s) for s in ALL}
-    energy = {s: m.kinetic_energy for s, m in motions.items()}
-    for scheme in ("explicit", "semi_implicit"):
-        assert np.all(np.diff(energy[scheme]) >= -1e-15)
-        assert energy[scheme][-1] > 1.001 * energy[scheme][0]
-    assert np.all(np.diff(energy["implicit"]) <= 1e-15)
-    assert energy["implicit"][-1] < 0.999 * energy["implicit"][0]
-
-
 @pytest.mark.parametrize(("scheme", "order"), [("midpoint", 2), *((s, 1) for s in ALL[:3])])
 def test_error_against_dop853_falls_with_order_of_scheme(scheme: Scheme, order: int) -> None:
     omega = np.array([3.0, 8.0, -4.0])
@@ -276,14 +222,6 @@ def test_balance_is_closed(inertia: tuple[float, ...], omega: tuple[float, ...],
         gain = np.diff(motion.kinetic_energy) - work
         rounding = 1e-12 * (motion.kinetic_energy.max() + np.abs(work).max())
         assert gain == pytest.approx(sign * second_order, rel=1e-9, abs=rounding)
-
-
-@settings(max_examples=40)
-@given(st.tuples(*[st.floats(-30, 30)] * 3))
-def test_midpoint_keeps_the_momentum_in_the_world_whatever_the_spin(omega: tuple[float]) -> None:
-    momentum = integrate_rotation(INERTIA, omega, 1e-3, 100, "midpoint").angular_momentum
-    scale = np.linalg.norm(momentum[0]) + 1e-300
-    assert np.linalg.norm(momentum - momentum[0], axis=1).max() <= 1e-12 * scale + 1e-300
 
 
 def test_torque_about_a_principal_axis_spins_up_at_a_constant_rate() -> None:

@@ -86,24 +86,6 @@ def test_too_light_a_tool_is_unstable_whatever_the_device(
         assert limit == pytest.approx(bound, rel=SHARE)
 
 
-def test_undamped_tool_between_samples_is_no_stable_tool() -> None:
-    loop = SampledLoop(coupling(1000, 0), 1e-3, mass=0.05, integrator="semi_implicit")
-    assert stability_limit(loop) == math.inf
-    assert stability_limit(replace(loop, integrator="implicit")) < 0.5
-
-
-def test_the_run_grows_below_the_bound_and_decays_above() -> None:
-    k_and_b = coupling(2000, 0.5)
-    loop = SampledLoop(k_and_b, 1e-3)
-    bound = minimum_damping(k_and_b, 1e-3)
-    grown, decayed = (
-        loop.simulate(WorstHand(share * bound, np.pi / 1e-3, 1e-3), 4000).force
-        for share in (0.98, 1.02)
-    )
-    assert np.abs(grown[-100:]).max() > 1e3 * np.abs(grown[:100]).max()
-    assert np.abs(decayed[-100:]).max() < 1e-3 * np.abs(decayed[:100]).max()
-
-
 @settings(max_examples=50)
 @given(
     st.floats(0.1, 20),
@@ -166,16 +148,6 @@ def test_tustins_damper_on_a_light_tool_asks_for_a_hundred_newton_seconds_per_me
     loop = SampledLoop(coupling(4000, 0.5), 1e-3, mass=0.05, discretization="tustin")
     assert stability_limit(loop) == pytest.approx(100.0, rel=SHARE)
     assert stability_limit(replace(loop, discretization="backward")) < 2.5
-
-
-def test_the_search_for_the_limit_knows_nothing_of_the_bound() -> None:
-    """Every loop misses its bound by another share; a bracket scaled from it would miss alike."""
-    shares = set()
-    for stiffness in (700, 1300, 2900, 6100):
-        k_and_b = coupling(stiffness, 0.7)
-        bound = minimum_damping(k_and_b, 1e-3)
-        shares.add(round(stability_limit(SampledLoop(k_and_b, 1e-3)) / bound - 1, 9))
-    assert len(shares) == 4
 
 
 @given(st.floats(-20, 20), st.floats(-3, 3))

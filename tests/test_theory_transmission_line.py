@@ -48,12 +48,6 @@ def test_spectrum_is_that_of_the_waves(end: Termination, trip: int) -> None:
     assert spectrum == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-def test_line_of_one_sample_each_way_in_software_is_a_cosine() -> None:
-    theta = np.linspace(0.1, np.pi, 50)
-    spectrum = transmission_line_spectrum(2.0, PERIOD, theta / PERIOD, terminated_by="software")
-    assert spectrum == pytest.approx(2 * np.cos(theta), abs=1e-9)
-
-
 def test_long_line_in_software_has_a_pole_that_no_damping_pays() -> None:
     theta = 2 * np.pi / 3
     spectrum = transmission_line_spectrum(

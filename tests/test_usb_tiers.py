@@ -13,7 +13,7 @@ from emulated.guest import NO_KERNEL, GuestRun, kernel, run_in_guest
 from emulated.parting import parting, repeated
 from emulated.tiers import JOBS, Claim, Job, claims_of, main
 
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.record import COLUMNS, TICK_DTYPE
 from hapticbridge.recording.writer import RecordingWriter
 
 
@@ -95,7 +95,7 @@ def test_where_two_runs_part_is_told(field: str, part: Any, values: Any, named: 
         ticks[field][part] = value
     told = str(parting(*runs))
     assert told.startswith(f"record 3 (ticks 3 and 3) is the first that differs: {named}. ")
-    assert "1 of 5 records and 1 of 51 columns differ; 5 and 5 records" in told
+    assert f"1 of 5 records and 1 of {len(COLUMNS)} columns differ; 5 and 5 records" in told
 
 
 @pytest.mark.parametrize(
@@ -160,12 +160,11 @@ def test_a_guest_says_how_its_command_ended_and_one_that_hangs_is_stopped(tmp_pa
     assert killed.status == 137
     assert "memory is full" in killed.output
     endless = ["sh", "-c", "while :; do i=0; while [ $i -lt 999 ]; do i=$((i+1)); done; echo; done"]
-    stopped = run_in_guest(
-        endless, tmp_path, environment={}, is_virtual=True, timeout=4.0, patience=3.0
-    )
+    limits: Any = {"environment": {}, "is_virtual": True, "patience": 3.0}
+    stopped = run_in_guest(endless, tmp_path, timeout=4.0, **limits)
     assert stopped.status is None
     assert stopped.output.endswith("\nthe guest was stopped after 4 s")
     endless[-1] = "echo begun; while :; do :; done"
-    silent = run_in_guest(endless, tmp_path, environment={}, is_virtual=True, patience=3.0)
+    silent = run_in_guest(endless, tmp_path, **limits)
     assert silent.status is None
     assert silent.output == "begun\nthe guest was stopped: it had printed nothing for 3 s"

@@ -251,10 +251,11 @@ def find_lean(
     original = SceneVariant(replace(source, spec=spec), grip, setting)
     with quiet():
         judge = Judge(original, motion, budget, damping, cost)
-        return _search(judge, _simplifications(original, motion), progress)
+        return _search(judge, all_simplifications(original, motion), progress)
 
 
-def _simplifications(original: SceneVariant, motion: Motion) -> list[Simplification]:
+def all_simplifications(original: SceneVariant, motion: Motion) -> list[Simplification]:
+    """Returns the simplifications that are worth trying on a scene under a motion."""
     seen = witness(original, motion)
     return [
         *contact_simplifications(seen),

@@ -151,7 +151,7 @@ def _ctype(declared: Any) -> Any:
     if declared.name in _SCALARS:
         return _SCALARS[declared.name]
     if declared.name in structs.STRUCTS:
-        return _struct(declared.name)
+        return struct_of(declared.name)
     raise SceneError(
         f"MuJoCo {mujoco.__version__} uses a type '{declared.name}' whose size is unknown here; "
         "install a version from constraints.txt"
@@ -159,19 +159,20 @@ def _ctype(declared: Any) -> Any:
 
 
 @cache
-def _struct(name: str) -> Any:
+def struct_of(name: str) -> Any:
+    """Returns the ctypes structure of a C struct of MuJoCo, by its name."""
     fields = [(field.name, _ctype(field.type)) for field in structs.STRUCTS[name].fields]
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
 def field_address(data: mujoco.MjData, name: str) -> int:
     """Returns the address of a field of ``mjData``; for a pointer, that of the pointer itself."""
-    return int(data._address + getattr(_struct("mjData"), name).offset)
+    return int(data._address + getattr(struct_of("mjData"), name).offset)
 
 
 def contact_layout() -> dict[str, int]:
     """Returns the size of ``mjContact`` and the offsets that a tick reads, in bytes."""
-    contact = _struct("mjContact")
+    contact = struct_of("mjContact")
     fields = {
         "distance": "dist",
         "point": "pos",
@@ -191,7 +192,7 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
         SceneError: The described layout of ``mjData`` is not that of the library, so the compiled
             tick would read wrong memory.
     """
-    view = _struct("mjData").from_address(data._address)
+    view = struct_of("mjData").from_address(data._address)
     agrees = (
         view.ncon == data.ncon
         and view.nefc == data.nefc

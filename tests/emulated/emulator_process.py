@@ -6,6 +6,7 @@ devices, and the system asks the device things meanwhile.
 
 from __future__ import annotations
 
+import abc
 import ctypes
 import math
 import multiprocessing
@@ -15,7 +16,6 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from emulated.front_end import FrontEnd
 from emulated.usb_device import UsbDevice
 
 _PR_SET_TIMERSLACK = 29
@@ -23,6 +23,30 @@ _PR_SET_TIMERSLACK = 29
 _SHORTEST = 5e-6
 """In s. A model that wants to be asked again at once, over and over, would hold virtual time still,
 and the host that it waits for too."""
+
+
+class FrontEnd(abc.ABC):
+    """Joins a device model and a system; served by one thread (``emulator_process``)."""
+
+    @abc.abstractmethod
+    def files(self) -> list[int]:
+        """Returns the files at which the system's next question may arrive."""
+
+    @abc.abstractmethod
+    def serve(self, file: int, now: float) -> None:
+        """Answers the question that has arrived at a file."""
+
+    @abc.abstractmethod
+    def settle(self, now: float) -> float | None:
+        """Hands over what the device has to say.
+
+        Returns:
+            When to call again at the latest, in s; None: only after the next question.
+        """
+
+    @abc.abstractmethod
+    def unplug(self) -> None:
+        """Pulls the device out; ``files`` then names only those whose clients must be told so."""
 
 
 class EmulatorProcess:

@@ -48,14 +48,9 @@ def kernel() -> Path | None:
     the cache folder to which ``scripts/build_uml`` builds, and in a folder shared by checkouts.
     """
     named = os.environ.get("HAPTICBRIDGE_UML")
-    places = (
-        [Path(named)]
-        if named
-        else [
-            Path(platformdirs.user_cache_dir("hapticbridge", appauthor=False)) / "uml/linux",
-            CHECKOUT.parent / "shared/usblab/uml/min/linux",
-        ]
-    )
+    built = Path(platformdirs.user_cache_dir("hapticbridge", appauthor=False)) / "uml/linux"
+    shared = CHECKOUT.parent / "shared/usblab/uml/min/linux"
+    places = [Path(named)] if named else [built, shared]
     return next((place for place in places if os.access(place, os.X_OK)), None)
 
 
@@ -125,22 +120,11 @@ def run_in_guest(
     exports = [f"export {name}={shlex.quote(text)}" for name, text in environment.items()]
     (folder / "command").write_text("\n".join([*exports, shlex.join(command)]) + "\n")
     (folder / "status").unlink(missing_ok=True)
-    arguments = [
-        str(program),
-        f"mem={_MEMORY_MIB}M",
-        "root=/dev/root",
-        "rootfstype=hostfs",
-        "rootflags=/",
-        "ro",
-        "quiet",
-        "con=null",
-        "con0=null,fd:1",
-        "ssl=null",
-        f"init={CHECKOUT / 'tests/uml/init'}",
-        f"job={folder}",
-        f"compiled={compiled or _compiled_code()}",
-        *(["time-travel=inf-cpu"] if is_virtual else []),
-    ]
+    root = "root=/dev/root rootfstype=hostfs rootflags=/ ro quiet con=null con0=null,fd:1 ssl=null"
+    job = [f"job={folder}", f"compiled={compiled or _compiled_code()}"]
+    init = f"init={CHECKOUT / 'tests/uml/init'}"
+    arguments = [str(program), f"mem={_MEMORY_MIB}M", *root.split(), init, *job]
+    arguments += ["time-travel=inf-cpu"] if is_virtual else []
     start = time.monotonic()
     # a group of its own: the guest's programs are processes of the host, and end with it
     guest = subprocess.Popen(

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import Motion, SimulatedDevice, read_motion
+from hapticbridge.scene import scene_path
 
 STEP = 125e-6
 """In s: the force is held over each step, which is then exact. An eighth of a loop's period, a
@@ -60,3 +61,9 @@ class Handle:
     def velocity(self) -> NDArray[np.float64]:
         """Returns velocity in m/s and angular velocity in rad/s, shape (6,)."""
         return self._mechanics.velocity
+
+
+def planar_hand(scene: str) -> Motion:
+    """Returns the path that comes with a scene in x and z, laid into the x and y of a stick."""
+    table = read_motion(scene_path(scene).with_suffix(".csv")).table
+    return Motion(table[:, 0], np.column_stack([table[:, 1], table[:, 3], 0.0 * table[:, 0]]))

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from emulated.hid_device import HidDevice
-from emulated.timed import Timed
 from emulated.usb_device import StallError
 from hapticbridge.device.transport.hid import HidHandle
+
+
+class Timed(Protocol):
+    """Emulated devices and the time in s that they are at."""
+
+    now: float
+
+    def advance(self, now: float) -> None:
+        """Brings every device to a time; a time before the newest one changes nothing."""
 
 
 class HidSeam:

@@ -66,7 +66,9 @@ def parting(first: NDArray[np.void], second: NDArray[np.void]) -> str | None:
     rows, columns = unequal.any(axis=1), unequal.any(axis=0)
     row = int(np.argmax(rows))
     here = [column for column, is_other in zip(COLUMNS, unequal[row], strict=True) if is_other]
-    named = [_named(first[row], second[row], column) for column in here[:MAX_NAMED]]
+    named = [
+        _named(first[row : row + 1], second[row : row + 1], column) for column in here[:MAX_NAMED]
+    ]
     if len(here) > MAX_NAMED:
         named.append(f"{len(here) - MAX_NAMED} other numbers")
     ticks = f"{first['tick'][row]} and {second['tick'][row]}"
@@ -82,18 +84,13 @@ def _numbers(records: NDArray[np.void], column: Column) -> NDArray[np.int64 | np
     return np.ascontiguousarray(field if column.part is None else field[..., column.part])
 
 
-def _unequal(
-    first: NDArray[np.void], second: NDArray[np.void], column: Column
-) -> NDArray[np.bool_]:
+def _unequal(first: NDArray[np.void], second: NDArray[np.void], one: Column) -> NDArray[np.bool_]:
     """Compares bits: the two zeros differ, and a NaN is like itself."""
-    a, b = (_numbers(records, column).view(np.int64) for records in (first, second))
+    a, b = (_numbers(records, one).view(np.int64) for records in (first, second))
     return np.asarray(a != b)
 
 
-def _named(first: np.void, second: np.void, column: Column) -> str:
-    a, b = (
-        first[column.field] if column.part is None else first[column.field][column.part],
-        second[column.field] if column.part is None else second[column.field][column.part],
-    )
+def _named(first: NDArray[np.void], second: NDArray[np.void], column: Column) -> str:
+    a, b = (_numbers(records, column).item() for records in (first, second))
     unit = "" if column.unit == "1" else f" {column.unit}"
-    return f"{column.name} {a.item()!r} and {b.item()!r}{unit}"
+    return f"{column.name} {a!r} and {b!r}{unit}"

@@ -7,7 +7,7 @@ own driver reads the same bytes in the guest.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -18,7 +18,7 @@ _PHYSICAL, _APPLICATION, _LOGICAL = 0, 1, 2
 _MILLISECONDS = (0x1003, -3)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Part:
     """One value of a report.
 
@@ -128,9 +128,7 @@ def descriptor(reports: Iterable[Report]) -> bytes:
 
 def _choice(name: str, within: int, usages: Iterable[int], bits: int = 8) -> Part:
     choices = tuple(PID | usage for usage in usages)
-    return Part(
-        name=name, within=PID | within, choices=choices, bits=bits, low=1, high=len(choices)
-    )
+    return Part(name, 0, bits, 1, len(choices), PID | within, choices)
 
 
 def _padding(bits: int) -> Part:
@@ -138,236 +136,149 @@ def _padding(bits: int) -> Part:
 
 
 def _index(bits: int = 8) -> Part:
-    return Part(name="index", usage=PID | 0x22, bits=bits, low=1, high=40)
+    return Part("index", PID | 0x22, bits, 1, 40)
 
 
 def _time(name: str, usage: int, bits: int = 16, high: int = 32767) -> Part:
-    return Part(name=name, usage=PID | usage, bits=bits, high=high, unit=_MILLISECONDS)
+    return Part(name, PID | usage, bits, 0, high, unit=_MILLISECONDS)
 
 
 def _bit(name: str, usage: int, within: int = 0) -> Part:
-    return Part(name=name, usage=usage, bits=1, high=1, within=within)
+    return Part(name, usage, 1, 0, 1, within)
 
 
-def _envelope(number: int, index: int, bits: int) -> Report:
-    """Returns the report of what the model has no use for; the kernel wants it to be there."""
-    parts = ("attack_level", 0x5B), ("fade_level", 0x5D)
-    times = ("attack_time", 0x5C), ("fade_time", 0x5E)
-    return Report(
-        kind=OUT,
-        number=number,
-        usage=PID | 0x5A,
-        parts=(
-            _index(index),
-            *(Part(name=name, usage=PID | usage, bits=bits) for name, usage in parts),
-            *(_time(name, usage) for name, usage in times),
-        ),
-    )
+def _angle(name: str, number: int) -> Part:
+    return Part(name, ORDINAL | number, 16, 0, 35999, PID | 0x57, unit=(0x14, -2))
 
 
-USUAL: dict[str, Report] = {
-    "state": Report(
-        kind=IN,
-        number=1,
-        usage=DESKTOP | 1,
-        parts=(
-            Part(name="x", usage=DESKTOP | 0x30, bits=16, low=-32767, high=32767),
-            Part(name="y", usage=DESKTOP | 0x31, bits=16, low=-32767, high=32767),
+def _envelope(index: int, bits: int) -> tuple[Part, ...]:
+    """Returns the parts of what the model has no use for; the kernel wants it to be there."""
+    levels = (Part(name, PID | usage, bits) for name, usage in (("attack", 0x5B), ("fade", 0x5D)))
+    times = (_time(name, usage) for name, usage in (("attack_time", 0x5C), ("fade_time", 0x5E)))
+    return (_index(index), *levels, *times)
+
+
+def _layout(table: Mapping[tuple[str, int, int, int], tuple[Part, ...]]) -> dict[str, Report]:
+    """Returns reports by name; a key is name, kind, number, and usage of the collection."""
+    return {
+        name: Report(kind=kind, number=number, usage=usage, parts=parts)
+        for (name, kind, number, usage), parts in table.items()
+    }
+
+
+_EFFECTS = (0x26, 0x27, 0x30, 0x31, 0x40, 0x41, 0x42, 0x43)
+
+USUAL = _layout(
+    {
+        ("state", IN, 1, DESKTOP | 1): (
+            Part("x", DESKTOP | 0x30, 16, -32767, 32767),
+            Part("y", DESKTOP | 0x31, 16, -32767, 32767),
             *(_bit(f"button{i}", BUTTON | i) for i in range(1, 9)),
         ),
-    ),
-    "effect": Report(
-        kind=OUT,
-        number=1,
-        usage=PID | 0x21,
-        parts=(
+        ("effect", OUT, 1, PID | 0x21): (
             _index(),
-            _choice("type", 0x25, (0x26, 0x27, 0x30, 0x31, 0x40, 0x41, 0x42, 0x43)),
+            _choice("type", 0x25, _EFFECTS),
             _time("duration", 0x50),
             _time("trigger_repeat", 0x54),
             _time("sample_period", 0x51),
             _time("delay", 0xA7),
-            Part(name="gain", usage=PID | 0x52),
-            Part(name="trigger", usage=PID | 0x53, low=1, high=8),
+            Part("gain", PID | 0x52),
+            Part("trigger", PID | 0x53, low=1, high=8),
             _bit("enable_x", DESKTOP | 0x30, PID | 0x55),
             _bit("enable_y", DESKTOP | 0x31, PID | 0x55),
             _bit("by_direction", PID | 0x56),
             _padding(5),
-            Part(
-                name="direction",
-                usage=ORDINAL | 1,
-                bits=16,
-                high=35999,
-                within=PID | 0x57,
-                unit=(0x14, -2),
-            ),
-            Part(
-                name="elevation",
-                usage=ORDINAL | 2,
-                bits=16,
-                high=35999,
-                within=PID | 0x57,
-                unit=(0x14, -2),
-            ),
+            _angle("direction", 1),
+            _angle("elevation", 2),
         ),
-    ),
-    "force": Report(
-        kind=OUT,
-        number=5,
-        usage=PID | 0x73,
-        parts=(_index(), Part(name="magnitude", usage=PID | 0x70, bits=16, low=-32767, high=32767)),
-    ),
-    "envelope": _envelope(2, 8, 8),
-    "operation": Report(
-        kind=OUT,
-        number=10,
-        usage=PID | 0x77,
-        parts=(
+        ("force", OUT, 5, PID | 0x73): (_index(), Part("magnitude", PID | 0x70, 16, -32767, 32767)),
+        ("envelope", OUT, 2, PID | 0x5A): _envelope(8, 8),
+        ("operation", OUT, 10, PID | 0x77): (
             _index(),
             _choice("operation", 0x78, (0x79, 0x7A, 0x7B)),
-            Part(name="loops", usage=PID | 0x7C),
+            Part("loops", PID | 0x7C),
         ),
-    ),
-    "free": Report(kind=OUT, number=11, usage=PID | 0x90, parts=(_index(),)),
-    "control": Report(
-        kind=OUT,
-        number=12,
-        usage=PID | 0x95,
-        parts=(_choice("control", 0x96, (0x97, 0x98, 0x99, 0x9A, 0x9B, 0x9C)),),
-    ),
-    "gain": Report(
-        kind=OUT, number=13, usage=PID | 0x7D, parts=(Part(name="gain", usage=PID | 0x7E),)
-    ),
-    "create": Report(
-        kind=FEATURE,
-        number=5,
-        usage=PID | 0xAB,
-        parts=(
-            _choice("type", 0x25, (0x26, 0x27, 0x30, 0x31, 0x40, 0x41, 0x42, 0x43)),
-            Part(name="bytes", usage=DESKTOP | 0x3B, bits=10, high=511),
+        ("free", OUT, 11, PID | 0x90): (_index(),),
+        ("control", OUT, 12, PID | 0x95): (_choice("control", 0x96, range(0x97, 0x9D)),),
+        ("gain", OUT, 13, PID | 0x7D): (Part("gain", PID | 0x7E),),
+        ("create", FEATURE, 5, PID | 0xAB): (
+            _choice("type", 0x25, _EFFECTS),
+            Part("bytes", DESKTOP | 0x3B, 10, 0, 511),
             _padding(6),
         ),
-    ),
-    "load": Report(
-        kind=FEATURE,
-        number=6,
-        usage=PID | 0x89,
-        parts=(
+        ("load", FEATURE, 6, PID | 0x89): (
             _index(),
             _choice("status", 0x8B, (0x8C, 0x8D, 0x8E)),
-            Part(name="memory", usage=PID | 0xAC, bits=16, high=32767),
+            Part("memory", PID | 0xAC, 16, 0, 32767),
         ),
-    ),
-    "pool": Report(
-        kind=FEATURE,
-        number=7,
-        usage=PID | 0x7F,
-        parts=(
-            Part(name="memory", usage=PID | 0x80, bits=16, high=32767),
-            Part(name="most", usage=PID | 0x83, high=127),
+        ("pool", FEATURE, 7, PID | 0x7F): (
+            Part("memory", PID | 0x80, 16, 0, 32767),
+            Part("most", PID | 0x83, 8, 0, 127),
             _bit("managed", PID | 0xA9),
             _bit("shared", PID | 0xAA),
             _padding(6),
         ),
-    ),
-}
+    }
+)
 """As most makers copy it from the standard's example."""
 
-ODD: dict[str, Report] = {
-    "pool": Report(
-        kind=FEATURE,
-        number=0x21,
-        usage=PID | 0x7F,
-        parts=(
+_ODD_EFFECTS = (0x43, 0x41, 0x40, 0x31, 0x26)
+
+ODD = _layout(
+    {
+        ("pool", FEATURE, 0x21, PID | 0x7F): (
             _bit("managed", PID | 0xA9),
             _padding(3),
-            Part(name="most", usage=PID | 0x83, bits=5, high=31),
-            Part(name="memory", usage=PID | 0x80, bits=15, high=32767),
+            Part("most", PID | 0x83, 5, 0, 31),
+            Part("memory", PID | 0x80, 15, 0, 32767),
         ),
-    ),
-    "control": Report(
-        kind=OUT,
-        number=0x30,
-        usage=PID | 0x95,
-        parts=(_choice("control", 0x96, (0x9C, 0x9B, 0x9A, 0x99, 0x98, 0x97), bits=4), _padding(4)),
-    ),
-    "force": Report(
-        kind=OUT,
-        number=0x42,
-        usage=PID | 0x73,
-        parts=(
-            Part(name="magnitude", usage=PID | 0x70, bits=11, low=-1000, high=1000),
+        ("control", OUT, 0x30, PID | 0x95): (
+            _choice("control", 0x96, range(0x9C, 0x96, -1), bits=4),
+            _padding(4),
+        ),
+        ("force", OUT, 0x42, PID | 0x73): (
+            Part("magnitude", PID | 0x70, 11, -1000, 1000),
             _padding(3),
             _index(6),
         ),
-    ),
-    "operation": Report(
-        kind=OUT,
-        number=0x43,
-        usage=PID | 0x77,
-        parts=(
-            Part(name="loops", usage=PID | 0x7C, bits=7, high=127),
+        ("operation", OUT, 0x43, PID | 0x77): (
+            Part("loops", PID | 0x7C, 7, 0, 127),
             _index(6),
             _choice("operation", 0x78, (0x7B, 0x79, 0x7A), bits=3),
         ),
-    ),
-    "state": Report(
-        kind=IN,
-        number=0x44,
-        usage=DESKTOP | 1,
-        parts=(
+        ("state", IN, 0x44, DESKTOP | 1): (
             *(_bit(f"button{i}", BUTTON | i) for i in range(1, 6)),
-            Part(name="y", usage=DESKTOP | 0x31, bits=14, high=16383),
-            Part(name="rudder", usage=DESKTOP | 0x35, bits=7, low=-64, high=63),
-            Part(name="x", usage=DESKTOP | 0x30, bits=14, high=16383),
+            Part("y", DESKTOP | 0x31, 14, 0, 16383),
+            Part("rudder", DESKTOP | 0x35, 7, -64, 63),
+            Part("x", DESKTOP | 0x30, 14, 0, 16383),
         ),
-    ),
-    "effect": Report(
-        kind=OUT,
-        number=0x45,
-        usage=PID | 0x21,
-        parts=(
-            Part(name="gain", usage=PID | 0x52, bits=7, high=100),
-            Part(name="direction", usage=ORDINAL | 1, bits=9, high=359, within=PID | 0x57),
+        ("effect", OUT, 0x45, PID | 0x21): (
+            Part("gain", PID | 0x52, 7, 0, 100),
+            Part("direction", ORDINAL | 1, 9, 0, 359, PID | 0x57),
             _bit("by_direction", PID | 0x56),
-            _choice("type", 0x25, (0x43, 0x41, 0x40, 0x31, 0x26), bits=5),
+            _choice("type", 0x25, _ODD_EFFECTS, bits=5),
             _index(6),
-            Part(name="trigger", usage=PID | 0x53, bits=4, low=1, high=5),
+            Part("trigger", PID | 0x53, 4, 1, 5),
             # hundredths of a second
-            Part(name="duration", usage=PID | 0x50, bits=12, high=4095, unit=(0x1003, -2)),
+            Part("duration", PID | 0x50, 12, 0, 4095, unit=(0x1003, -2)),
             _time("trigger_repeat", 0x54, 11, 2047),
             _time("delay", 0xA7, 11, 2047),
             _bit("enable_y", DESKTOP | 0x31, PID | 0x55),
             _bit("enable_x", DESKTOP | 0x30, PID | 0x55),
         ),
-    ),
-    "envelope": _envelope(0x48, 6, 9),
-    "load": Report(
-        kind=FEATURE,
-        number=0x22,
-        usage=PID | 0x89,
-        parts=(
-            Part(name="memory", usage=PID | 0xAC, bits=15, high=32767),
+        ("envelope", OUT, 0x48, PID | 0x5A): _envelope(6, 9),
+        ("load", FEATURE, 0x22, PID | 0x89): (
+            Part("memory", PID | 0xAC, 15, 0, 32767),
             _choice("status", 0x8B, (0x8E, 0x8D, 0x8C), bits=3),
             _index(6),
         ),
-    ),
-    "create": Report(
-        kind=FEATURE,
-        number=0x23,
-        usage=PID | 0xAB,
-        parts=(
-            Part(name="bytes", usage=DESKTOP | 0x3B, bits=11, high=511),
-            _choice("type", 0x25, (0x43, 0x41, 0x40, 0x31, 0x26), bits=5),
+        ("create", FEATURE, 0x23, PID | 0xAB): (
+            Part("bytes", DESKTOP | 0x3B, 11, 0, 511),
+            _choice("type", 0x25, _ODD_EFFECTS, bits=5),
         ),
-    ),
-    "free": Report(kind=OUT, number=0x46, usage=PID | 0x90, parts=(_padding(2), _index(6))),
-    "gain": Report(
-        kind=OUT,
-        number=0x47,
-        usage=PID | 0x7D,
-        parts=(Part(name="gain", usage=PID | 0x7E, bits=10, high=1000),),
-    ),
-}
-"""Other numbers, widths, ranges and order, as the standard allows: whoever takes a number or a
-place for granted fails on one of the two."""
+        ("free", OUT, 0x46, PID | 0x90): (_padding(2), _index(6)),
+        ("gain", OUT, 0x47, PID | 0x7D): (Part("gain", PID | 0x7E, 10, 0, 1000),),
+    }
+)
+"""Other numbers, widths, ranges and order, as the standard allows: a driver that takes a number or
+a place for granted fails on one of the two."""

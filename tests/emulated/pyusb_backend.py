@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import errno
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,22 @@ import usb.core
 from emulated.usb_device import TO_HOST, Setup, StallError, UsbDevice
 
 Buffer = array.array  # of bytes, as pyusb hands it over
+
+
+_DEVICE = """bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol
+    bMaxPacketSize0 idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber
+    bNumConfigurations"""
+_CONFIGURATION = """bLength bDescriptorType wTotalLength bNumInterfaces bConfigurationValue
+    iConfiguration bmAttributes bMaxPower"""
+_INTERFACE = """bLength bDescriptorType bInterfaceNumber bAlternateSetting bNumEndpoints
+    bInterfaceClass bInterfaceSubClass bInterfaceProtocol iInterface"""
+_ENDPOINT = "bLength bDescriptorType bEndpointAddress bmAttributes wMaxPacketSize bInterval"
+"""Fields of descriptors in the order of their bytes, as the standard names them."""
+
+
+def _named(names: str, layout: str, raw: bytes) -> SimpleNamespace:
+    fields = dict(zip(names.split(), struct.unpack(layout, raw), strict=True))
+    return SimpleNamespace(**fields, extra_descriptors=[])
 
 
 class PyusbBackend(usb.backend.IBackend):  # type: ignore[misc]
@@ -50,79 +67,29 @@ class PyusbBackend(usb.backend.IBackend):  # type: ignore[misc]
         return iter(list(self._devices))
 
     def get_device_descriptor(self, device: UsbDevice) -> SimpleNamespace:
-        raw = device.device_descriptor()
-        return SimpleNamespace(
-            bLength=18,
-            bDescriptorType=1,
-            bcdUSB=raw[2] | raw[3] << 8,
-            bDeviceClass=raw[4],
-            bDeviceSubClass=raw[5],
-            bDeviceProtocol=raw[6],
-            bMaxPacketSize0=raw[7],
-            idVendor=device.vendor,
-            idProduct=device.product,
-            bcdDevice=device.release,
-            iManufacturer=raw[14],
-            iProduct=raw[15],
-            iSerialNumber=raw[16],
-            bNumConfigurations=1,
-            address=1 + (self._devices.index(device) if device in self._devices else 0),
-            bus=1,
-            port_number=1,
-            port_numbers=(1,),
-            speed=device.speed,
-        )
+        found = _named(_DEVICE, "<2BH4B3H4B", device.device_descriptor())
+        found.address = 1 + (self._devices.index(device) if device in self._devices else 0)
+        found.bus, found.port_number, found.port_numbers, found.speed = 1, 1, (1,), device.speed
+        return found
 
     def get_configuration_descriptor(self, device: UsbDevice, config: int) -> SimpleNamespace:
         if config:
             raise IndexError
-        raw = device.configuration_descriptor()
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=2,
-            wTotalLength=len(raw),
-            bNumInterfaces=1,
-            bConfigurationValue=1,
-            iConfiguration=0,
-            bmAttributes=raw[7],
-            bMaxPower=raw[8],
-            extra_descriptors=[],
-        )
+        return _named(_CONFIGURATION, "<2BH5B", device.configuration_descriptor()[:9])
 
     def get_interface_descriptor(
         self, device: UsbDevice, interface: int, alternate: int, config: int
     ) -> SimpleNamespace:
         if interface or alternate or config:
             raise IndexError
-        code, subclass, protocol = device.interface_class
-        return SimpleNamespace(
-            bLength=9,
-            bDescriptorType=4,
-            bInterfaceNumber=0,
-            bAlternateSetting=0,
-            bNumEndpoints=len(device.endpoints),
-            bInterfaceClass=code,
-            bInterfaceSubClass=subclass,
-            bInterfaceProtocol=protocol,
-            iInterface=0,
-            extra_descriptors=[],
-        )
+        return _named(_INTERFACE, "<9B", device.configuration_descriptor()[9:18])
 
     def get_endpoint_descriptor(
         self, device: UsbDevice, endpoint: int, interface: int, alternate: int, config: int
     ) -> SimpleNamespace:
-        one = device.endpoints[endpoint]
-        return SimpleNamespace(
-            bLength=7,
-            bDescriptorType=5,
-            bEndpointAddress=one.address,
-            bmAttributes=one.kind,
-            wMaxPacketSize=one.size,
-            bInterval=one.interval,
-            bRefresh=0,
-            bSynchAddress=0,
-            extra_descriptors=[],
-        )
+        found = _named(_ENDPOINT, "<4BHB", device.endpoints[endpoint].descriptor())
+        found.bRefresh = found.bSynchAddress = 0
+        return found
 
     # -- opening ---------------------------------------------------------------------------------
 

@@ -94,8 +94,8 @@ class RawHid(HidDevice):
         self.is_silent = False
         self._title = title
         self._handle = None if mechanics is None else Handle(mechanics)
-        self._clock_start_us = clock_start_us
-        self._echo, self._sequence = 0, 0
+        self.clock_start_us = clock_start_us
+        self._echo, self.sequence = 0, 0
         self._start: float | None = None
         self._sent = 0
         self._expires: float | None = None
@@ -134,12 +134,12 @@ class RawHid(HidDevice):
 
     def _send_state(self, when: float) -> None:
         self.frames += 1
-        self._sequence = (self._sequence + 1) & 0xFFFF
+        self.sequence = (self.sequence + 1) & 0xFFFF
         if self.is_silent or self.frames in self.lose:
             return
         status = self.status | self.is_enabled | self._has_expired << 1
-        time_us = (self._clock_start_us + round(1e6 * when)) & 0xFFFFFFFF
-        head = (0x48, 1, 0x53, status, self._sequence, self.buttons, time_us)
+        time_us = (self.clock_start_us + round(1e6 * when)) & 0xFFFFFFFF
+        head = (0x48, 1, 0x53, status, self.sequence, self.buttons, time_us)
         body = struct.pack("<BBBBHHI", *head) + struct.pack("<12f", *self._motion_now())
         body += struct.pack("<H", self._echo)
         frame = bytearray(body + struct.pack("<H", crc(body)))

@@ -20,19 +20,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hapticbridge as hb
+from emulated import guest
 from emulated.compile_ahead import compile_ahead, snapshot_of_compiled_code
-from emulated.guest import (
-    CHECKOUT,
-    NO_KERNEL,
-    PATIENCE,
-    GuestRun,
-    has_pidff,
-    kernel,
-    python_environment,
-    run_in_guest,
-)
+from emulated.guest import CHECKOUT, NO_KERNEL, GuestRun, kernel
 from emulated.parting import repeated
 from emulated.umock_sysfs import make_test_bed
 
@@ -132,14 +125,9 @@ def _under_umockdev(folder: Path) -> list[Claim]:
         "PYTHONPATH": f"{CHECKOUT}:{CHECKOUT / 'tests'}",
     }
     try:
-        ended = subprocess.run(
-            [*_pytest(str(report)), f"--basetemp={folder / 'files'}"],
-            env=os.environ | variables,
-            capture_output=True,
-            text=True,
-            timeout=LIMIT,
-            check=False,
-        )
+        command = [*_pytest(str(report)), f"--basetemp={folder / 'files'}"]
+        how: Any = {"capture_output": True, "text": True, "timeout": LIMIT}
+        ended = subprocess.run(command, env=os.environ | variables, check=False, **how)
     except subprocess.TimeoutExpired:
         return [Claim("the job ran", is_true=False, note=f"stopped after {LIMIT:g} s")]
     return claims_of(report, ended.stdout + ended.stderr)
@@ -154,20 +142,14 @@ def _in_the_guest(
     compiled: Path | None = None,
 ) -> GuestRun:
     _compile_ahead()
-    variables = python_environment() | {"HAPTICBRIDGE_TIER": "uml"}
+    variables = guest.python_environment() | {"HAPTICBRIDGE_TIER": "uml"}
     if is_virtual:
         variables["HAPTICBRIDGE_TIME"] = "virtual"
-    if not has_pidff():
+    if not guest.has_pidff():
         variables["HAPTICBRIDGE_NO_PIDFF"] = "1"
-    return run_in_guest(
-        command,
-        folder,
-        environment=variables,
-        is_virtual=is_virtual,
-        timeout=LIMIT,
-        patience=patience,
-        compiled=compiled,
-    )
+    limits = {"timeout": LIMIT, "patience": patience}
+    how = {"environment": variables, "is_virtual": is_virtual, "compiled": compiled}
+    return guest.run_in_guest(command, folder, **limits, **how)  # type: ignore[arg-type]
 
 
 _compiling = threading.Lock()
@@ -182,7 +164,7 @@ def _compile_ahead() -> None:
 def _checks(folder: Path, *which: str, is_virtual: bool) -> list[Claim]:
     """Runs checks in a guest, and finds what they claim."""
     command = _pytest("/run/job/report.xml", *which)
-    run = _in_the_guest(folder, command, is_virtual=is_virtual, patience=PATIENCE)
+    run = _in_the_guest(folder, command, is_virtual=is_virtual, patience=guest.PATIENCE)
     return claims_of(folder / "report.xml", run.output)
 
 

@@ -6,19 +6,12 @@ import errno
 import os
 import struct
 
-from emulated.front_end import FrontEnd
+from emulated.emulator_process import FrontEnd
 from emulated.hid_device import FEATURE_REPORT, INPUT_REPORT, OUTPUT_REPORT, HidDevice
 from emulated.usb_device import StallError
 
 _DESTROY, _OPEN, _CLOSE, _OUTPUT = 1, 4, 5, 6
-_GET_REPORT, _GET_REPORT_REPLY, _CREATE, _INPUT, _SET_REPORT, _SET_REPORT_REPLY = (
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-)
+_GET_REPORT, _GET_REPORT_REPLY, _CREATE, _INPUT, _SET_REPORT, _SET_REPORT_REPLY = range(9, 15)
 _EVENT_SIZE = 4380
 _DATA_MAX = 4096
 _BUS_USB = 3
@@ -39,23 +32,12 @@ class Uhid(FrontEnd):
         # without report numbers the kernel puts a zero in their place, which no device ever sees
         self._blank = b"" if device.has_numbered_reports else b"\0"
         self._file = os.open("/dev/uhid", os.O_RDWR | os.O_CLOEXEC)
-        os.write(
-            self._file,
-            struct.pack(
-                f"<I128s64s64sHHIIII{_DATA_MAX}s",
-                _CREATE,
-                f"{device.manufacturer} {device.product_name}".encode(),
-                b"emulated",
-                device.serial.encode(),
-                len(device.report_descriptor),
-                _BUS_USB,
-                device.vendor,
-                device.product,
-                device.release,
-                0,
-                device.report_descriptor,
-            ),
-        )
+        name, serial = f"{device.manufacturer} {device.product_name}", device.serial.encode()
+        descriptor = device.report_descriptor
+        words = (_BUS_USB, device.vendor, device.product, device.release, 0)
+        form, texts = f"<I128s64s64s2H4I{_DATA_MAX}s", (name.encode(), b"emulated", serial)
+        event = struct.pack(form, _CREATE, *texts, len(descriptor), *words, descriptor)
+        os.write(self._file, event)
 
     def files(self) -> list[int]:
         return [self._file] if self._is_plugged else []
@@ -98,9 +80,8 @@ class Uhid(FrontEnd):
         elif _KINDS.get(kind) == INPUT_REPORT:
             answer = self._device.input_report(number, now)
         data = b"" if answer is None else self._blank + answer
-        head = struct.pack(
-            "<IIHH", _GET_REPORT_REPLY, token, errno.EIO if answer is None else 0, len(data)
-        )
+        error = errno.EIO if answer is None else 0
+        head = struct.pack("<IIHH", _GET_REPORT_REPLY, token, error, len(data))
         os.write(self._file, head + data)
 
     def _set_report(self, token: int, kind: int, report: bytes, now: float) -> None:

@@ -55,11 +55,9 @@ def add(root: Path, device: UsbDevice) -> Nodes:
     _write(
         folder,
         {
-            "busnum": "1",
+            **dict.fromkeys(("busnum", "bConfigurationValue", "bNumConfigurations"), "1"),
             "devnum": f"{address}",
             "speed": _SPEEDS[device.speed],
-            "bConfigurationValue": "1",
-            "bNumConfigurations": "1",
             "bNumInterfaces": " 1",
             "idVendor": f"{device.vendor:04x}",
             "idProduct": f"{device.product:04x}",
@@ -75,12 +73,9 @@ def add(root: Path, device: UsbDevice) -> Nodes:
             f"BUSNUM=001\nDEVNUM={address:03d}",
         },
     )
-    texts = {
-        "manufacturer": device.manufacturer,
-        "product": device.product_name,
-        "serial": device.serial,
-    }
-    _write(folder, {key: text for key, text in texts.items() if text})
+    texts = device.manufacturer, device.product_name, device.serial
+    named = zip(("manufacturer", "product", "serial"), texts, strict=True)
+    _write(folder, {key: text for key, text in named if text})
     descriptors = device.device_descriptor() + device.configuration_descriptor()
     (folder / "descriptors").write_bytes(descriptors)
     _link(folder / "subsystem", root / "sys/bus/usb")
@@ -90,15 +85,9 @@ def add(root: Path, device: UsbDevice) -> Nodes:
     interface = folder / f"{name}:1.0"
     keys = ("Number", "Class", "SubClass", "Protocol")
     codes = (0, *device.interface_class)
-    _write(
-        interface,
-        {f"bInterface{key}": f"{code:02x}" for key, code in zip(keys, codes, strict=True)}
-        | {
-            "bAlternateSetting": "00",
-            "bNumEndpoints": f"{len(device.endpoints):02x}",
-            "uevent": "DEVTYPE=usb_interface",
-        },
-    )
+    shown = {f"bInterface{key}": f"{code:02x}" for key, code in zip(keys, codes, strict=True)}
+    shown |= {"bAlternateSetting": "00", "bNumEndpoints": f"{len(device.endpoints):02x}"}
+    _write(interface, {**shown, "uevent": "DEVTYPE=usb_interface"})
     _link(interface / "subsystem", root / "sys/bus/usb")
     _link(root / f"sys/bus/usb/devices/{name}:1.0", interface)
     hidraw = _add_hidraw(root, interface, device, number) if isinstance(device, HidDevice) else None
@@ -121,25 +110,18 @@ def _add_hidraw(root: Path, interface: Path, device: HidDevice, number: int) -> 
     minor = number - 1
     name = f"hidraw{minor}"
     hid = interface / f"0003:{device.vendor:04X}:{device.product:04X}.{number:04X}"
-    _write(
-        hid,
-        {
-            "uevent": f"DRIVER=hid-generic\nHID_ID=0003:{device.vendor:08X}:{device.product:08X}\n"
-            f"HID_NAME={device.manufacturer} {device.product_name}\n"
-            f"HID_PHYS=usb-0000:00:14.0-{number}/input0\nHID_UNIQ={device.serial}"
-        },
+    event = (
+        f"DRIVER=hid-generic\nHID_ID=0003:{device.vendor:08X}:{device.product:08X}\n"
+        f"HID_NAME={device.manufacturer} {device.product_name}\n"
+        f"HID_PHYS=usb-0000:00:14.0-{number}/input0\nHID_UNIQ={device.serial}"
     )
+    _write(hid, {"uevent": event})
     (hid / "report_descriptor").write_bytes(device.report_descriptor)
     _link(hid / "subsystem", root / "sys/bus/hid")
     _link(root / "sys/bus/hid/devices" / hid.name, hid)
     raw = hid / "hidraw" / name
-    _write(
-        raw,
-        {
-            "uevent": f"MAJOR={_HIDRAW_MAJOR}\nMINOR={minor}\nDEVNAME={name}",
-            "dev": f"{_HIDRAW_MAJOR}:{minor}",
-        },
-    )
+    event = f"MAJOR={_HIDRAW_MAJOR}\nMINOR={minor}\nDEVNAME={name}"
+    _write(raw, {"uevent": event, "dev": f"{_HIDRAW_MAJOR}:{minor}"})
     _link(raw / "subsystem", root / "sys/class/hidraw")
     _link(raw / "device", hid)
     _link(root / "sys/class/hidraw" / name, raw)

@@ -183,27 +183,14 @@ class UsbDevice:
     def device_descriptor(self) -> bytes:
         """Returns the 18 bytes by which a host knows the device."""
         texts = self._texts()
-        return struct.pack(
-            "<BBHBBBBHHHBBBB",
-            18,
-            _DEVICE,
-            0x0200,
-            0,
-            0,
-            0,
-            self.control_size,
-            self.vendor,
-            self.product,
-            self.release,
-            *(index if index in texts else 0 for index in (1, 2, 3)),
-            1,
-        )
+        ids = (self.vendor, self.product, self.release)
+        named = (index if index in texts else 0 for index in (1, 2, 3))
+        head = (18, _DEVICE, 0x0200, 0, 0, 0, self.control_size)
+        return struct.pack("<2BH4B3H4B", *head, *ids, *named, 1)
 
     def configuration_descriptor(self) -> bytes:
         """Returns configuration, interface and endpoint descriptors in one."""
-        interface = struct.pack(
-            "<BBBBBBBBB", 9, 4, 0, 0, len(self.endpoints), *self.interface_class, 0
-        )
+        interface = struct.pack("<9B", 9, 4, 0, 0, len(self.endpoints), *self.interface_class, 0)
         endpoints = b"".join(endpoint.descriptor() for endpoint in self.endpoints)
         body = interface + self.interface_extra() + endpoints
         # powered by the bus, 50 x 2 mA

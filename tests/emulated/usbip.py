@@ -14,7 +14,7 @@ import socket
 import struct
 from pathlib import Path
 
-from emulated.front_end import FrontEnd
+from emulated.emulator_process import FrontEnd
 from emulated.usb_device import TO_HOST, Setup, StallError, UsbDevice
 
 _CONTROLLER = Path("/sys/devices/platform/vhci_hcd.0")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
 from emulated.falcon_model import FalconModel
-from emulated.handle import Handle
+from emulated.handle import Handle, planar_hand
 from emulated.pid_layouts import ODD, USUAL
 from emulated.pid_model import PidStick
-from emulated.planar_hand import planar_hand
 from emulated.rawhid_model import Claims, RawHid
 
 from hapticbridge.device import SimulatedDevice
+from hapticbridge.device.discovery import plugged_devices
+from hapticbridge.device.driver import FoundDevice
 from hapticbridge.scene import load_scene
 
 MASS, DAMPING, FRICTION = 0.5, 5.0, 0.3
@@ -74,3 +79,25 @@ def free_stick(*, is_odd: bool = False) -> PidStick:
     """Returns a stick that nobody holds, without friction; ``is_odd``: of the other reports."""
     mechanics = SimulatedDevice(mass=MASS, damping=DAMPING, hand=None)
     return PidStick(mechanics, ODD if is_odd else USUAL, newtons=NEWTONS, travel=TRAVEL)
+
+
+Found = TypeVar("Found")
+
+
+def wait_for(look: Callable[[], Found], seconds: float = 10.0) -> Found:
+    """Looks every 10 ms until what is seen is true.
+
+    Raises:
+        TimeoutError: It is not within this time.
+    """
+    end = time.monotonic() + seconds
+    while not (found := look()):
+        if time.monotonic() > end:
+            raise TimeoutError(f"not within {seconds:g} s")
+        time.sleep(0.01)
+    return found
+
+
+def usable_devices() -> list[FoundDevice]:
+    """Lists what can be opened: the kernel tells of a device before its node is there."""
+    return [device for device in plugged_devices() if device.problem is None]

@@ -15,10 +15,11 @@ from emulated.echo import VENDOR, EchoHid, EchoUsb
 from emulated.emulator_process import EmulatorProcess
 
 from hapticbridge.device.transport.usb import libusb
+from usb_tiers.benches import wait_for
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import wait_for
 
 Echo = tuple[EmulatorProcess, Any]
+Record = Callable[[str, object], None]
 
 ROUND_TRIPS = 1000
 
@@ -53,7 +54,7 @@ def _hid(serial: str = "E2") -> Any:
     return wait_for(lambda: _opened(serial))
 
 
-def _measure(trip: Callable[[int], None], record: Callable[[str, object], None]) -> None:
+def _measure(trip: Callable[[int], None], record: Record) -> None:
     """Makes many round trips, and says how many there are in a second where time is real."""
     start = time.perf_counter()
     for i in range(ROUND_TRIPS):
@@ -62,9 +63,7 @@ def _measure(trip: Callable[[int], None], record: Callable[[str, object], None])
         record("round trips/s", round(ROUND_TRIPS / (time.perf_counter() - start)))
 
 
-def test_bulk_bytes_come_back_through_libusb(
-    echo: Echo, record_property: Callable[[str, object], None]
-) -> None:
+def test_bulk_bytes_come_back_through_libusb(echo: Echo, record_property: Record) -> None:
     _, device = echo
     assert device.serial_number == "E1"
     assert bytes(device.ctrl_transfer(0xC0, 7, 0x1234, 0, 2)) == b"\x34\x12"
@@ -97,9 +96,7 @@ def test_a_read_in_wait_ends_when_the_device_is_pulled_out(echo: Echo) -> None:
     wait_for(lambda: _found() is None)
 
 
-def test_reports_and_features_come_back_through_hidraw(
-    plug_hid: Plug, record_property: Callable[[str, object], None]
-) -> None:
+def test_reports_come_back_through_hidraw(plug_hid: Plug, record_property: Record) -> None:
     plug_hid(EchoHid)
     device = _hid()
     device.send_feature_report(b"\0feature!")

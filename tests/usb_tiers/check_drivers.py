@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from emulated.emulator_process import EmulatorProcess
 from emulated.falcon_model import Faults
 from emulated.spacemouse_model import SpaceMouse
+from emulated.usb_device import UsbDevice
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -18,23 +20,9 @@ from hapticbridge.device import Device
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.record import SAMPLE_DTYPE
-from usb_tiers.benches import (
-    DAMPING,
-    FALCON,
-    MASS,
-    NEWTONS,
-    PROGRAM,
-    STICK,
-    falcon,
-    free_falcon,
-    free_rawhid,
-    free_stick,
-    rawhid,
-    stick,
-    unloaded_falcon,
-)
+from usb_tiers import benches
+from usb_tiers.benches import usable_devices, wait_for
 from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
-from usb_tiers.waiting import usable_devices, wait_for
 
 PERIOD = 1e-3
 
@@ -67,8 +55,8 @@ def _held(device: Device, seconds: float, force: tuple[float, float, float]) -> 
 def _require_pushed(device: Device) -> None:
     """Pushes mass and damping along x by a constant force; asserts that they move, only there."""
     start = _held(device, 0.01, (0.0, 0.0, 0.0))
-    rate = DAMPING / MASS
-    expected = FORCE / DAMPING * (PUSHED - (1.0 - math.exp(-rate * PUSHED)) / rate)
+    rate = benches.DAMPING / benches.MASS
+    expected = FORCE / benches.DAMPING * (PUSHED - (1.0 - math.exp(-rate * PUSHED)) / rate)
     moved = _held(device, PUSHED, (FORCE, 0.0, 0.0)) - start
     if IS_TIME_VIRTUAL:
         # steps of encoders and motors, and some ms on the way
@@ -90,34 +78,29 @@ def _refuses_to_go_on(device: Device) -> str:
 
 
 def test_a_written_force_moves_a_falcon_as_its_mass_and_damping_say(plug_usb: Plug) -> None:
-    plug_usb(free_falcon)
-    device = _opened("falcon")
-    _require_pushed(device)
-    device.close()
+    plug_usb(benches.free_falcon)
+    with closing(_opened("falcon")) as device:
+        _require_pushed(device)
 
 
-def test_a_written_force_moves_a_home_made_device_likewise(plug_hid: Plug) -> None:
-    plug_hid(free_rawhid)
-    device = _opened("rawhid")
-    _require_pushed(device)
-    device.close()
+def test_a_written_force_moves_a_home_made_device_alike(plug_hid: Plug) -> None:
+    plug_hid(benches.free_rawhid)
+    with closing(_opened("rawhid")) as device:
+        _require_pushed(device)
 
 
 @pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
-def test_a_written_force_moves_a_force_feedback_stick_likewise(
-    plug_hid: Plug, is_odd: bool
-) -> None:
-    model = plug_hid(lambda: free_stick(is_odd=is_odd))
-    device = _opened(STICK)
-    _require_pushed(device)
-    assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * NEWTONS)
-    device.close()
+def test_a_written_force_moves_a_force_feedback_stick_alike(plug_hid: Plug, is_odd: bool) -> None:
+    model = plug_hid(lambda: benches.free_stick(is_odd=is_odd))
+    with closing(_opened(benches.STICK)) as device:
+        _require_pushed(device)
+        assert model.call("force") == pytest.approx((FORCE, 0.0), abs=2e-3 * benches.NEWTONS)
     assert model.call("force") == (0.0, 0.0)
 
 
 def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) -> None:
-    model = plug_hid(free_stick)
-    device = _opened(STICK)
+    model = plug_hid(benches.free_stick)
+    device = _opened(benches.STICK)
     _held(device, 0.05, (0.5, 0.0, 0.0))
     assert model.call("force") != (0.0, 0.0)
     life = max(effect.duration for effect in model.get("effects").values())
@@ -128,26 +111,26 @@ def test_a_stick_lets_go_of_a_host_that_says_nothing_any_more(plug_hid: Plug) ->
 
 
 def test_a_falcon_takes_its_program_and_then_speaks(plug_usb: Plug, tmp_path: Path) -> None:
-    model = plug_usb(unloaded_falcon)
+    model = plug_usb(benches.unloaded_falcon)
     file = tmp_path / "program.bin"
-    file.write_bytes(PROGRAM)
+    file.write_bytes(benches.PROGRAM)
     with pytest.raises(DeviceError, match="firmware"):
         _opened("falcon")
     device = _opened(f"falcon:firmware={file}")
     device.close()
-    assert model.get("uploaded") == PROGRAM
+    assert model.get("uploaded") == benches.PROGRAM
 
 
 def test_a_falcon_with_the_wrong_program_is_refused(plug_usb: Plug, tmp_path: Path) -> None:
-    plug_usb(unloaded_falcon)
+    plug_usb(benches.unloaded_falcon)
     file = tmp_path / "wrong.bin"
-    file.write_bytes(PROGRAM[::-1])
+    file.write_bytes(benches.PROGRAM[::-1])
     with pytest.raises(DeviceError, match="with its firmware"):
         _opened(f"falcon:firmware={file}")
 
 
 def test_garbage_between_a_falcons_packets_changes_no_pose(plug_usb: Plug) -> None:
-    model = plug_usb(free_falcon)
+    model = plug_usb(benches.free_falcon)
     device = _opened("falcon")
     clean = _held(device, 0.02, (0.0, 0.0, 0.0))
     model.set("faults", Faults(noise=b"\x00<AAAAAA>\xff<<"))
@@ -157,7 +140,7 @@ def test_garbage_between_a_falcons_packets_changes_no_pose(plug_usb: Plug) -> No
 
 
 def test_damaged_frames_of_a_home_made_device_change_no_pose(plug_hid: Plug) -> None:
-    model = plug_hid(free_rawhid)
+    model = plug_hid(benches.free_rawhid)
     device = _opened("rawhid")
     frames = model.get("frames")
     model.set("damage", set(range(frames, frames + 10_000, 2)))
@@ -168,7 +151,7 @@ def test_damaged_frames_of_a_home_made_device_change_no_pose(plug_hid: Plug) -> 
 
 
 def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
-    model = plug_usb(falcon)
+    model = plug_usb(benches.falcon)
     device = _opened("falcon")
     model.set("halted", {0x81})
     assert "halted" in _refuses_to_go_on(device)
@@ -176,7 +159,7 @@ def test_a_stalled_endpoint_ends_a_run_in_words(plug_usb: Plug) -> None:
 
 def test_two_home_made_devices_at_once_are_told_apart(plug_hid: Plug) -> None:
     for serial in ("left", "right"):
-        plug_hid(lambda serial=serial: free_rawhid(serial))  # type: ignore[misc]
+        plug_hid(lambda serial=serial: benches.free_rawhid(serial))  # type: ignore[misc]
     wait_for(lambda: len(usable_devices()) == 2)
     with pytest.raises(DeviceError, match=r"left.*right|right.*left"):
         hb.open_device("rawhid")
@@ -203,8 +186,14 @@ def _deflected(now: float) -> tuple[float, ...]:
     return (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path) -> None:
-    """Pulls a device out half a second after its run's start; no row may be lost before that."""
+def _pulled_out_of_a_run(
+    plug: Plug, make: Callable[[], UsbDevice], specification: str, folder: Path
+) -> None:
+    """Pulls a device out half a second after its run's start, and plugs it in again.
+
+    No row may be lost before that.
+    """
+    model, file = plug(make), folder / "run.mcap"
     wait_for(usable_devices)
     times: list[float] = []
 
@@ -227,33 +216,21 @@ def _pulled_out_of_a_run(model: EmulatorProcess, specification: str, file: Path)
     if IS_TIME_VIRTUAL:
         # times are those of the ticks' beginnings, one period before the next
         assert 0.5 - PERIOD <= times[-1] - times[0] <= 0.502
-
-
-def test_a_falcon_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_usb: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_usb(falcon), FALCON, tmp_path / "run.mcap")
     wait_for(lambda: not plugged_devices())
-    plug_usb(falcon)
-    again = _opened("falcon")
-    again.close()
+    plug(make)
+    _opened(specification).close()
 
 
-def test_a_home_made_device_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_hid: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_hid(rawhid), "rawhid", tmp_path / "run.mcap")
-    wait_for(lambda: not plugged_devices())
-    plug_hid(rawhid)
-    again = _opened("rawhid")
-    again.close()
+@pytest.mark.usefixtures("no_spin")
+def test_a_falcon_pulled_out_of_a_run_comes_back(plug_usb: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_usb, benches.falcon, benches.FALCON, tmp_path)
 
 
-def test_a_stick_pulled_out_of_a_run_loses_no_row_and_can_come_back(
-    plug_hid: Plug, tmp_path: Path, no_spin: None
-) -> None:
-    _pulled_out_of_a_run(plug_hid(stick), STICK, tmp_path / "run.mcap")
-    wait_for(lambda: not plugged_devices())
-    plug_hid(stick)
-    again = _opened(STICK)
-    again.close()
+@pytest.mark.usefixtures("no_spin")
+def test_a_home_made_device_pulled_out_of_a_run_comes_back(plug_hid: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_hid, benches.rawhid, "rawhid", tmp_path)
+
+
+@pytest.mark.usefixtures("no_spin")
+def test_a_stick_pulled_out_of_a_run_comes_back(plug_hid: Plug, tmp_path: Path) -> None:
+    _pulled_out_of_a_run(plug_hid, benches.stick, benches.STICK, tmp_path)

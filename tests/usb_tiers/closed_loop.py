@@ -15,8 +15,7 @@ from emulated.usbip import Usbip
 
 import hapticbridge.clock
 from hapticbridge.cli import main
-from usb_tiers.benches import FALCON, STICK, falcon, rawhid, stick
-from usb_tiers.waiting import usable_devices, wait_for
+from usb_tiers.benches import FALCON, STICK, falcon, rawhid, stick, usable_devices, wait_for
 
 DEVICES: dict[str, tuple[Callable[[], UsbDevice], str, tuple[str, ...]]] = {
     "falcon": (falcon, FALCON, ("peg_in_hole",)),

@@ -14,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from emulated.emulator_process import EmulatorProcess
-from emulated.front_end import FrontEnd
+from emulated.emulator_process import EmulatorProcess, FrontEnd
 from emulated.uhid import Uhid
 from emulated.umock import Umock
 from emulated.usb_device import UsbDevice
 from emulated.usbip import Usbip
 
-from usb_tiers.waiting import wait_for
+from usb_tiers.benches import wait_for
 
 TIER = os.environ.get("HAPTICBRIDGE_TIER", "")  # empty where pytest only passes by
 _FRONT_ENDS: dict[str, dict[str, Callable[[Any], FrontEnd]]] = {

@@ -18,9 +18,8 @@ from emulated.pid_model import PidStick
 
 import hapticbridge as hb
 from hapticbridge.device.discovery import plugged_devices
-from usb_tiers.benches import NEWTONS, STICK, free_stick
+from usb_tiers.benches import NEWTONS, STICK, free_stick, wait_for
 from usb_tiers.conftest import Plug
-from usb_tiers.waiting import wait_for
 
 _EV_FF, _FF_CONSTANT = 0x15, 0x52
 _GET_EFFECT_BITS, _UPLOAD, _ERASE = 0x80104535, 0x40304580, 0x40044581
@@ -65,21 +64,15 @@ def _event_node() -> Path | None:
 
 @pytest.mark.skipif("HAPTICBRIDGE_NO_PIDFF" in os.environ, reason=NO_PIDFF)
 @pytest.mark.parametrize("is_odd", [False, True], ids=["usual", "odd"])
-def test_the_kernels_driver_takes_the_stick_and_pushes_it_the_way_it_says(
-    plug_usb: Plug, is_odd: bool
-) -> None:
+def test_the_kernels_driver_pushes_the_way_it_says(plug_usb: Plug, is_odd: bool) -> None:
     model = plug_usb(lambda: free_stick(is_odd=is_odd))
     node = wait_for(_event_node)
     assert node is not None
     evdev = wait_for(lambda: _with_force(node))
     assert evdev is not None
     effect = -1
-    for direction, expected in (
-        (_DOWN, (0.0, 1.0)),
-        (_LEFT, (-1.0, 0.0)),
-        (_UP, (0.0, -1.0)),
-        (_RIGHT, (1.0, 0.0)),
-    ):
+    ways = {_DOWN: (0.0, 1.0), _LEFT: (-1.0, 0.0), _UP: (0.0, -1.0), _RIGHT: (1.0, 0.0)}
+    for direction, expected in ways.items():
         effect = evdev.upload(direction, _FULL // 2, effect)
         evdev.play(effect, 1)
         x, y = (0.5 * NEWTONS * share for share in expected)
@@ -105,9 +98,7 @@ def _wait_for_force(model: EmulatorProcess, x: float, y: float) -> None:
     wait_for(lambda: model.call("force") == pytest.approx((x, y), abs=0.05))
 
 
-def test_a_sticks_rate_is_that_of_two_reports_through_the_endpoint_that_the_kernel_shows(
-    plug_usb: Plug,
-) -> None:
+def test_a_sticks_rate_is_that_of_two_reports_through_its_endpoint(plug_usb: Plug) -> None:
     plug_usb(free_stick)
     wait_for(plugged_devices)
     device = hb.open_device(STICK)

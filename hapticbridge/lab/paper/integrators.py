@@ -503,7 +503,8 @@ def _swept(mass: float, delay: int) -> float:
     return float(np.max(top / np.abs(turned) ** 2))
 
 
-def _in_mujoco(mass: float, integrator: Integrator) -> float:
+def least_in_mujoco(mass: float, integrator: Integrator) -> float:
+    """Returns the least device damping in N s/m of a mass in kg behind MuJoCo's integrator."""
     loop = SampledLoop(MASS_COUPLING, PERIOD, mass=mass, integrator=integrator)
     frequency = loop.worst_frequency()
     response = complex(loop.response(frequency))
@@ -563,7 +564,7 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
                 )
             cell = f"{closed:.4f} / {in_time:.4f}" if np.isfinite(closed) else "unstable"
             if integrator != "explicit":
-                measured = _in_mujoco(mass, integrator)
+                measured = least_in_mujoco(mass, integrator)
                 checks.append(
                     Check(
                         equation="(19)",

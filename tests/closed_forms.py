@@ -1,0 +1,24 @@
+"""Motion in closed form, for every test that follows a mass behind a coupling."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.theory.rigid_body import exact_mass_response
+
+
+def swing_from_rest(
+    times: NDArray[np.floating[Any]], coupling: Coupling, mass: float, frequency: float = 2.0
+) -> NDArray[np.float64]:
+    """Returns a mass's path behind a handle that begins to swing as sin(2π f t)."""
+    omega = 2 * np.pi * frequency
+    steady = complex(exact_mass_response(coupling, mass, frequency))
+    roots = np.roots([mass, coupling.damping, coupling.stiffness])
+    at_start = [-steady.imag, -(1j * omega * steady).imag]
+    own = np.linalg.solve(np.vstack([np.ones(2), roots]), at_start)
+    swing = (steady * np.exp(1j * omega * times)).imag
+    return np.asarray(swing + (np.exp(np.outer(times, roots)) @ own).real)

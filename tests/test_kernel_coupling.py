@@ -1,0 +1,177 @@
+"""The coupling: its parameters, its law at the recorded poses, and that the scene obeys it."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import fields, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_runs import (
+    FREE_BALL,
+    Array,
+    Run,
+    T,
+    bind,
+    coupling_work,
+    fast,
+    live,
+    load,
+    mjcf,
+    run_of,
+    samples_of,
+    sines,
+    turns,
+    wrench_law,
+)
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.record import TICK_DTYPE
+
+MASS = 0.1
+STIFF = Coupling(2000.0, 2.0, 2.0, 2e-3)
+
+TILTED_BOX = mjcf("""
+    <body name="tool" pos="0.1 0.2 0.3" quat="0.8 0.6 0 0"><freejoint/>
+      <geom type="box" size="0.02 0.03 0.04" mass="0.2"/>
+      <site name="grip" pos="0.02 -0.01 0.03" quat="0.6 0 0.8 0"/>
+    </body>""")
+
+
+def _by_substep(scene: str, samples: np.ndarray, coupling: Coupling, substeps: int) -> Run:
+    """Steps a scene; returns a run with a row of poses per substep, and the records as ``sent``."""
+    loaded = load(scene)
+    binding, parameters = bind(loaded, coupling, substeps=substeps)
+    run = run_of(loaded, binding, parameters)
+    run.parameters = replace(parameters, period=T / substeps, substeps=1)
+    run.ticks = np.zeros(substeps * len(samples), TICK_DTYPE)
+    model, data = loaded.model, loaded.data
+    grip = model.site("grip").id
+    for k in range(len(run.ticks)):
+        tick, substep = divmod(k, substeps)
+        before_step(binding.state, samples[tick : tick + 1], binding.row, substep, T)
+        mujoco.mj_step(model, data)
+        after_step(binding.state, binding.row, substep)
+        row = run.ticks[k]
+        row["handle_position"], row["handle_quaternion"] = data.mocap_pos[0], data.mocap_quat[0]
+        row["tool_position"], row["tool_quaternion"] = data.site_xpos[grip], data.site_xquat[grip]
+        row["wrench_on_tool"] = binding.row["wrench_on_tool"][0]
+    return run
+
+
+@settings(max_examples=30)
+@given(
+    st.floats(10, 2e4),
+    st.floats(0, 10),
+    st.floats(0, 10),
+    st.floats(0, 0.01),
+    st.floats(0.1, 1.4),
+    st.sampled_from([1, 2, 5]),
+)
+def test_wrench_law_holds_for_any_coupling(
+    stiffness: float,
+    damping: float,
+    rotational_stiffness: float,
+    rotational_damping: float,
+    angle: float,
+    substeps: int,
+) -> None:
+    coupling = Coupling(stiffness, damping, rotational_stiffness, rotational_damping)
+    turning = Rotation.from_rotvec(sines(60, angle, 4.0))
+    samples = samples_of(sines(60, 0.01, 10.0), turning)
+    run = _by_substep(TILTED_BOX, samples, coupling, substeps)
+    laws = wrench_law(run)
+    mean = laws.reshape(60, substeps, 6).mean(axis=1)
+    sent = run.ticks["wrench_on_tool"][substeps - 1 :: substeps]
+    assert sent == pytest.approx(mean, rel=1e-9, abs=1e-10)
+    run.ticks["wrench_on_tool"] = laws
+    assert run.ledger.coupling_work == pytest.approx(coupling_work(run).sum(), rel=1e-8, abs=1e-13)
+
+
+def test_mujoco_applies_the_recorded_force_also_where_the_handle_is_turned() -> None:
+    """Newton's law is the witness: m (v_k − v_{k−1})/T is what the step really applied."""
+    angle = np.minimum(np.arange(2000) / 500, 1.0)  # to 1 rad, and held
+    turning = Rotation.from_rotvec(angle[:, None] * np.array([[0.0, 0.0, 1.0]]))
+    samples = samples_of(sines(2000, 0.02, 3.0), turning)
+    run = fast(FREE_BALL, samples, STIFF)
+    speeds = run.tool_steps() / T
+    applied = MASS * np.diff(speeds, axis=0, prepend=np.zeros((1, 3))) / T
+    # positions to 1e-17 m, differenced twice over T = 1 ms, times 0.1 kg
+    assert run.ticks["wrench_on_tool"][:, :3] == pytest.approx(applied, abs=1e-11)
+
+
+def test_applied_torque_is_the_recorded_one_to_first_order_in_the_period() -> None:
+    inertia = 0.4 * MASS * 0.015**2
+
+    def mismatch(period: float) -> float:
+        count = round(0.5 / period)
+        turning = Rotation.from_rotvec(sines(count, 0.5, 2.0, period))
+        speeds: list[Array] = []
+        run = live(
+            FREE_BALL,
+            samples_of(np.zeros((count, 3)), turning),
+            period=period,
+            after_tick=lambda _k, data: speeds.append(
+                Rotation.from_quat(data.qpos[3:7], scalar_first=True).apply(data.qvel[3:6])
+            ),
+        )
+        change = np.diff(np.array(speeds), axis=0, prepend=np.zeros((1, 3)))
+        torque = run.ticks["wrench_on_tool"][:, 3:]
+        return float(np.abs(inertia * change / period - torque).max() / np.abs(torque).max())
+
+    coarse, fine = mismatch(1e-3), mismatch(0.25e-3)
+    assert coarse < 0.01
+    assert fine < coarse / 2
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_timestep_is_the_period_over_the_substeps(substeps: int) -> None:
+    run = live(FREE_BALL, samples_of(sines(10)), substeps=substeps)
+    assert run.scene.model.opt.timestep == T / substeps
+    assert run.scene.data.time == pytest.approx(10 * T, rel=1e-12)
+
+
+def test_handle_moves_uniformly_over_the_substeps_and_arrives_in_the_last() -> None:
+    scene = load(FREE_BALL)
+    binding, parameters = bind(scene, substeps=4)
+    run = run_of(scene, binding, parameters)
+    turn = Rotation.from_rotvec([[0.0, 0.4, 0.0]])
+    samples = samples_of(np.array([[0.004, 0.0, 0.0]]), turn)
+    positions, quaternions = [run.handle_start[:3]], [run.handle_start[3:]]
+    for substep in range(4):
+        before_step(binding.state, samples, binding.row, substep, T)
+        positions.append(scene.data.mocap_pos[0].copy())
+        quaternions.append(scene.data.mocap_quat[0].copy())
+    steps = np.diff(positions, axis=0)
+    assert steps == pytest.approx(np.tile([0.001, 0.0, 0.0], (4, 1)), abs=1e-15)
+    vectors = turns(np.array(quaternions[1:]), np.array(quaternions[0]))
+    assert vectors == pytest.approx(np.tile([0.0, 0.1, 0.0], (4, 1)), abs=1e-15)
+
+
+def test_a_turning_free_tool_is_strict_under_substeps() -> None:
+    turning = Rotation.from_rotvec(sines(1500, 1.0, 1.0))
+    run = fast(FREE_BALL, samples_of(sines(1500), turning), substeps=4)
+    assert run.ledger.environment == "strict"
+
+
+GAINS = [field.name for field in fields(Coupling)]
+NO_GAIN: tuple[Any, ...] = (float("nan"), float("inf"), -1.0, "1", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [*itertools.product(GAINS, NO_GAIN), ("stiffness", 0.0)]
+)
+def test_invalid_gains_are_refused_by_name_and_only_the_stiffness_must_not_be_zero(
+    name: str, value: Any
+) -> None:
+    values = dict.fromkeys(GAINS, 0.0) | {"stiffness": 1.0}
+    Coupling(**values)
+    with pytest.raises(CouplingError, match=f"coupling {name} is"):
+        Coupling(**{**values, name: value})

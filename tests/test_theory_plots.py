@@ -1,0 +1,71 @@
+"""What the pictures of the theory show, and the table of alternatives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.plotting import ENDINGS, check_ending, new_figure, write_picture
+from hapticbridge.theory.z_width import z_width
+from hapticbridge.theory_plots import alternatives, draw_z_width
+
+T = 1e-3
+
+
+@given(st.floats(1, 1e5), st.floats(1e-3, 50))
+@settings(max_examples=30)
+def test_alternatives_follow_their_closed_forms(stiffness: float, damping: float) -> None:
+    lossless, compensated, asked, half, low_pass, tustin, wall, anywhere, line = alternatives(
+        Coupling(stiffness, damping, 0, 0), T, 2 * T
+    )
+    a = stiffness * T / 2
+    assert asked.needed == pytest.approx(a + damping, rel=1e-12)
+    assert half.needed == pytest.approx(a / 2 + damping, rel=1e-12)
+    assert low_pass.needed == pytest.approx(a + damping / 5, rel=1e-12)
+    assert tustin.needed == np.inf
+    assert anywhere.needed == np.inf
+    assert line.needed == pytest.approx(2 * a, rel=1e-12)
+    assert compensated.needed == pytest.approx(max(damping - a, a), rel=1e-12)
+    assert lossless.needed == pytest.approx(max(damping, a), rel=1e-12)
+    if a < 2 * damping:
+        assert wall.needed == pytest.approx(a + a**2 / (2 * damping) + damping, rel=1e-9)
+    else:
+        assert wall.needed == pytest.approx(3 * a - damping, rel=1e-9)
+
+
+def test_each_spectrum_reaches_what_its_alternative_needs() -> None:
+    for way in alternatives(Coupling(2000, 1, 0, 0), T, T):
+        if way.spectrum is None:
+            assert way.frequency is None
+            continue
+        frequency, needed = way.spectrum
+        assert needed.max() == pytest.approx(way.needed, rel=1e-3)
+        if way.frequency is not None:
+            nearest = frequency[np.nanargmax(needed)]
+            assert nearest == pytest.approx(way.frequency, rel=2e-2)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_picture_is_written_in_the_format_that_it_is_named_after(
+    ending: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"picture{ending}"
+    write_picture(draw_z_width(z_width(2, T)), path)
+    first = {".pdf": b"%PDF", ".png": b"\x89PNG", ".svg": b"<?xml"}[ending]
+    assert path.read_bytes().startswith(first)
+
+
+def test_picture_that_cannot_be_written_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    figure = new_figure(4, 3)
+    with pytest.raises(HapticBridgeError, match=r"must end in \.pdf"):
+        check_ending(Path("x.jpeg"))
+    with pytest.raises(HapticBridgeError, match="must end in"):
+        write_picture(figure, tmp_path / "x")
+    with pytest.raises(HapticBridgeError, match=r"write '.*x\.png': its folder does not exist"):
+        write_picture(figure, tmp_path / "no" / "x.png")
