@@ -150,11 +150,10 @@ def decide(
     Returns:
         The fields of ``AuditReport`` that hold the verdict and its reason.
     """
-    if energies is None:
-        fault = fault or Fault("the recording holds no tick")
-    elif energies.is_passive(strict=strict):
-        fault = fault or gap
+    if fault is None and energies is not None and energies.is_passive(strict=strict):
+        fault = gap
     if fault is not None or energies is None:
+        fault = fault or Fault("the recording holds no tick")
         return {
             "verdict": "invalid",
             "environment": None,

@@ -182,11 +182,11 @@ def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any
         if field.name not in first:
             changed.append((field.name, Annotated[hints[field.name], tyro.conf.Suppress], field))
             continue
-        has_quiet_default = field.default in (None, -math.inf, math.inf)
-        help_argument = tyro.conf.arg(
-            help=descriptions[field.name],
-            **({"help_behavior_hint": ""} if has_quiet_default else {}),
-        )
+        text = descriptions[field.name]
+        if field.default in (None, -math.inf, math.inf):
+            help_argument = tyro.conf.arg(help=text, help_behavior_hint="")
+        else:
+            help_argument = tyro.conf.arg(help=text)
         changed.append((field.name, Annotated[hints[field.name], help_argument], field))
     count = sum(field.name not in first for field in fields(command))
     return make_dataclass(command.__name__, changed, bases=(command,), frozen=True), count
