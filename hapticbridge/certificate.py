@@ -17,7 +17,7 @@ from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
 
-# Additional device damping required by the device's own update rate and delay.
+# Additional device damping required by the device's own update rate and delay
 
 _WHOLE = 1e-9
 """Excess over a whole number of ticks that counts as rounding, in ticks."""
@@ -92,7 +92,7 @@ def required_damping(
     moves by an n-th of its step for each, and the mean wrench is sent. There is no closed form; b
     is the smallest value for which
 
-        Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s ‖δx_i‖²_{K + nB/T} >= 0,
+        Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s (K + nB/T) ‖δx_i‖² >= 0,
         f_i = K e_i + (nB/T) δe_i,   e = h − x
 
     for every motion. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one

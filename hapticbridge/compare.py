@@ -18,7 +18,7 @@ from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, colu
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.run_description import meta_float
 
-# Result of a comparison.
+# Result of a comparison
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.timeline import Timeline, due_times
 from hapticbridge.run_description import meta_float
 
-# Interface of table writers.
+# Interface of table writers
 
 
 class Sink(Protocol):

@@ -12,7 +12,7 @@ from typing import Any
 
 from hapticbridge.errors import HapticBridgeError
 
-# Import of optional packages.
+# Import of optional packages
 
 
 def import_extra(

@@ -20,7 +20,7 @@ from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.record import SAMPLE_DTYPE
 
-# Limits of the wrench and of the run.
+# Limits of the wrench and of the run
 
 LONGEST_RAMP = 60.0
 """Longest ramp in s. A larger number is taken for a mistake in the unit."""

@@ -52,7 +52,7 @@ from hapticbridge.rendering import (
 )
 from hapticbridge.scene import Scene
 
-# Options of a user.
+# Options of a user
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,7 +28,7 @@ from hapticbridge.recording import Attachment
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.scene import Scene
 
-# Start of a run: MuJoCo's state, compiled model, and energies.
+# Start of a run: MuJoCo's state, compiled model, and energies
 
 STATE_ATTACHMENT = "start_state.f64"
 

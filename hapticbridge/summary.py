@@ -21,7 +21,7 @@ from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method
 from hapticbridge.theory.compensation import IMPLICIT_SHARE, effective_damping
 
-# Sentences on the effective coupling and its law.
+# Sentences on the effective coupling and its law
 
 
 def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
@@ -89,7 +89,7 @@ def _sentence(name: str, adds: float | None, step: float, substeps: int, gains: 
     spring, damper, stiffness, damping, spring_unit, damper_unit = gains
     start = f"{spring} = {stiffness:.4g} {spring_unit}, {damper} ="
     if adds is None:
-        return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as asked)"
+        return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as requested)"
     effective = effective_damping(stiffness, damping, step, adds)
     parts = substeps / adds
     added = ("KT" if spring == "K" else f"{spring} T") + (f"/{parts:g}" if parts != 1 else "")
@@ -109,8 +109,8 @@ class Ledger:
     """Energies of a run in J; all but the storage are cumulative since its start.
 
     E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
-    energy than it received while Σ E_k <= 0 (BC97 (14)). The device stays safe while Σ E_k stays
-    below the slack, Σ ½‖δx_k‖²_{K+B/T} and its rotational counterpart.
+    energy than it received while Σ E_k <= 0, eq. (14) of Brown & Colgate (1997). The device stays
+    safe while Σ E_k stays below the slack, Σ ½ (K + B/T) ‖δx_k‖² and its rotational counterpart.
 
     Attributes:
         kinetic: Present kinetic energy.

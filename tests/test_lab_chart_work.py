@@ -50,7 +50,7 @@ def test_boxes_at_rest_sleep_where_they_may_and_only_there() -> None:
 @pytest.mark.parametrize("build", [work.floating, work.plate, work.mesh_ball, work.resting])
 def test_scene_of_nothing_or_of_too_much_is_refused(build: object) -> None:
     for number in (-1, 10**9):
-        with pytest.raises(StudyError, match=r"a scene of .* is asked for"):
+        with pytest.raises(StudyError, match=r"the scene has .* parts; it must have 1 to"):
             build(number)  # type: ignore[operator]
 
 

@@ -89,7 +89,7 @@ class EnergyBalance:
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
-        slack: Σ ½‖δx‖²_{K+B/T} + ½‖δφ‖²_{K_r+B_r/T}, (n,) in J.
+        slack: Σ ½ (K + B/T) ‖δx‖² + ½ (K_r + B_r/T) ‖δφ‖², (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation and the energy
             released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
             per tick. With a coupling law, energy created by the environment is not included; it

@@ -36,7 +36,7 @@ from hapticbridge.run_description import (
     versions,
 )
 
-# Attached scene.
+# Attached scene
 
 FOREIGN_TOLERANCE = 1e-9
 """Allowed difference on another processor, relative to a field's largest value; other vector

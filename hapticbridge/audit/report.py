@@ -18,7 +18,7 @@ class AuditReport:
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``.
-        environment: ``strict`` (BC97 (14) held), ``within slack`` or ``active``; None if invalid.
+        environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
         certified: True if the recorded device bears the coupling; None if its damping is unknown or
             its motion is prescribed.
         reason: The verdict in a sentence.

@@ -36,7 +36,7 @@ from hapticbridge.rendering import Method
 from hapticbridge.summary import coupling_sentences, was_never_lossless
 from hapticbridge.units import format_energy
 
-# End of a run.
+# End of a run
 
 
 def unusual_end(events: Sequence[Mapping[str, Any]]) -> str:
@@ -85,7 +85,7 @@ class PassivityTally:
         slack_share: Largest share of the slack that was used.
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
-        excess: First tick in which the device received unpaid energy, and that energy.
+        excess: First tick in which the device received excess energy, and that energy.
     """
 
     is_watched: bool
@@ -94,6 +94,11 @@ class PassivityTally:
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
+
+    def is_passive(self, *, strict: bool) -> bool:
+        """Returns True if neither port gave out too much; ``strict`` allows no slack."""
+        is_within_slack = self.active is None and not strict
+        return self.excess is None and (self.unstrict is None or is_within_slack)
 
     def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
         """Adds at least one record with its balance."""
@@ -127,17 +132,22 @@ def _first(
 # Decision
 
 
-def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool) -> dict[str, Any]:
+def decide(
+    fault: Fault | None, energies: PassivityTally | None, *, gap: Fault | None, strict: bool
+) -> dict[str, Any]:
     """Decides between ``passive``, ``active`` and ``invalid``.
 
     Args:
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
+        gap: Missing check without which a recording is not called passive, or None.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
 
     Returns:
         The fields of ``AuditReport`` that hold the verdict and its reason.
     """
+    if fault is None and energies is not None and energies.is_passive(strict=strict):
+        fault = gap
     if fault is not None or energies is None:
         fault = fault or Fault("the recording holds no tick")
         return {
@@ -154,8 +164,8 @@ def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool
         return {
             "verdict": "active",
             "environment": "within slack" if unstrict else "strict",
-            "reason": f"from tick {tick} the device is given {joules:.3g} J more than its damping "
-            "burns and scene and coupling give up",
+            "reason": f"from tick {tick} the device received {format_energy(joules)} more than its "
+            "damping dissipated and scene and coupling released",
             "tick": tick,
             "port": "device",
             "joules": joules,
@@ -184,7 +194,7 @@ def decide(fault: Fault | None, energies: PassivityTally | None, *, strict: bool
     return {
         "verdict": "active",
         "environment": "active" if active else "within slack",
-        "reason": f"from tick {tick} the environment exceeds {limit} by {joules:.3g} J",
+        "reason": f"from tick {tick} the environment exceeds {limit} by {format_energy(joules)}",
         "tick": tick,
         "port": "environment",
         "joules": joules,
@@ -229,9 +239,10 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             fault = _replay_fault(outcome)
     except RecordingError as error:
         fault = Fault(str(error))
-    found = decide(fault, energies, strict=strict)
-    if found["verdict"] == "passive" and facts["unchecked"] and not outcome.has_run:
-        found = decide(Fault(outcome.agreement), None, strict=strict)
+    # without a simulation again, some methods leave a wrench that no other computation covers
+    is_checked = outcome.has_run or not facts.get("unchecked")
+    gap = None if is_checked else Fault(outcome.agreement)
+    found = decide(fault, energies, gap=gap, strict=strict)
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY

@@ -24,7 +24,7 @@ from hapticbridge.recording import read_recording
 from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
-# Motion for a check: the scene's own hand path, a file of poses, or a recording.
+# Motion for a check: the scene's own hand path, a file of poses, or a recording
 
 RECORDING = ".mcap"
 

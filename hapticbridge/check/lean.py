@@ -30,7 +30,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.scene import SceneSource
 
-# Judgement of one version of a scene.
+# Judgement of one version of a scene
 
 MIN_SAVING = 0.05
 """Share of the cost that a simplification must save, without unit. On a busy machine a scene
@@ -255,7 +255,7 @@ def find_lean(
 
 
 def all_simplifications(original: SceneVariant, motion: Motion) -> list[Simplification]:
-    """Returns the simplifications that leave a scene's motion as it is, the largest first."""
+    """Returns the simplifications that are worth trying on a scene under a motion."""
     seen = witness(original, motion)
     return [
         *contact_simplifications(seen),

@@ -28,7 +28,7 @@ from hapticbridge.scene.contacts import (
     impedance_at,
 )
 
-# Faults of joint limits, equality constraints and dry friction.
+# Faults of joint limits, equality constraints and dry friction
 
 CREEP_LOAD = 0.5
 """Load as a share of the dry friction at which creep is judged, without unit. Creep grows with the

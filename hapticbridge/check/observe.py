@@ -24,7 +24,7 @@ from hapticbridge.rendering import default_method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
 
-# Clearance of the tool between opposite walls.
+# Clearance of the tool between opposite walls
 
 FARTHEST = 2e-3
 """Distance in m beyond which two geoms do not form a clearance. Fits are tenths of it; anything

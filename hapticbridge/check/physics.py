@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.scene.contacts import impedance_at
 
-# Poses and rotations as NumPy arrays, by MuJoCo's functions.
+# Poses and rotations as NumPy arrays, by MuJoCo's functions
 
 Array = NDArray[np.float64]
 

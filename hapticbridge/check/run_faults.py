@@ -17,7 +17,7 @@ from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
 
-# Faults of a scene's options that the bridge overrides.
+# Faults of a scene's options that the bridge overrides
 
 _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 

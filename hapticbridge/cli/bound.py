@@ -25,8 +25,8 @@ from hapticbridge.theory_plots import Alternative, alternatives, draw_alternativ
 class Bound:
     """Compute the device damping that a coupling needs.
 
-    Alternative laws are listed beside it. K and B are what is felt: the default method uses B' = B
-    - KT/2 of it, 0 at least. Exit code 1 if --device-damping is given and does not suffice.
+    Alternative laws are listed beside it. K and B are those at the hand; the law of the default
+    method uses B' = B - KT/2, at least 0. Exit code 1 if --device-damping does not suffice.
 
     Example:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
@@ -35,7 +35,7 @@ class Bound:
     stiffness: float
     """Coupling stiffness K in N/m."""
     damping: float = 0.0
-    """Coupling damping B in N s/m that is to be felt."""
+    """Coupling damping B in N s/m at the hand."""
     rate: float = DEFAULT_RATE
     """Ticks per second."""
     filter_time: float | None = None

@@ -93,7 +93,7 @@ class Chart:
         return 0
 
     def _peers(self) -> list[str]:
-        """Returns the engines that are asked for and installed; says which are not."""
+        """Returns the requested engines that are installed; prints which are not."""
         if self.engines == (ALL,):
             found = available_engines()
             for reason in dict.fromkeys(found.missing.values()):

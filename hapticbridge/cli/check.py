@@ -333,7 +333,7 @@ class Check:
     stiffness: float | None = None
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the simulated device."""
     damping: float | None = None
-    """Coupling damping B in N s/m that is to be felt."""
+    """Coupling damping B in N s/m at the hand."""
     scale: float = 1.0
     """Handle motion per device motion."""
     workspace: float = LARGEST_WORKSPACE

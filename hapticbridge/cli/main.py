@@ -143,7 +143,7 @@ def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
 
     import tyro  # noqa: PLC0415
 
-    description = inspect.getdoc(command) or ""
+    description = _reflowed(inspect.getdoc(command) or "")
     if {"-h", "--help", "--help-all"} & set(words):
         is_whole = "--help-all" in words
         command, hidden = _with_first_options(command, is_whole=is_whole)
@@ -175,17 +175,57 @@ def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any
 
     import tyro  # noqa: PLC0415
 
-    hints = get_type_hints(command, include_extras=True)
+    hints, descriptions = get_type_hints(command, include_extras=True), _descriptions(command)
     first = hints if is_whole else getattr(command, "FIRST_OPTIONS", hints)
     changed: list[tuple[str, Any, Any]] = []
     for field in fields(command):
         if field.name not in first:
             changed.append((field.name, Annotated[hints[field.name], tyro.conf.Suppress], field))
-        elif field.default in (None, -math.inf, math.inf):
-            quiet = tyro.conf.arg(help_behavior_hint="")
-            changed.append((field.name, Annotated[hints[field.name], quiet], field))
+            continue
+        text = descriptions[field.name]
+        if field.default in (None, -math.inf, math.inf):
+            help_argument = tyro.conf.arg(help=text, help_behavior_hint="")
+        else:
+            help_argument = tyro.conf.arg(help=text)
+        changed.append((field.name, Annotated[hints[field.name], help_argument], field))
     count = sum(field.name not in first for field in fields(command))
     return make_dataclass(command.__name__, changed, bases=(command,), frozen=True), count
+
+
+def _descriptions(command: type[Any]) -> dict[str, str]:
+    """Returns the text below each option of a command's class, without its line breaks."""
+    import ast  # noqa: PLC0415 - for a command's help alone
+    import inspect  # noqa: PLC0415
+    from itertools import pairwise  # noqa: PLC0415
+
+    (body,) = ast.parse(inspect.getsource(command)).body
+    assert isinstance(body, ast.ClassDef)
+    return {
+        option.target.id: " ".join(ast.literal_eval(text.value).split())
+        for option, text in pairwise(body.body)
+        if isinstance(option, ast.AnnAssign)
+        and isinstance(option.target, ast.Name)
+        and isinstance(text, ast.Expr)
+    }
+
+
+def _reflowed(text: str) -> str:
+    """Wraps the paragraphs below the summary at 80 columns; an example keeps its lines.
+
+    They are indented, because tyro joins lines that begin with a letter and wraps no description.
+    Before an indented line it adds a line break of its own.
+    """
+    import textwrap  # noqa: PLC0415 - for a command's help alone
+
+    summary, *paragraphs = text.split("\n\n")
+    for paragraph in paragraphs:
+        if "\n " in paragraph:
+            summary += f"\n\n{paragraph}"
+        else:
+            summary += "\n" + textwrap.indent(
+                textwrap.fill(paragraph, 78, break_on_hyphens=False), "  "
+            )
+    return summary
 
 
 def _print_version() -> int:

@@ -56,7 +56,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         err.print(f"  {sentence}")
     if not method.has_law:
         err.print(
-            f"  asked for: K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
+            f"  requested: K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
             f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
             f"B_r = {coupling.rotational_damping:g} N m s/rad"
         )
@@ -66,7 +66,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     elif method != usual:
         err.print(
             f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and {substeps} "
-            "are asked for"
+            "are requested"
         )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
@@ -76,7 +76,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         and math.isclose(attainable.rotational_damping, coupling.rotational_damping)
     ):
         err.print(
-            f"[yellow]warning:[/yellow] asked for B = {coupling.damping:g} N s/m, B_r = "
+            f"[yellow]warning:[/yellow] requested B = {coupling.damping:g} N s/m, B_r = "
             f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
             "at this stiffness and rate; lower the stiffness or raise the rate"
         )
@@ -116,7 +116,7 @@ def _true_weld(effective: Coupling, requested: Coupling) -> str:
     wanted = ", ".join(f"{value:.4g}" for value in astuple(requested))
     return (
         f"the weld is {k:.4g} N/m, {b:.4g} N s/m, {kr:.4g} N m/rad, {br:.4g} N m s/rad in its "
-        f"stiffest directions at the start; asked for: {wanted}"
+        f"stiffest directions at the start; requested: {wanted}"
     )
 
 
@@ -205,50 +205,48 @@ class Run:
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")
     ] = ()
-    """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3. What there is, with
-    unit and range: 'hapticbridge scenes NAME'."""
+    """Set a parameter of the scene, as in --set clearance=0.1e-3. 'hapticbridge scenes NAME' lists
+    the parameters with units and ranges."""
     grip: str = "grip"
     """Site on the tool that the hand holds."""
     device: str = "simulated"
-    """'simulated' (in the hand that the scene asks for), 'simulated:damping=5,hand_mass=1',
-    'trajectory:FILE' (CSV or recording), or one that 'hapticbridge devices' lists."""
+    """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
+    (CSV or recording), or a device from the list of 'hapticbridge devices'."""
     duration: float | None = None
-    """Seconds to run, by the clock: a deadline that was missed is time that has passed, and makes
-    the ticks one less. By default until the device's motion ends, however long its samples take, or
-    until Ctrl-C."""
+    """Duration in s; missed deadlines count, so that each makes the ticks one less. By default the
+    run ends with the device's motion, or with Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
     method: str | None = None
-    """Rendering method: 'lossless' (half of the coupling inside MuJoCo's implicit step, half
-    carried over: second order away from contact; the default), 'implicit' (all of it inside the
-    step, which adds K T to the damping that is felt; the default with substeps, which 'lossless'
-    does not take), 'compensated' (the same, with that K T taken off the coupling's damping), or a
-    method that exists to be compared, such as 'explicit', 'weld' or 'direct' (a tool without mass);
-    an unknown name lists them."""
+    """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
+    carried over; second order away from contact. 'implicit', the default with substeps: all of the
+    coupling inside the step, which adds K T to the damping. 'compensated': 'implicit' with the
+    added K T subtracted from the coupling's damping. Or a method that exists to be compared, such
+    as 'explicit', 'weld' or 'direct' (a tool without mass); an unknown name lists them."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
-    """Accept a method that may kick on a real device; the first three need no such word."""
+    """Accept a method that may kick on a real device; the first three never need it."""
     rate: float = 1000.0
     """Ticks per second."""
     substeps: int = 1
     """MuJoCo steps per tick; with more than one the mean of their wrenches is sent."""
     realtime: bool = False
-    """Ask the system for real time while the loop runs, and say what it refuses and how to grant it
-    ('hapticbridge doctor' tells more); with a real device that is always asked for."""
+    """Request real-time priority and locked memory for the loop, and print what the system refuses
+    (see 'hapticbridge doctor'). Always done with a real device."""
     fast: bool = False
-    """Simulated time: as fast as it goes, and the same in every run."""
+    """Run in simulated time: as fast as possible, with equal results in every run."""
     stiffness: float | None = None
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
     damping: float | None = None
-    """Coupling damping B in N s/m that is to be felt; of it 'lossless' uses B' = B - KT/2 and
-    'compensated' B - KT, 0 at least, and the device needs KT/2 + B'. The others use it as it is."""
+    """Coupling damping B in N s/m at the hand. Damping of the law: B' = B - KT/2 with 'lossless',
+    B - KT with 'compensated', at least 0; B with all others. The device needs b >= KT/2 + B'."""
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None
-    """Rotational coupling damping in N m s/rad that is to be felt."""
+    """Rotational coupling damping in N m s/rad at the hand."""
     scale: float = 1.0
     """Handle motion per device motion."""
     force_scale: float | None = None
@@ -269,29 +267,28 @@ class Run:
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
     port: int | None = None
-    """Port on this machine to serve the view on, by default 8080; 0: any that is free. Only the
-    printed address gets in. From another machine: ssh -L 8080:localhost:8080 MACHINE, then open
-    the printed address there."""
+    """Port of the view on this machine, by default 8080; 0 takes any free port. Only the printed
+    address opens it. From another machine: ssh -L 8080:localhost:8080 MACHINE."""
     controller: Literal["damper", "environment", "off"] | None = None
-    """Passivity controller: what is done when the device was given more than its damping burns and
-    the scene gives up, or, 'environment', when the scene created more than the coupling's slack; by
-    default 'damper' where the device condition does not hold, else 'environment'."""
+    """Passivity controller. 'damper' acts when the device has received more energy than it
+    dissipated and the scene released, 'environment' when the scene has created more than the
+    coupling's slack. By default 'environment', or 'damper' if the device condition fails."""
     clutch: int | None = None
     """Button of the device, from 0: while it is held the device moves without the handle."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
     mark: int | None = None
-    """Button of the device, from 0: each press of it writes an event 'mark' into the recording;
-    'hapticbridge export --from S --to S' cuts there."""
+    """Button of the device, from 0: each press writes an event 'mark' into the recording.
+    'hapticbridge export --from S --to S' cuts a recording."""
     stretch_limit: float = USUAL_STRETCH
     """Largest distance between handle and tool in m; beyond it the run is stopped."""
     reach_limit: float | None = None
-    """Farthest in m that the device may be from the middle of its workspace; beyond it moves
-    without the handle and without force. By default what its driver or profile knows, all of the
-    workspace, else none (inf). To keep force off its stops, choose less."""
+    """Largest distance in m of the device from the middle of its workspace; beyond it the device
+    moves without handle and force. By default the reach of its data sheet, else inf. A smaller
+    limit keeps force away from its mechanical stops."""
     energy_limit: float = USUAL_ENERGY
-    """Most energy in J that the device may be given beyond what the hand put in; inf for scenes
-    whose motors are meant to push the hand."""
+    """Largest energy in J given to the device beyond the hand's own work; beyond it the run is
+    stopped. inf for scenes whose motors are meant to push the hand."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the summary as JSON."""
 

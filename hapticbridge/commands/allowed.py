@@ -19,7 +19,7 @@ from hapticbridge.errors import CommandError, CouplingError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import Method
 
-# Largest stiffness and damping that a device tolerates, for translation or rotation.
+# Largest stiffness and damping that a device tolerates, for translation or rotation
 
 SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no

@@ -21,7 +21,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.rendering import Method
 from hapticbridge.run_description import restore_state
 
-# Events of commands: recorded, and repeated by a re-simulation.
+# Events of commands: recorded, and repeated by a re-simulation
 
 CHANGES = ("coupling", "switch", "reset")
 """Names of the events that commands cause."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
 
-# Data sheet of a haptic device.
+# Data sheet of a haptic device
 
 
 def checked_number(name: str, value: object, unit: str, *, is_positive: bool = False) -> float:

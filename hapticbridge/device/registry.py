@@ -18,7 +18,7 @@ from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.scene import Scene
 
-# Table of the hardware drivers. A driver is imported when one of its devices is opened.
+# Table of the hardware drivers; a driver is imported when one of its devices is opened
 
 DRIVERS = {
     "falcon": "hapticbridge.device.falcon.device",

@@ -27,7 +27,7 @@ from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE
 
-# Products of the SpaceMouse family.
+# Products of the SpaceMouse family
 
 _LOGITECH = {
     0xC603: "SpaceMouse Plus XT",
@@ -318,8 +318,8 @@ DRIVER = Driver(
     about="3Dconnexion SpaceMouse and earlier models: input only, its rate moves the handle",
     ids=IDS,
     transport="hid",
-    axes="6, by rate",
-    force="none; shown, not felt",
+    axes="6; deflection sets velocity",
+    force="none (input only)",
     rate="about 125 Hz",
     options={"serial": str, "log": str, **dict.fromkeys(_NUMBERS, float)},
     open=open_spacemouse,

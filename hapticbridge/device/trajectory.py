@@ -34,7 +34,7 @@ from hapticbridge.pose import (
 )
 from hapticbridge.record import SAMPLE_DTYPE
 
-# Prescribed motion: poses over time, interpolated within a tick.
+# Prescribed motion: poses over time, interpolated within a tick
 
 TIME_AND_POSITION = ("t", "x", "y", "z")
 ORIENTATION = ("qw", "qx", "qy", "qz")

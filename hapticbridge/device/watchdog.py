@@ -8,7 +8,7 @@ import subprocess
 import sys
 from typing import IO, cast
 
-# Guardian process that writes a zero-force report if the bridge process dies.
+# Guardian process that writes a zero-force report if the bridge process dies
 
 _CHILD = """
 import os, select, signal, sys, time

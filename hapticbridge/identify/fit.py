@@ -13,7 +13,7 @@ from scipy.stats import t as student
 from hapticbridge.errors import IdentificationError
 from hapticbridge.identify.excitation import stretch
 
-# Least squares with jackknife intervals.
+# Least squares with jackknife intervals
 
 CONFIDENCE = 0.95
 """Probability, without unit, that the true value lies within the interval."""

@@ -34,7 +34,7 @@ from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
 from hapticbridge.jit import direct
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Short, safe run that moves one axis of a device and records it.
+# Short, safe run that moves one axis of a device and records it
 
 RUNAWAY = 3.0
 """Multiple of the allowed travel at which a run is aborted, without unit. Such a device does not

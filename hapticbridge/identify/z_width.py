@@ -24,7 +24,7 @@ from hapticbridge.identify.excitation import CALMING, CENTRING
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.theory.z_width import WITHOUT_HAND, ZWidth
 
-# Decay of a device's swing on a virtual wall.
+# Decay of a device's swing on a virtual wall
 
 NOISE_STEPS = 2.0
 """Amplitude in steps of resolution below which a swing has decayed."""

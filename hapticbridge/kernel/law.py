@@ -66,7 +66,7 @@ GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
 time step in s."""
 
 SLACK_SHARE = 0.5
-"""Share of ½‖δx_i‖²_{K + nB/T} that counts as slack with n > 1 evaluations of the law per tick; no
+"""Share of ½ (K + nB/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick; no
 unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
 environment counts as active sooner."""
 
@@ -113,11 +113,14 @@ def no_gains(_coupling: Coupling, _timestep: float) -> tuple[Gains, Gains]:
 def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
 
-    g = K + B/T with one evaluation of the law per tick, and half of K/n + B/T with n > 1. Zero
-    without a coupling law (a weld, a tool without mass), because the proof of a slack needs
-    one. With n > 1, a slack of ½‖δx_i‖²_{K + nB/T} per evaluation would need infinite device
-    damping at B = 0; half of it does not (``certificate.required_damping``). The records hold
-    the sum of the motions δx_i alone, and uniform motion gives the least slack for a sum.
+    δx_k and δφ_k are the tool's motion in tick k, in m and rad. Without a coupling law (a weld, a
+    tool without mass) both gains are 0, because the proof of a slack needs a law. With one
+    evaluation of the law per tick g = K + B/T.
+
+    With n > 1 evaluations g = ½ (K/n + B/T). The whole slack ½ (K + nB/T) ‖δx_i‖² of each
+    evaluation i would require infinite device damping at B = 0; half of it does not
+    (``certificate.required_damping``). A record holds only δx_k, the sum of all δx_i. For a given
+    sum the slack is least if all δx_i are equal, so that g bounds it from below.
     """
     if not parameters.has_law:
         return 0.0, 0.0

@@ -4,7 +4,8 @@
 
 S is the energy that the scene stores, f and τ the coupling's wrench on the tool, δx and δφ the
 tool's motion in tick k; energies and works in J, wrenches in N and N m, motions in m and rad.
-Σ E_k <= 0 means that the simulation created no energy, BC97 (14).
+Σ E_k <= 0 means that the simulation created no energy. It is eq. (14) of Brown & Colgate (1997),
+in short (14).
 """
 
 from __future__ import annotations

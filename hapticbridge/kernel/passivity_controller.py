@@ -154,8 +154,9 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     the credit, so that long dissipation cannot hide a short active phase.
 
     Also updated, each in J:
-        ``generated_energy``: Σ E_k − slack of the environment's port; A_max caps its credit.
-        ``excess_device_energy``: as the function computes it; motors of the scene pay for none.
+        ``generated_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
+        ``excess_device_energy``: result of the function of that name. Work of the scene's motors
+        does not reduce it.
         ``stored_while_force_off``: energy that the scene took up while the force was off by
         command and still stores. No hand supplied it (``cap_dissipation``).
 

@@ -2,7 +2,7 @@
 
 After a start or a re-anchoring, the guard lets only a share r of the wrench through, and r grows
 from tick to tick. A coupling that is stretched meanwhile grows with r. From the identity behind
-BC97 (6), with the wrench r_k f_k in the place of f_k, the device receives
+eq. (6) of Brown & Colgate (1997), with the wrench r_k f_k in the place of f_k, the device receives
 
     W = Σ (r_k − r_{k−1}) V(e_k),    V(e) = ∫ min(K e, F) de
 

@@ -70,7 +70,7 @@ _COMPARED = (
         about="an equality constraint of MuJoCo welds the tool to the handle, under "
         "implicitfast, with K and B as its solref; how stiff it truly is depends on the tool's "
         "mass and on the constraint's impedance",
-        hazard="the weld's stiffness is not the one asked for but mass times K/(1 - impedance) "
+        hazard="the weld's stiffness is not the requested K but mass times K/(1 - impedance) "
         "as measured, and no coupling law proves what the device needs",
         scheme=Scheme.WELD,
         integrator="implicitfast",

@@ -31,7 +31,7 @@ from hapticbridge.realtime import (
 )
 from hapticbridge.realtime.realtime import CAPABILITIES, LASTING, SHELL
 
-# Baseline of a C program, ``cyclictest``.
+# Baseline of a C program, ``cyclictest``
 
 INSTALL = "sudo apt install rt-tests"
 _LONGEST_US = 50_000

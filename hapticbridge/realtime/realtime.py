@@ -28,7 +28,7 @@ from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.rendering import Method
 from hapticbridge.scene import Scene
 
-# Time stolen by the host of a virtual machine.
+# Time stolen by the host of a virtual machine
 
 _STOLEN = 8
 """Column of the line ``cpu`` in ``/proc/stat``; column 0 is the line's name."""

@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.errors import RecordingError
 
-# Random access to a file's bytes.
+# Random access to a file's bytes
 
 WINDOW = 1 << 20
 """Bytes per read of a long stretch. A larger window takes more memory, a smaller one more calls."""

@@ -18,7 +18,7 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
 
-# Metadata, attachments, events and ticks of a container.
+# Metadata, attachments, events and ticks of a container
 
 _HEAD_DTYPE = np.dtype(
     [
@@ -391,4 +391,4 @@ def _split(
         if not left:
             rest = [run[head[-1].size :], *runs[index + 1 :]]
             return _join(head, record), [each for each in rest if each.size]
-    raise AssertionError("fewer records than asked for")
+    raise AssertionError("fewer records than requested")

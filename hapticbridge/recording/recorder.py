@@ -31,7 +31,7 @@ from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.writer import RecordingWriter, check_contents
 
-# Second reader of a run.
+# Second reader of a run
 
 
 class RingObserver(Protocol):

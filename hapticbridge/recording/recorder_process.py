@@ -32,7 +32,7 @@ from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
 
-# Live status line of a run.
+# Live status line of a run
 
 REDRAW = 0.125
 """Time in s between two drawings on a terminal."""

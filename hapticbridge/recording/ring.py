@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 
-# Shared memory of a ring.
+# Shared memory of a ring
 
 if sys.platform != "win32":
     import fcntl

@@ -23,7 +23,7 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 
-# Chunk index on disk.
+# Chunk index on disk
 
 
 class ChunkIndexFile:

@@ -166,7 +166,8 @@ class Evidence:
         time: Due time of each tick in s on the clock of the events, (n,).
         created: Energy that the environment has created so far, (n,) in J.
         allowed: Slack: energy that the environment may have created so far, (n,) in J.
-        excess: Unpaid energy given to the device so far, (n,) in J; zeros if it cannot be computed
+        excess: Energy given to the device beyond its dissipation and what scene and coupling
+            released, so far, (n,) in J; zeros if it cannot be computed
             (``EnergyBalance.excess_device_energy``).
         model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
     """

@@ -37,7 +37,7 @@ from hapticbridge.report.plots import (
 from hapticbridge.run_description import meta_float
 from hapticbridge.units import format_si
 
-# Self-contained HTML pages.
+# Self-contained HTML pages
 
 PAGES = (".html", ".htm")
 """Allowed extensions of a page; browsers show others as text."""

@@ -12,7 +12,7 @@ from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.scene.source import SourceFile, read_elements
 
-# Requirements of the rendering methods for comparison on a scene.
+# Requirements of the rendering methods for comparison on a scene
 
 AXES_TOLERANCE = 1e-9
 """Largest deviation from orthogonality of the joint axes of a planar tool, without unit. It admits

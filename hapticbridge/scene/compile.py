@@ -10,7 +10,7 @@ import mujoco
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene.source import SourceFile
 
-# Custom texts and numbers of a scene (``<custom>`` in MJCF), by name.
+# Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
 
 
 def custom_text(model: mujoco.MjModel, name: str) -> str:

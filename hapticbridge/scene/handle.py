@@ -20,7 +20,7 @@ from hapticbridge.errors import SceneError, choices
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.scene.compile import go_to_start
 
-# Weld between grip and handle (MuJoCo's equality constraint).
+# Weld between grip and handle (MuJoCo's equality constraint)
 
 IMPEDANCE = 0.95
 """Impedance d of the weld, without unit, equal at every displacement (MuJoCo's default reaches 0.95

@@ -19,7 +19,7 @@ from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
 
-# Shipped scenes, by name.
+# Shipped scenes, by name
 
 
 @cache

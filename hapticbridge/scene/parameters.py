@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticbridge.errors import SceneError, choices
 
-# Parameter file of a scene.
+# Parameter file of a scene
 
 KINDS = {
     "body": "bodies",

@@ -22,7 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.transfer import checked, delayed_by, plain, scalar, single, together
 
-# Stiffness limits from position resolution and Coulomb friction.
+# Stiffness limits from position resolution and Coulomb friction
 
 Region = Literal["passive", "locally stable", "bounded limit cycle", "unstable"]
 """Regions of (β, σ) after Diolaiti et al. 2006."""

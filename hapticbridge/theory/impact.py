@@ -13,7 +13,7 @@ from hapticbridge.arguments import Array, shown
 from hapticbridge.errors import MechanicsError
 from hapticbridge.theory.rigid_body import CHECK
 
-# Normal velocity of an impact over its normal impulse.
+# Normal velocity of an impact over its normal impulse
 
 
 @dataclass(frozen=True, slots=True)

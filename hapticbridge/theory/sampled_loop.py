@@ -26,7 +26,7 @@ from hapticbridge.theory.transfer import (
 )
 from hapticbridge.theory.virtual_mass import Integrator, force_delay
 
-# Compiled time-domain run of a sampled loop.
+# Compiled time-domain run of a sampled loop
 
 KICK = 1e-3
 """First displacement of the handle in m. The loop is linear, so it only scales the motion."""

@@ -13,7 +13,7 @@ from hapticbridge.arguments import LARGEST, SMALLEST, Arguments, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 
-# Arrays of couplings, and argument checks shared by all bounds.
+# Arrays of couplings, and argument checks shared by all bounds
 
 Axis = Literal["translation", "rotation"]
 """Kind of axis; it selects the pair of K and B."""

@@ -17,7 +17,7 @@ from hapticbridge.theory.device_limits import free_device_damping, free_device_s
 from hapticbridge.theory.spectrum import wall_supremum
 from hapticbridge.theory.transfer import delayed_by, scalar, whole
 
-# Line of passivity in the plane of K and B.
+# Line of passivity in the plane of K and B
 
 SECANTS, SETTLED = 60, 1e-13
 """Largest number of secant steps towards the line against a wall, and relative step in K at which

@@ -26,7 +26,7 @@ from hapticbridge.run_description import SOURCE_PREFIX, compiled_model, paramete
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.whatif.settings import Settings
 
-# Exact inversion of a floating-point function.
+# Exact inversion of a floating-point function
 
 NEIGHBOURS = 8
 """Number of doubles tried on either side of a guess. A product and a sum are off by two at most;

@@ -31,7 +31,7 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.settings import GAINS, Settings
 
-# Recorded motion as a device, and recorded times as a clock.
+# Recorded motion as a device, and recorded times as a clock
 
 _STALE = int(TickFlag.STALE_SAMPLE)
 

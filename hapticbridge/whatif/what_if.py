@@ -33,7 +33,7 @@ from hapticbridge.whatif.replayed_hand import (
 )
 from hapticbridge.whatif.settings import UNITS, Settings, Value
 
-# Result of a what-if.
+# Result of a what-if
 
 RECORDED, PRESCRIBED, CLOSED = "recorded", "prescribed", "closed loop"
 """Names of the runs: the recorded one; the recorded motion, and a model hand, through the changed

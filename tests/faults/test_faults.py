@@ -60,17 +60,17 @@ def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path:
     if fault.ends == "trip":
         assert outcome.error.startswith("SafetyTrip")
         assert outcome.events[-2:] == ["trip", "stop"]
-    elif fault.ends in ("fades", "re-seats", "goes on"):
+    elif fault.ends in ("fades", "re-anchors", "goes on"):
         assert not outcome.error
         assert outcome.has_flag(TickFlag.REANCHORED) == (fault.ends != "goes on")
-    if fault.ends == "re-seats":
+    if fault.ends == "re-anchors":
         assert at_cause(outcome) < 0.1 * LIMIT
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.without], ids=ids)
 def test_without_its_guard_the_fault_does_harm(fault: Fault, tmp_path: Path) -> None:
     outcome = fault.run(tmp_path, is_guarded=False)
-    if fault.ends == "re-seats":
+    if fault.ends == "re-anchors":
         assert at_cause(outcome) > 0.5 * LIMIT
     elif "turn" in fault.name:
         torques = outcome.torques

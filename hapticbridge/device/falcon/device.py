@@ -65,7 +65,7 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.jit import direct
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Measured timing of a Falcon.
+# Measured timing of a Falcon
 
 UNDER_WAY = 2
 """Number of requests kept on their way while the rate is measured, so that one waits when a reply

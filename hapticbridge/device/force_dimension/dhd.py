@@ -25,7 +25,7 @@ from hapticbridge.device.base import TIMING, USUAL_TORQUE_LIMIT, usual_delay
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical
 
-# Device types of Force Dimension's library.
+# Device types of Force Dimension's library
 
 ROTATION_ERROR = 1e-3
 """Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to

@@ -42,7 +42,7 @@ from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Measured timing of the service.
+# Measured timing of the service
 
 UNDER_WAY = 2
 """Number of messages kept on their way while the rate is measured, as in the loop."""

@@ -49,7 +49,7 @@ from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Constant-force effects of a stick.
+# Constant-force effects of a stick
 
 ANGLES = (270.0, 180.0)
 """Origins of the forces of the x and y effect in degrees clockwise from north, as the standard
@@ -605,7 +605,7 @@ DRIVER = Driver(
     ids=(),
     transport="hid",
     axes="2",
-    force="a share of full scale, which newtons= states",
+    force="percent of a maximum in N, which newtons= sets",
     rate="125 Hz to 1 kHz, one axis at a time",
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
     options={

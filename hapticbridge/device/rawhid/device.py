@@ -46,7 +46,7 @@ from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
-# Data sheet of a raw HID device.
+# Data sheet of a raw HID device
 
 ASKS, ASK_WAIT_MS = 10, 100
 """Number of requests for a page of the sheet, and wait for each answer in ms. A booting device has

@@ -38,7 +38,7 @@ from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.scene import custom_numbers
 from hapticbridge.theory.sampled_loop import WorstHand
 
-# Hand of a scene.
+# Hand of a scene
 
 SCENE_HAND = "simulated_hand"
 """Name of the custom numbers in a scene's file."""

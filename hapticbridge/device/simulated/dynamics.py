@@ -25,7 +25,7 @@ from hapticbridge.pose import (
     vector_of,
 )
 
-# Exact motion of one axis of a device in a hand.
+# Exact motion of one axis of a device in a hand
 
 Record: TypeAlias = Any
 """Structured scalar inside compiled code, where fields are attributes. NumPy's type has none."""

@@ -17,7 +17,7 @@ from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost
 
-# Connected HID devices, from hidapi and the kernel.
+# Connected HID devices, from hidapi and the kernel
 
 NO_NODE = (
     "the kernel gives it no hidraw node; load its driver (for 046d: 'sudo modprobe hid_logitech') "

@@ -24,7 +24,7 @@ from hapticbridge.device.driver import Driver, FoundDevice, access_problem, perm
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
-# Devices on the USB bus, from sysfs.
+# Devices on the USB bus, from sysfs
 
 BUS = Path("/sys/bus/usb/devices")
 """Folder in which Linux lists USB devices; absent without USB and on other systems."""

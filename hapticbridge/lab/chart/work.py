@@ -285,7 +285,7 @@ def _box(x: float, y: float) -> str:
 
 def _check(count: int, most: int) -> None:
     if not 1 <= count <= most:
-        raise StudyError(f"a scene of {count} is asked for; it must be 1 to {most}")
+        raise StudyError(f"the scene has {count} parts; it must have 1 to {most}")
 
 
 ROUNDS = 3

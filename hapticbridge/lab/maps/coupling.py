@@ -197,7 +197,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     figure.suptitle(
         f"K against B, device damping b = {DEVICE_DAMPING:g} N s/m at {1 / PERIOD:g} Hz;\n"
         f"worst hands on a wall and with a tool of {1e3 * TOOL_MASS:g} g, and a hand that taps.\n"
-        "B is asked for; the law uses B′ = B, or less where a title says so (0 at least)",
+        "B is requested; the law uses B′ = B, or less where a title says so (0 at least)",
         fontsize="medium",
     )
     base.verdict_legend(
@@ -326,7 +326,7 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             selected | {"name": name},
         )
     yield (
-        "B is the damping asked for; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "
+        "B is the requested damping; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "
         "least, and (6) holds for what is used",
         {},
     )

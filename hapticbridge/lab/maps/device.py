@@ -325,7 +325,7 @@ def _draw_regions(axes: Axes, cells: Table) -> None:
 
 
 def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
-    axes.set(xlabel="coupling damping B asked for (N s/m)", ylabel="friction needed, f_c/(K Δ)")
+    axes.set(xlabel="requested coupling damping B (N s/m)", ylabel="friction needed, f_c/(K Δ)")
     axes.set_title(f"with a damper, b = {DAMPED:g} N s/m", fontsize="medium")
     if not found:
         base.say_missing(axes)

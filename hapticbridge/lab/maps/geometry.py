@@ -273,7 +273,7 @@ def draw(table: Table, _boundary: Mapping[str, Any]) -> Figure:
     figure.suptitle(
         f"A peg that fills its hole, handle midway, b_θ = {1e3 * DEVICE_DAMPING:g} mN m s/rad "
         f"at {1 / PERIOD:g} Hz, worst hand in rotation;\nbehind the coupling B_r = "
-        f"{1e3 * ROTATIONAL_DAMPING:g} mN m s/rad is asked for, and the law uses B_r′ (0 at least)",
+        f"{1e3 * ROTATIONAL_DAMPING:g} mN m s/rad is requested, and the law uses B_r′ (0 at least)",
         fontsize="medium",
     )
     base.verdict_legend(

@@ -271,7 +271,7 @@ def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
     figure.suptitle(
         f"Largest stable K on a wall: behind the coupling is a tool of {1e-3 * WALL_MASS:g} t, "
         f"device damping b = {DEVICE_DAMPING:g} N s/m\n"
-        f"above: even ticks, B = {DAMPING:g} N s/m asked for, the law uses B′ (0 at least);\n"
+        f"above: even ticks, B = {DAMPING:g} N s/m requested, the law uses B′ (0 at least);\n"
         "circles: measured with the worst hand",
         fontsize="medium",
     )
