@@ -15,29 +15,27 @@ from numpy.typing import NDArray
 
 
 class TickFlag(IntFlag):
-    """Bits of the record's ``flags``.
+    """Bits of the record's ``flags``; 8 is in recordings of earlier versions only.
 
     Attributes:
         OVERRUN: The tick started a period or more after its deadline; deadlines were skipped.
         DROPPED_BEFORE: Records before this one were lost because the ring was full.
         FORCE_LIMITED: Force or torque was scaled down to its limit.
-        SLEW_LIMITED: The change of the wrench was cut to the slew limit.
-        RAMPING: The wrench is rising after the start or after a re-anchoring of the coupling.
+        RAMPING: The device gets less than the whole wrench, and the handle follows it in part.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had no new sample since the previous tick.
         TRIP: The guard stopped the run in this tick and sent zero wrench. A tick that is not finite
             is not recorded; the event ``trip`` names it.
-        REANCHORED: The coupling was re-anchored before this tick: the handle was set to the tool at
-            the device's present pose, and the wrench rises from zero again.
+        REANCHORED: The handle slipped, or followed the device in part: its pose belongs to the
+            device's present pose from this tick on.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
     """
 
     OVERRUN = 1
     DROPPED_BEFORE = 2
     FORCE_LIMITED = 4
-    SLEW_LIMITED = 8
     RAMPING = 16
     CONTROLLER_ACTIVE = 32
     CONTACT = 64

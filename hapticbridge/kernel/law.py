@@ -236,22 +236,6 @@ def _spring_energy(stiffness: float, length: float, limit: float) -> float:
 
 
 @compiled
-def releasable_energy(s: State) -> float:
-    """Returns r V(e) + r V(φ) in J, the energy that the springs can release to the device.
-
-    r = force_scale / scale; V is limited by the largest force and torque on the device.
-    """
-    pose, run = s.pose, s.run
-    ratio = run.force_scale / run.scale
-    stretch = norm(subtract(vector_of(pose.handle_position), vector_of(pose.tool_position)))
-    tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
-    twist = norm(rotation_between(tool, handle))
-    linear = _spring_energy(s.coupling.stiffness, stretch, run.force_limit / run.force_scale)
-    angular = _spring_energy(s.coupling.rotational_stiffness, twist, run.torque_limit / ratio)
-    return float(ratio * (linear + angular))
-
-
-@compiled
 def set_gains(s: State, share: float) -> None:
     """Gives the coupling's actuators a share of their gains."""
     mj = s.mj

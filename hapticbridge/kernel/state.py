@@ -36,7 +36,6 @@ from hapticbridge.kernel.law import (
     Gains,
     bind_coupling,
     implicit_gains,
-    releasable_energy,
     set_tuning_goal,
 )
 from hapticbridge.kernel.ledger import (
@@ -51,7 +50,6 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
-    cap_dissipation,
     observe_reset,
 )
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
@@ -160,7 +158,7 @@ class BoundKernel:
 
     @property
     def external_flags(self) -> NDArray[np.int64]:
-        """Flags ``STALE_SAMPLE`` and ``REANCHORED`` of the next tick; the loop fills this view."""
+        """Flag ``STALE_SAMPLE`` of the next tick; the loop fills this view."""
         return cast(NDArray[np.int64], self.state["loop"]["external_flags"])
 
     @property
@@ -182,12 +180,10 @@ class BoundKernel:
             gains: Gains of its actuators (``rendering.Method.gains``).
             ticks: Length of the change in ticks, >= 1.
         """
-        cap_dissipation(self._record)
         set_tuning_goal(self._record["coupling"], parameters, gains, ticks)
 
     def command(self, bits: int) -> None:
         """Sets the commands in force from the next tick on, ``FORCE_OFF`` and ``CLUTCHED``."""
-        cap_dissipation(self._record)
         set_commanded(self._record["guard"], bits)
 
     def handle_reset(self) -> None:
@@ -282,7 +278,6 @@ class BoundKernel:
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
             direct(restart_lossless, s)
-        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

@@ -72,7 +72,7 @@ _GUARD = {
     "max_rotational_damping": "N m s/rad",
     "stale_ticks": "ticks",
     "fade_ticks": "ticks",
-    "longest_stall": "s",
+    "has_hand": "",
     "stretch": "m",
     "angle": "rad",
     "speed": "m/s",
