@@ -249,7 +249,9 @@ class Attack:
             scheme=method.scheme,
             device_damping=b,
             device_rotational_damping=b_r,
-            guarding=GuardParameters(clutch=1, fade_ticks=max(round(0.02 / period), 1)),
+            guarding=GuardParameters(
+                clutch=1, fade_ticks=max(round(0.02 / period), 1), has_hand=True
+            ),
         )
         kernel = BoundKernel(scene.model, scene.data, parameters)
         hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.wrench_limits import wrench_deviations
 from hapticbridge.coupling import Coupling
+from hapticbridge.guard import Limits
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
@@ -130,7 +132,9 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
         return (x, 0, 0, 1, 0, 0, 0)
 
     path = tmp_path / "wall.mcap"
-    recorded(path, scene, ScriptedDevice(press), coupling, duration=0.3)
+    device = ScriptedDevice(press, strength=100.0)
+    limits = Limits(force=100.0, torque=5.0, ramp=0.05, energy=math.inf)
+    recorded(path, scene, device, coupling, duration=0.3, limits=limits)
     report = audit(path)
     assert (report.verdict, report.exit_code) == ("active", 1)
     assert report.tick is not None and 100 < report.tick < 140

@@ -38,6 +38,12 @@ _NOT_NEGATIVE = (
 )
 
 
+EARLIER_VERSION = (
+    "recorded by an earlier version of hapticbridge, whose force limits acted on the device alone; "
+    "this version cannot judge it, but 'hapticbridge export' reads it"
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
@@ -139,10 +145,7 @@ class GuardParameters:
             values = {}
         names = {field.name for field in fields(cls)}
         if "controller" in values and "hold_force" not in values:
-            raise HapticBridgeError(
-                "recorded by an earlier version of hapticbridge, whose force limits acted on the "
-                "device alone; this version cannot judge it, but 'hapticbridge export' reads it"
-            )
+            raise HapticBridgeError(EARLIER_VERSION)
         if values.keys() != names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}

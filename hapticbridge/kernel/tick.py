@@ -178,7 +178,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
-    if s.run.has_law and s.loop.tick > s.guard.start_tick:
+    if s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick:
         charge_lateness(s, interval)
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
