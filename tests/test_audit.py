@@ -128,7 +128,8 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     coupling = Coupling(2e4, 0.5, 2.4, 5e-4)
 
     def press(tick: int) -> tuple[float, ...]:
-        x = 0.0115 * min(tick / 100, 1) + 1e-3 * np.sin(2 * np.pi * 0.02 * tick)
+        since = max(tick - 60, 0)  # the force has risen
+        x = 0.0115 * min(since / 100, 1) + 1e-3 * np.sin(2 * np.pi * 0.02 * since)
         return (x, 0, 0, 1, 0, 0, 0)
 
     path = tmp_path / "wall.mcap"
@@ -137,7 +138,7 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     recorded(path, scene, device, coupling, duration=0.3, limits=limits)
     report = audit(path)
     assert (report.verdict, report.exit_code) == ("active", 1)
-    assert report.tick is not None and 100 < report.tick < 140
+    assert report.tick is not None and 160 < report.tick < 200
     assert read_recording(path).ticks["contacts"][report.tick - 10 : report.tick].any()
 
 
