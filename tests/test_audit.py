@@ -133,7 +133,7 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
         return (x, 0, 0, 1, 0, 0, 0)
 
     path = tmp_path / "wall.mcap"
-    device = ScriptedDevice(press, strength=100.0)
+    device = ScriptedDevice(press, strength=100.0, damping=20.0)
     limits = Limits(force=100.0, torque=5.0, ramp=0.05, energy=math.inf)
     recorded(path, scene, device, coupling, duration=0.3, limits=limits)
     report = audit(path)
