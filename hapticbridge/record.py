@@ -82,8 +82,8 @@ after the step. Positions are in m, quaternions (w, x, y, z) with w >= 0, energi
 works in J. Wrenches (force in N, torque in N m) are in the world frame about the grip
 (``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
-of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of the
-wrench that was sent, and of the device's motion to the next sample that the handle makes."""
+of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
+the wrench that was sent, and of the device's motion to the next sample that the handle makes."""
 
 LATER_FIELDS = ("share",)
 """Fields that recordings of earlier versions lack; such a recording is read without them.

@@ -60,7 +60,7 @@ class GuardParameters:
         stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
         fade_ticks: Ticks in which the wrench fades to zero.
         has_hand: True if a hand holds the device. The handle then does not follow what the device
-            did before a start, when no force was on it.
+            did before a start, when no force was on it, and slips for late samples.
         clutch: Mask of buttons; while one is held, the device moves without the handle.
         dead_man: Mask of buttons of which one must be held; 0 for none.
         speed: Speed of the device in m/s above which the run is stopped.
