@@ -40,6 +40,9 @@ SCENES = (
 HEAVY = ("point_mass",)
 """Scenes whose tool gets a random mass."""
 
+UNPAID = 1e-6
+"""Largest energy in J that a hand may have beyond what it put in; rounding leaves less."""
+
 HANDS = 5
 CHUNK = 50
 """Ticks between two decisions of the hand about buttons and coupling."""
