@@ -108,22 +108,20 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
     def by(method: Method) -> Alternative:
         used = method.law_coupling(requested, period)
         shown = RunCoupling.of(method, period, requested).effective or used
-        name = f"method {method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
+        name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
     methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B
-    anywhere = Alternative(
-        "law as requested, one tick late, any environment", float("inf"), None, None
-    )
+    anywhere = Alternative("B_law = B, one tick late, any scene", float("inf"), None, None)
     return (
         *methods,
-        way("law as requested, at half the period", step=period / 2),
-        way(f"law as requested, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
-        way("law as requested, Tustin's damper", scheme="tustin"),
-        way("law as requested, one tick late, against a wall", delay=1),
+        way("B_law = B at half the period", step=period / 2),
+        way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
+        way("B_law = B, Tustin's damper", scheme="tustin"),
+        way("B_law = B, one tick late, against a wall", delay=1),
         anywhere,
         Alternative(
             "transmission line of that stiffness", float(line.max()), None, (frequency, line)
