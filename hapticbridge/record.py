@@ -11,7 +11,7 @@ from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 class TickFlag(IntFlag):
@@ -91,6 +91,20 @@ LATER_FIELDS = ("share",)
 A new field needs an entry here, in ``TICK_DTYPE`` and in ``UNITS``, a line in ``kernel.tick`` that
 writes it, and a check in the audit.
 """
+
+
+def force_on_hand(ticks: NDArray[np.void], axes: ArrayLike) -> NDArray[np.float64]:
+    """Returns the force of the device on the hand in the scene's frame, (n, 3) in N.
+
+    It is ``wrench_on_device``, what the motors were sent, and opposite to the force on the tool
+    times ``force_scale`` and the recorded share.
+
+    Args:
+        ticks: Records, ``TICK_DTYPE``, (n,).
+        axes: Row-major rotation from the device's frame to the scene's, 9 numbers.
+    """
+    rotation = np.asarray(axes, dtype=np.float64).reshape(3, 3)
+    return np.asarray(ticks["wrench_on_device"][:, :3] @ rotation.T)
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> NDArray[np.bool_]:

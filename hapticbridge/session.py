@@ -286,6 +286,7 @@ class Session:
             self.setup.scene,
             self.parameters,
             self.kernel.bound,
+            requested=self.setup.coupling,
             method=self.setup.method.name,
             device=self.device.info,
             clock=self.clock.name,

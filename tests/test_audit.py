@@ -178,7 +178,11 @@ def test_certificate_is_the_device_condition_with_what_is_used(
     report = audit(path)
     assert report.verdict == "passive"
     assert report.certified is certified
-    assert "B' = 0.5" in report.coupling_sentences[0]
+    assert "law 0.5" in report.coupling_sentences[0]
+    assert report.coupling is not None
+    assert report.coupling.requested == felt
+    assert report.coupling.law is not None
+    assert report.coupling.law.damping == pytest.approx(0.5)
     assert report.exit_code == (0 if certified else 1)
     assert any("<" in sentence for sentence in report.conditions) is not certified
 

@@ -304,10 +304,11 @@ def test_record_holds_the_tick_the_sample_and_the_pose_after_the_step() -> None:
     assert (run.ticks["tool_quaternion"][:, 0] >= 0).all()
     assert (run.ticks["tool_position"][-1] == run.scene.data.qpos[:3]).all()
     loop = run.binding.state["loop"]
-    force = np.linalg.norm(run.ticks["wrench_on_tool"][:, :3], axis=1)
-    torque = np.linalg.norm(run.ticks["wrench_on_tool"][:, 3:], axis=1)
-    assert loop["peak_force"][0] == pytest.approx(force.max(), rel=1e-15)
-    assert loop["peak_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
+    for port, wrench in (("peak", "wrench_on_device"), ("peak_tool", "wrench_on_tool")):
+        force = np.linalg.norm(run.ticks[wrench][:, :3], axis=1)
+        torque = np.linalg.norm(run.ticks[wrench][:, 3:], axis=1)
+        assert loop[f"{port}_force"][0] == pytest.approx(force.max(), rel=1e-15)
+        assert loop[f"{port}_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
 
 
 def test_publish_writes_one_record_and_refuses_a_full_ring() -> None:

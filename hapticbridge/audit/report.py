@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from hapticbridge.files import finite_or_null
+from hapticbridge.rendering import RunCoupling
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +34,9 @@ class AuditReport:
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
         conditions: Device condition per kind of axis, as sentences.
-        coupling_sentences: Sentences on effective and law coupling. They hold away from contact, or
-            everywhere if the tool was never released.
+        coupling: Requested, law and effective coupling at the start; None if invalid.
+        coupling_sentences: Sentences on them, and on changes by commands. They hold away from
+            contact, or everywhere if the tool was never released.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
             re-simulation a recording whose wrench is such a part is invalid instead of passive. Any
             other then names the changes that would pass: those of ``wrench_on_device`` and
@@ -60,6 +62,7 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    coupling: RunCoupling | None = None
     coupling_sentences: tuple[str, ...] = ()
     unchecked: str = ""
     damping_margin: float | None = None

@@ -30,10 +30,12 @@ from hapticbridge.certificate import (
     is_run_certified,
     run_conditions,
 )
+from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.rendering import Method
-from hapticbridge.summary import coupling_sentences, was_never_lossless
+from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.run_description import requested_of
+from hapticbridge.summary import was_never_lossless
 from hapticbridge.units import format_energy
 
 # End of a run
@@ -225,7 +227,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         run = AuditedRun.of(recording)
         facts |= _device_facts(run, recording)
         sentences = facts["coupling_sentences"]
-        facts["coupling_sentences"] = sentences + run.events.sentences
+        facts["coupling_sentences"] = sentences + run.events.changes_of_coupling(run.method)
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
@@ -237,6 +239,8 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             outcome = compare_resimulation(recording, run.parameters)
             facts["resimulation"] = outcome.agreement
             fault = _replay_fault(outcome)
+        if fault is None:
+            requested_of(recording.meta)
     except RecordingError as error:
         fault = Fault(str(error))
     # without a simulation again, some methods leave a wrench that no other computation covers
@@ -301,21 +305,31 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
     info, method, parameters = run.info, run.method, run.parameters
     try:
         worst = run.worst
+        coupling = RunCoupling.of(
+            method,
+            parameters.period / parameters.substeps,
+            _requested(recording),
+            law=parameters.coupling,
+            measured=parameters.effective,
+            is_always_implicit=was_never_lossless(recording.count, recording.flags),
+        )
         conditions = run_conditions(info, worst, method)
         return {
             "certified": is_run_certified(conditions, method),
             "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
-            "coupling_sentences": coupling_sentences(
-                parameters.coupling,
-                method,
-                parameters.period,
-                parameters.substeps,
-                is_always_implicit=was_never_lossless(recording.count, recording.flags),
-            ),
+            "coupling": coupling,
+            "coupling_sentences": coupling.sentences(),
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
+
+
+def _requested(recording: RecordingFile) -> Coupling | None:
+    try:
+        return requested_of(recording.meta)
+    except RecordingError:
+        return None  # a fault, named after those that may have caused it
 
 
 def _unchecked(run: AuditedRun) -> str:

@@ -264,7 +264,7 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  {plain(sentence)}")
     if not report.conditions:
         out.print(
-            "  device condition b >= KT/2 + B': not applicable, the motion is prescribed or the "
+            "  device condition b >= KT/2 + B_law: not applicable, the motion is prescribed or the "
             "damping unknown"
         )
     if report.is_cut:

@@ -109,6 +109,8 @@ LOOP_DTYPE = np.dtype(
         ("law_work", "<f8"),
         ("peak_force", "<f8"),
         ("peak_torque", "<f8"),
+        ("peak_tool_force", "<f8"),
+        ("peak_tool_torque", "<f8"),
         ("wrench_on_tool", "<f8", 6),
         ("motion", "<f8", 6),
         ("wrench_on_device", "<f8", 6),
@@ -426,8 +428,10 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
         return _refuse(s)
-    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_tool)))
-    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
+    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
+    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_device[3:6])))
+    loop.peak_tool_force = max(loop.peak_tool_force, norm(vector_of(loop.wrench_on_tool)))
+    loop.peak_tool_torque = max(loop.peak_tool_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     _record(s, row)
@@ -576,7 +580,8 @@ def publish_positions(
         state: The bound state.
         cursors: Cursors of the ring; the record of this tick is the next one written there.
         head: Head of the snapshot.
-        numbers: Slack in J, positions, mocap poses, then per contact its point in m and force in N.
+        numbers: Slack in J, positions, mocap poses, then per contact with a force its point in m
+            and its force in N.
     """
     s = state[0]
     mj = s.mj
@@ -591,12 +596,19 @@ def publish_positions(
         for value in floats(source, count):
             numbers[end] = value
             end += 1
-    shown = min(ints(mj.ncon, 1)[0], (numbers.size - end) // 6)
-    for c in range(shown):
+    shown = 0
+    # MuJoCo solves for no contact forces of a tool without mass
+    count = 0 if s.run.scheme == Scheme.MASSLESS else ints(mj.ncon, 1)[0]
+    for c in range(count):
+        if end + 6 > numbers.size:
+            break
         contact = pointer_at(mj.contact) + c * mj.contact_size
         slot, frame = numbers[end : end + 6], floats(contact + mj.contact_frame, 9)
         mj_contact_force(mj.model, mj.data, c, slot.ctypes.data)  # along the axes of its frame
         normal, first, second = slot[0], slot[1], slot[2]
+        if normal == 0.0 and first == 0.0 and second == 0.0:
+            continue  # a near contact may exist without a force
+        shown += 1
         point = floats(contact + mj.contact_point, 3)
         for axis in range(3):
             slot[axis] = point[axis]

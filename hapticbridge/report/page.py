@@ -134,7 +134,7 @@ def _device_notes(report: AuditReport) -> list[str]:
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
-    """Returns the time in s of the fault, or else of the largest force.
+    """Returns the time in s of the fault, or else of the largest force on the tool.
 
     Raises:
         RecordingError: The recording has no tick or no period.
