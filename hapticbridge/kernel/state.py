@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: ten sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: eleven sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -16,6 +16,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
+| timing      | delay of the force, energy that it may have given | timing                        |
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ from hapticbridge.kernel.tick_guard import (
     restart_ramp,
     set_commanded,
 )
+from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
 
 _FROM_PARAMETERS = (
@@ -116,6 +118,7 @@ STATE_DTYPE = np.dtype(
         ("guard", GUARD_DTYPE),
         ("observer", OBSERVER_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
+        ("timing", TIMING_DTYPE),
     ]
 )
 """The kernel's state; the module's docstring has a table of its sub-records."""

@@ -83,6 +83,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
+from hapticbridge.kernel.timing import meter_delay, note_delay, skip_delay
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -182,6 +183,9 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     max_stretch = max_twist = np.inf
     if s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick:
         charge_lateness(s, interval)
+        meter_delay(s, max(elapsed, s.run.period), interval)
+    else:
+        skip_delay(s)
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
@@ -560,6 +564,7 @@ def finish_tick(
     code = close_tick(state, row, has_positions)
     if code != OK:
         return code
+    note_delay(state[0], read_ns, write_ns)
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 
