@@ -377,7 +377,8 @@ class RunSetup:
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
-        is_absolute, handle_origin, guard = self.workspace.absolute, IDENTITY_POSE, self.guard
+        is_absolute, guard = self.workspace.absolute, self.guard
+        handle_origin: tuple[float, ...] = IDENTITY_POSE
         if self.method.has_law:
             load = static_load(self.scene)
             force, torque = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
