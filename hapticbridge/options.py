@@ -278,7 +278,7 @@ class RunSetup:
             info: The device's data sheet.
             coupling: Requested K and B. None selects the stiffest safe coupling for the device's
                 damping: 80 % of the bound, with a quarter of b as damping, less where substeps need
-                it. A device of unknown damping counts as the default simulated one.
+                it. Unknown damping is replaced by ``certificate.assumed_damping``.
             options: The user's options.
             clock: Clock of the run.
             is_recorded: True if the run is recorded.

@@ -16,6 +16,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
+from hapticbridge.audit import verdict_words
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
 from hapticbridge.cli.terminal import err, notify, out
@@ -141,11 +142,10 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
         if joules:  # exactly 0 without motors or springs
             table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
+    tick, port = summary.fault or (0, "")
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
-    out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    if summary.fault is not None:
-        tick, port = summary.fault
-        out.print(f"from tick {tick} on, at port {port}")
+    since = f", from tick {tick} on" if port else ""
+    out.print(f"{verdict_words(summary.verdict, summary.environment, port)}{since}{used}")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     if summary.effective is not None:
@@ -171,7 +171,8 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
         and law_evaluations == 1
     ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
-        out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
+        out.print("no verdict is given on the device's port during the run; only the energy limit")
+        out.print(f"watches it; {judge} it")
     if summary.recording is not None:
         out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
 
@@ -180,7 +181,8 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
 class Run:
     """Put a scene behind a haptic device and feel it.
 
-    Ctrl-C stops cleanly: zero force first, then the recording is closed.
+    Ctrl-C ends the run in order: zero force first, then the recording is closed. The exit code is
+    then 0, or 1 after an active run or on a device that is not certified.
 
     Example:
         hapticbridge run peg_in_hole --duration 8 --record run.mcap
@@ -190,6 +192,8 @@ class Run:
         "scene",
         "settings",
         "device",
+        "force_limit",
+        "dead_man",
         "duration",
         "record",
         "overwrite",
@@ -213,8 +217,8 @@ class Run:
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
     duration: float | None = None
-    """Duration in s; missed deadlines count, so that each makes the ticks one less. By default the
-    run ends with the device's motion, or with Ctrl-C."""
+    """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
+    default the run ends with the device's motion, or with Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False

@@ -15,10 +15,10 @@ storage in J. The next step applies
 so that the bias acts at v where MuJoCo evaluates it at u. Forces that the user applies enter as the
 mean of their present and previous values.
 
-In contact, half a wrench that is one step late would generate energy. The tool therefore changes to
+In contact, half a wrench that is one step late would create energy. The tool therefore changes to
 the implicit form before it touches, and back after it has been free for ``HOLDOFF`` ticks. Both
-changes keep S. B' is equal on both sides, so one device condition covers both. With a larger B' in
-contact, a device that bears only the smaller one would be thrown off forever
+changes keep S. B' is equal on both sides, so one device condition covers both. If B' were larger in
+contact, a device with just enough damping for free motion would bounce off the wall again and again
 (``theory.compensation``).
 
 Kinematic trees other than the tool's belong to MuJoCo alone: for them v = u.
@@ -380,8 +380,8 @@ sooner and longer.
 A change only when the next step would have a contact force, predicted from distance and approach
 speed, errs less: tapping on a wall at 4 Hz 0.25 of the implicit form instead of 0.31, at 1 Hz 0.35
 instead of 0.50. It uses more slack: a peg led into its hole 1.4 % instead of 0.9 %, and 2 of 20
-hands on a planar peg (0 of another 100) 0.01 % instead of none. The strict variant was chosen after
-both had been seen."""
+hands on a planar peg (0 of another 100) 0.01 % instead of none. The fixed distance is less accurate
+but created no energy."""
 
 
 @compiled

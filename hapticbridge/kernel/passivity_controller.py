@@ -155,8 +155,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
 
     Also updated, each in J:
         ``generated_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
-        ``excess_device_energy``: result of the function of that name. Work of the scene's motors
-        does not reduce it.
+        ``excess_device_energy``: result of the function of that name. If a motor in the scene
+        pushes the hand, that energy counts as excess.
         ``stored_while_force_off``: energy that the scene took up while the force was off by
         command and still stores. No hand supplied it (``cap_dissipation``).
 
