@@ -127,7 +127,7 @@ class BridgeOptions:
             reported once, with the command that grants it. None requests it for a real device.
         pipelined: True computes ahead, after the wrench was sent, what needs no new sample
             (``kernel.tick.can_split``). The numbers are equal to the bit, the wrench is sent
-            sooner, and the whole tick takes 5 % longer. Between two ticks ``scene.data`` then holds
+            sooner, and the whole tick takes 5 % longer. Between two ticks ``Scene.data`` then holds
             the contacts of the new positions, without forces. None does so on a real clock.
         live: True shows the state of the run on standard error, from the recorder's process.
 

@@ -193,6 +193,7 @@ WRITERS = {
     "mj": "state",
     "run": "state",
     "coupling": "law",
+    "level": "force_level",
     "pose": "handle",
     "loop": "tick",
     "energy": "ledger",

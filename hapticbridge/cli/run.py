@@ -16,7 +16,6 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from hapticbridge.audit import verdict_words
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
 from hapticbridge.cli.terminal import err, notify, out
@@ -145,7 +144,8 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     tick, port = summary.fault or (0, "")
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     since = f", from tick {tick} on" if port else ""
-    out.print(f"{verdict_words(summary.verdict, summary.environment, port)}{since}{used}")
+    words = f"[bold]{summary.verdict}[/bold] ({port or summary.environment})"
+    out.print(f"{words}{since}{used}")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     if summary.effective is not None:
@@ -196,7 +196,6 @@ class Run:
         "dead_man",
         "duration",
         "record",
-        "overwrite",
         "fast",
         "stiffness",
         "damping",
