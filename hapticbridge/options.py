@@ -118,7 +118,7 @@ class BridgeOptions:
         limits: Limits of the wrench and of the run; None takes the device's own.
         controller: Passivity controller. ``damper`` acts when the device was given more than its
             damping dissipates and the scene released. ``environment`` acts when the scene
-            generated more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
+            created more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
             the device condition does not hold, else ``environment``.
         clutch: Number of the device's button, from 0, that lets it move without the handle.
         dead_man: Number of the button, from 0, that must be held for any force.

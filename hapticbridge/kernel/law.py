@@ -119,8 +119,9 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     evaluation of the law per tick g = K + B'/T.
 
     With n > 1 evaluations g = ½ (K/n + B'/T), which is the ``SLACK_SHARE`` of each evaluation's
-    slack ½ (K + nB'/T) ‖δx_i‖² (``certificate.required_damping``). A record holds only δx_k, the sum of all δx_i. For a given
-    sum the slack is least if all δx_i are equal, so that g bounds it from below.
+    slack ½ (K + nB'/T) ‖δx_i‖² (``certificate.required_damping``). A record holds only δx_k, the
+    sum of all δx_i. For a given sum the slack is least if all δx_i are equal, so that g bounds it
+    from below.
     """
     if not parameters.has_law:
         return 0.0, 0.0
@@ -237,9 +238,9 @@ def _spring_energy(stiffness: float, length: float, limit: float) -> float:
 
 @compiled
 def releasable_energy(s: State) -> float:
-    """Returns r V(e) + r V(φ) in J, the energy that the springs can release to the device.
+    """Returns q V(e) + q V(φ) in J, the energy that the springs can release to the device.
 
-    r = force_scale / scale; V is limited by the largest force and torque on the device.
+    q = force_scale / scale; V is limited by the largest force and torque on the device.
     """
     pose, run = s.pose, s.run
     ratio = run.force_scale / run.scale

@@ -165,7 +165,7 @@ class BoundKernel:
 
     @property
     def slack(self) -> float:
-        """Energy in J that the environment may have generated so far."""
+        """Energy in J that the environment may have created so far."""
         return float(self.state["energy"]["slack"][0])
 
     def resume(self) -> None:
@@ -281,8 +281,8 @@ class BoundKernel:
         start_energies(s["energy"])
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
-            direct(restart_lossless, s)
-        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
+            direct(restart_lossless, s)  # loads its code ahead of a command; not run here
+        direct(releasable_energy, s)  # also ahead, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

@@ -1,8 +1,14 @@
 """The arithmetic of a tick before and after MuJoCo's step, and the end of a tick.
 
-The live loop calls ``before_step``, MuJoCo through its Python bindings, ``answer_step``, and once
-the wrench is sent ``finish_tick``. ``simulate`` runs whole ticks in compiled code, with MuJoCo by
-its C symbol (``advance``); both inline the same functions and agree to the bit.
+    live loop (``Bridge``)                whole_tick (re-simulation, sweeps)
+    1. the device is read                 1. the sample is given
+    2. before_step                        2. before_step
+    3. MuJoCo by its Python bindings      3. advance: MuJoCo by its C symbol
+    4. answer_step                        4. after_step: answer_step,
+    5. the wrench is sent                 5.   no device,
+    6. finish_tick: close_tick, publish   6.   close_tick
+
+2 to 4 are repeated for each substep. Both inline the same functions and agree to the bit.
 """
 
 from __future__ import annotations
@@ -185,9 +191,6 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     if slip(s, max_stretch, max_twist) or share < 1.0:
         anchor_handle(pose)
         note_anchored(s.guard)
-    handle = vector_of(pose.handle_position)
-    orientation = quaternion_of(pose.handle_quaternion)
-
     row[0].buttons = buttons
     _record_sample(s, row)
     return OK

@@ -61,7 +61,7 @@ Sentences = Iterable[tuple[str, Mapping[str, Any]]]
 """Sentences with fields in braces, and the numbers that fill them."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StabilityMap:
     """A map: its points, their evaluation, and the reading of the table.
 
@@ -238,7 +238,8 @@ def largest_stable(
         width: Relative width at which the search ends, > 0.
 
     Returns:
-        The bracket; ``Bracket(0, lower)`` if nothing was stable, ``Bracket(upper, inf)`` if all was.
+        The bracket; ``Bracket(0, lower)`` if nothing was stable; ``Bracket(upper, inf)`` if all
+            was.
 
     Raises:
         StudyError: An end or the width is out of range.

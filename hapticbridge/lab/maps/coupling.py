@@ -333,4 +333,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     )
 
 
-COUPLING = StabilityMap("coupling", __doc__, 6000, points, evaluate, summarize, draw, sentences)
+COUPLING = StabilityMap(
+    name="coupling",
+    doc=__doc__,
+    default_points=6000,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)
