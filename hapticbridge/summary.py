@@ -55,7 +55,7 @@ class Ledger:
 
     E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
     energy than it received while Σ E_k <= 0, eq. (14) of Brown & Colgate (1997). The device stays
-    safe while Σ E_k stays below the slack, Σ ½ (K + B/T) ‖δx_k‖² and its rotational counterpart.
+    safe while Σ E_k stays below the slack, Σ ½ (K + B'/T) ‖δx_k‖² and its rotational counterpart.
 
     Attributes:
         kinetic: Present kinetic energy.

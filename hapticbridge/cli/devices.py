@@ -65,7 +65,9 @@ class Devices:
             )
         elif usable:
             specification = _specification(usable[0], plugged)
-            out.print(f"next: hapticbridge run peg_in_hole --device {specification}")
+            out.print(
+                f"next: hapticbridge run peg_in_hole --device {specification} --force-limit 2"
+            )
         return 0
 
 

@@ -134,11 +134,11 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
         if joules:  # exactly 0 without motors or springs
             table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
+    tick, port = summary.fault or (0, "")
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
-    out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    if summary.fault is not None:
-        tick, port = summary.fault
-        out.print(f"from tick {tick} on, at port {port}")
+    since = f", from tick {tick} on" if port else ""
+    words = f"[bold]{summary.verdict}[/bold] ({port or summary.environment})"
+    out.print(f"{words}{since}{used}")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     _print_coupling(summary.coupling)
@@ -176,7 +176,8 @@ def _print_certificate(summary: Summary, law_evaluations: int, *, has_hand: bool
         and law_evaluations == 1
     ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
-        out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
+        out.print("no verdict is given on the device's port during the run; only the energy limit")
+        out.print(f"watches it; {judge} it")
 
 
 def _print_coupling(coupling: RunCoupling) -> None:
@@ -192,7 +193,8 @@ def _print_coupling(coupling: RunCoupling) -> None:
 class Run:
     """Put a scene behind a haptic device and feel it.
 
-    Ctrl-C stops cleanly: zero force first, then the recording is closed.
+    Ctrl-C ends the run in order: zero force first, then the recording is closed. The exit code is
+    then 0, or 1 after an active run or on a device that is not certified.
 
     Example:
         hapticbridge run peg_in_hole --duration 8 --record run.mcap
@@ -202,9 +204,10 @@ class Run:
         "scene",
         "settings",
         "device",
+        "force_limit",
+        "dead_man",
         "duration",
         "record",
-        "overwrite",
         "fast",
         "stiffness",
         "damping",
@@ -225,8 +228,8 @@ class Run:
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
     duration: float | None = None
-    """Duration in s; missed deadlines count, so that each makes the ticks one less. By default the
-    run ends with the device's motion, or with Ctrl-C."""
+    """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
+    default the run ends with the device's motion, or with Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False

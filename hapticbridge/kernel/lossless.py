@@ -15,10 +15,10 @@ storage in J. The next step applies
 so that the bias acts at v where MuJoCo evaluates it at u. Forces that the user applies enter as the
 mean of their present and previous values.
 
-In contact, half a wrench that is one step late would generate energy. The tool therefore changes to
+In contact, half a wrench that is one step late would create energy. The tool therefore changes to
 the implicit form before it touches, and back after it has been free for ``HOLDOFF`` ticks. Both
-changes keep S. B' is equal on both sides, so one device condition covers both. With a larger B' in
-contact, a device that bears only the smaller one would be thrown off forever
+changes keep S. B' is equal on both sides, so one device condition covers both. If B' were larger in
+contact, a device with just enough damping for free motion would bounce off the wall again and again
 (``theory.compensation``).
 
 Kinematic trees other than the tool's belong to MuJoCo alone: for them v = u.
@@ -116,7 +116,7 @@ LOSSLESS_DTYPE = np.dtype(
 
 Addresses of vectors over the degrees of freedom come first. ``is_midpoint`` and ``was_midpoint``
 are the form of the next and of the last step; ``holdoff`` counts the ticks until the tool may be
-lossless again; ``energy_debt`` in J is generated energy that is still to be taken back; ``twist``
+lossless again; ``energy_debt`` in J is created energy that is still to be taken back; ``twist``
 in rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
 
 # The velocity v at which a lossless step's energy is balanced, and the force carried over
@@ -228,7 +228,7 @@ def balance_midpoint(s: State) -> None:
 
 @compiled
 def balance(s: State) -> None:
-    """Takes the kinetic energy at v, and takes generated energy back from the tool's motion."""
+    """Takes the kinetic energy at v, and takes created energy back from the tool's motion."""
     lossless = s.lossless
     mj = s.mj
     v = floats(lossless.velocity, mj.nv)
@@ -245,7 +245,7 @@ def balance(s: State) -> None:
 
 @compiled
 def _take_back(s: State, kinetic: float, own: float) -> float:
-    """Slows the tool by the energy that the lossless form generated, so that (14) holds.
+    """Slows the tool by the energy that the lossless form created, so that (14) holds.
 
     If inertia and Jacobian turn, the form keeps S to third order only: 1e-10 J per tick at the
     speed of a hand. That is 1e-7 of the tool's kinetic energy, and leaves the order unchanged.
@@ -348,7 +348,7 @@ def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
         Force, torque, and the tool's motion and rotation vector in the step.
     """
     lossless = s.lossless
-    lossless.is_near = is_near(s)
+    lossless.is_near = scan_contacts(s)
     lossless.was_midpoint = lossless.is_midpoint
     lossless.ticks += lossless.was_midpoint
     if not lossless.is_midpoint:
@@ -391,16 +391,17 @@ sooner and longer.
 A change only when the next step would have a contact force, predicted from distance and approach
 speed, errs less: tapping on a wall at 4 Hz 0.25 of the implicit form instead of 0.31, at 1 Hz 0.35
 instead of 0.50. It uses more slack: a peg led into its hole 1.4 % instead of 0.9 %, and 2 of 20
-hands on a planar peg (0 of another 100) 0.01 % instead of none. The strict variant was chosen after
-both had been seen."""
+hands on a planar peg (0 of another 100) 0.01 % instead of none. The fixed distance is less accurate
+but created no energy."""
 
 
 @compiled
-def is_near(s: State) -> bool:
-    """Returns True if the step saw the tool near a contact, in contact, or at a joint's limit.
+def scan_contacts(s: State) -> bool:
+    """Counts contacts with a force, and notes if a constraint force acted on the tool's tree.
 
-    Contacts within ``REACH`` exist without a force, because the geoms' gap includes them. Also
-    notes whether a constraint force acted on the tool's tree, and counts contacts with a force.
+    Returns:
+        True if the step saw the tool near a contact, in contact, or at a joint's limit. Contacts
+        within ``REACH`` exist without a force, because the geoms' gap includes them.
     """
     mj = s.mj
     lossless = s.lossless
@@ -477,7 +478,7 @@ def _is_driven(model: mujoco.MjModel, bodies: NDArray[np.bool_], own: Container[
     """Returns True if an actuator of the scene acts on the tree; unknown transmissions count.
 
     MuJoCo applies the whole force of an actuator in a step that is due half of it, and a servo's
-    force implicitly. Beside a lossless coupling that generates energy: 8 mJ in 1 s as measured.
+    force implicitly. Beside a lossless coupling that creates energy: 8 mJ in 1 s as measured.
     """
     transmission = mujoco.mjtTrn
     owner = {
@@ -591,7 +592,7 @@ def apply_carried(s: State) -> None:
     The user writes to the array that this method also writes to; a value that differs from the
     method's last one is the user's. If the user's force changes from p to p', a lossless step takes
     ½ (p + p'). Then v gains T M⁻¹ p', and the work h p'·u of the external port is exact. With all
-    of p', a varying force would generate energy.
+    of p', a varying force would create energy.
     """
     mj, lossless = s.mj, s.lossless
     applied, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)

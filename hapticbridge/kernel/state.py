@@ -166,7 +166,7 @@ class BoundKernel:
 
     @property
     def slack(self) -> float:
-        """Energy in J that the environment may have generated so far."""
+        """Energy in J that the environment may have created so far."""
         return float(self.state["energy"]["slack"][0])
 
     def resume(self) -> None:
@@ -280,7 +280,7 @@ class BoundKernel:
         start_energies(s["energy"])
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
-            direct(restart_lossless, s)
+            direct(restart_lossless, s)  # loads its code ahead of a command; not run here
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""
