@@ -199,6 +199,7 @@ WRITERS = {
     "guard": "tick_guard",
     "observer": "passivity_controller",
     "lossless": "lossless",
+    "springs": "springs",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""
 

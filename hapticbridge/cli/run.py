@@ -34,7 +34,12 @@ from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import Summary, coupling_sentences, is_always_implicit
+from hapticbridge.summary import (
+    Summary,
+    coarse_spring,
+    coupling_sentences,
+    is_always_implicit,
+)
 from hapticbridge.units import format_energy, format_si
 
 if TYPE_CHECKING:
@@ -59,6 +64,12 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
             f"  requested: K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
             f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
             f"B_r = {coupling.rotational_damping:g} N m s/rad"
+        )
+    coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
+    if coarse:
+        err.print(
+            f"  the tool has {coarse}: its springs are followed to first order in T only; without "
+            "it, or at a higher --rate, the error falls"
         )
     usual = default_method()
     if is_method_chosen and method != usual:
