@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
-from hapticbridge.kernel.lossless import tree_of_tool
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
+from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling
@@ -32,6 +32,15 @@ def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
     """
     own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
     return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
+
+
+def coarse_spring(model: mujoco.MjModel, grip: str, method: Method) -> str:
+    """Returns the spring that makes a lossless coupling first order; empty if none does."""
+    if method.scheme != Scheme.MIDPOINT:
+        return ""
+    own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
+    tree = tree_of_tool(model, int(model.site(grip).bodyid[0]), own)
+    return "" if tree.is_never_free else spring_at_the_end(model, tree)
 
 
 def was_always_implicit(ticks: NDArray[np.void]) -> bool:

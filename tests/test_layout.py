@@ -200,6 +200,7 @@ WRITERS = {
     "guard": "tick_guard",
     "observer": "passivity_controller",
     "lossless": "lossless",
+    "springs": "springs",
     "timing": "timing",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""

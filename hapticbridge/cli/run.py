@@ -34,7 +34,7 @@ from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import Summary, is_always_implicit
+from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
 
 if TYPE_CHECKING:
@@ -53,6 +53,12 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
         err.print(f"  {sentence}")
+    coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
+    if coarse:
+        err.print(
+            f"  the tool has {coarse}: its springs are followed to first order in T only; without "
+            "it, or at a higher --rate, the error falls"
+        )
     usual = default_method()
     if is_method_chosen and method != usual:
         err.print(f"  {method.name}: {escape(method.about)}")

@@ -82,6 +82,7 @@ from hapticbridge.kernel.mujoco_c import (
     release_fence,
 )
 from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
+from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.tick_guard import (
     DEVICE_BUTTONS,
     advance_share,
@@ -432,10 +433,11 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     s = state[0]
     loop = s.loop
     loop.has_positions = has_positions
+    restore_springs(s)
     if s.run.scheme != Scheme.MASSLESS:
         refresh_energies(s)
-    if s.run.scheme == Scheme.MIDPOINT:
-        finish_lossless(s)
+    if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
+        loop.has_positions = 0  # it was computed with the springs of the other form
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
         return _refuse(s)
