@@ -430,6 +430,7 @@ class Session:
             dropped=self.stream.dropped,
             stopped_by=self.stopped_by,
             recording=self.output.path,
+            is_realtime=self.setup.is_realtime,
         )
         setup = self.setup
         return Summary.of(

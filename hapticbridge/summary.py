@@ -19,6 +19,7 @@ from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 
 # Sentences on the effective coupling and its law
 
@@ -140,6 +141,7 @@ class RunOutcome:
         stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
             ``Bridge.stop``.
         recording: The recording, or None.
+        is_realtime: True if real time was requested from the system.
     """
 
     ticks: int
@@ -148,6 +150,7 @@ class RunOutcome:
     dropped: int
     stopped_by: str
     recording: Path | None
+    is_realtime: bool
 
 
 _PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
@@ -183,8 +186,9 @@ class Summary:
             metering; for any other the audit of the recording decides.
         conditions: Device conditions, as sentences.
         is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation. None if its damping is unknown, or if no coupling law makes
-            the condition sufficient.
+            translation and rotation, and the run kept its time. None if its damping is unknown, or
+            if no coupling law makes the condition sufficient.
+        timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
@@ -210,6 +214,7 @@ class Summary:
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
     is_certified: bool | None
+    timekeeping: Timekeeping
     stopped_by: str
     recording: Path | None
     reach: float | None
@@ -232,6 +237,15 @@ class Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
+        timing = state["timing"][0]
+        times = RunTimes(
+            ticks=outcome.ticks,
+            due=outcome.ticks + outcome.skipped,
+            mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
+            delay_energy=float(timing["most_uncovered"]),
+            is_realtime=outcome.is_realtime,
+        )
+        timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,
@@ -255,7 +269,8 @@ class Summary:
             ),
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
-            is_certified=is_run_certified(conditions, method),
+            is_certified=timekeeping.certified(is_run_certified(conditions, method)),
+            timekeeping=timekeeping,
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,

@@ -344,7 +344,7 @@ REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
         ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0)),
         {"limits": EVERY_LIMIT, "workspace": Workspace(scale=2.0)},
-        TickFlag.SLEW_LIMITED,
+        TickFlag.FORCE_LIMITED,
     ),
     "the edge of the reach": (
         ScriptedDevice(drift(1e-4)),

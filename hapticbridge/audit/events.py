@@ -19,7 +19,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import EARLIER_VERSION, RunParameters
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import Method, RunCoupling, method_named
 from hapticbridge.run_description import meta_start, parameters_of
@@ -150,6 +151,8 @@ class AuditedRun:
             RecordingError: They are damaged or do not describe a run.
         """
         meta, parameters = recording.meta, parameters_of(recording.meta)
+        if recording.record != TICK_DTYPE:
+            raise RecordingError(EARLIER_VERSION)
         try:
             info = DeviceInfo.from_json(meta.get("device", ""))
             limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))

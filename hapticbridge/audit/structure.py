@@ -241,7 +241,6 @@ def _flag_faults(
         (TickFlag.CONTACT, is_touching, is_touching),
         (TickFlag.CLUTCH, is_released, is_released),
         (TickFlag.RAMPING, is_partial, is_partial),
-        (TickFlag.SLEW_LIMITED, none, none),
         (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
     ):
         has = has_flag(ticks, flag)

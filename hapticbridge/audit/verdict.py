@@ -23,6 +23,7 @@ from hapticbridge.audit.structure import (
     first_row,
     structure_fault,
 )
+from hapticbridge.audit.timing import TimingTally
 from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
@@ -36,6 +37,7 @@ from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
 from hapticbridge.summary import was_never_lossless
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
 # End of a run
@@ -233,8 +235,10 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
         if fault is None:
             energies = PassivityTally(is_watched=facts["certified"] is not True)
-            fault, facts["duration"] = _check_records(recording, run, energies)
+            timing = TimingTally(run.parameters)
+            fault, facts["duration"] = _check_records(recording, run, energies, timing)
             facts["energies"] = energies.energies
+            facts |= _time_facts(run, recording, timing, facts["certified"])
         if fault is None:
             outcome = compare_resimulation(recording, run.parameters)
             facts["resimulation"] = outcome.agreement
@@ -250,15 +254,17 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        notes = (found["reason"], unusual_end(recording.events), facts["unchecked"])
+        kept = facts.get("timekeeping")
+        not_kept = "" if kept is None else kept.fault
+        notes = (found["reason"], not_kept, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 
 
 def _check_records(
-    recording: RecordingFile, run: AuditedRun, energies: PassivityTally
+    recording: RecordingFile, run: AuditedRun, energies: PassivityTally, timing: TimingTally
 ) -> tuple[Fault | None, float]:
-    """Compares all records with their second computation and collects their energies.
+    """Compares all records with their second computation; collects energies and times.
 
     Returns:
         The earliest fault or None, and the due time of the last record in s.
@@ -268,6 +274,7 @@ def _check_records(
     delay = min(run.delay, recording.count)
     for block, balance in energy_balances(recording.blocks(), start, run.events, delay):
         energies.add(block.ticks, balance)
+        timing.add(block, run.events)
         duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
         fault = fault or _block_fault(block, balance, run.events)
     return fault, duration
@@ -330,6 +337,25 @@ def _requested(recording: RecordingFile) -> Coupling | None:
         return requested_of(recording.meta)
     except RecordingError:
         return None  # a fault, named after those that may have caused it
+
+
+def _time_facts(
+    run: AuditedRun, recording: RecordingFile, timing: TimingTally, certified: bool | None
+) -> dict[str, Any]:
+    """Returns the time that a run kept, and its device's verdict and margin at this time."""
+    times = RunTimes(
+        ticks=timing.ticks,
+        due=timing.due,
+        mean_delay=timing.delays / max(timing.ticks, 1),
+        delay_energy=timing.most_uncovered,
+        is_realtime=any(event.get("event") == "real_time" for event in recording.events),
+    )
+    conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
+    kept = Timekeeping.of(times, run.worst, conditions)
+    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified)}
+    if kept.conditions:
+        facts["damping_margin"] = damping_margin(kept.conditions)
+    return facts
 
 
 def _unchecked(run: AuditedRun) -> str:

@@ -392,6 +392,8 @@ class Check:
                 cost = measure_cost(
                     case.scene, case.samples, case.coupling, case.period, progress=show
                 )
+            slow = cost.fault(case)
+            faults = faults if slow is None else (*faults, slow)
         if not self.as_json:
             print_case(case)
             print_inventory(inventory)

@@ -119,7 +119,9 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     """
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
+    skipped = ""
+    if summary.skipped:
+        skipped = f" ({summary.skipped} deadlines skipped: {summary.timekeeping.words})"
     table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
     hand, tool = (
         (summary.peak_force, summary.peak_torque),
@@ -140,19 +142,34 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     _print_coupling(summary.coupling)
+    _print_certificate(summary, law_evaluations, has_hand=has_hand)
+    if hint := summary.timekeeping.hint:
+        out.print(hint)
+    if summary.recording is not None:
+        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
+
+
+def _print_certificate(summary: Summary, law_evaluations: int, *, has_hand: bool) -> None:
+    """Prints if the device bears the coupling at the time that the run kept."""
+    kept = summary.timekeeping
     if summary.is_certified is None and summary.conditions:
         for sentence in summary.conditions:
             out.print(escape(sentence))
         out.print("nothing proves that the device bears this")
-    else:
-        bound = "KT/2 + B_law" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
-        certified = {
-            True: f"device certified: b >= {bound}",
-            False: f"device not certified: b < {bound}",
-            None: f"device unknown: b >= {bound} not checked",
-        }
-        unfelt = "the device feels no force: there is nothing to certify"
-        out.print(certified[summary.is_certified] if has_hand else unfelt)
+        return
+    if not has_hand:
+        out.print("the device feels no force: there is nothing to certify")
+        return
+    if kept.fault:
+        out.print(f"device not certified: {kept.fault}")
+        return
+    bound = "KT/2 + B_law" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
+    certified = {
+        True: f"device certified{kept.clause}: b >= {bound}",
+        False: f"device not certified: b < {bound}",
+        None: f"device unknown: b >= {bound} not checked",
+    }
+    out.print(certified[summary.is_certified])
     if (
         summary.is_certified is False
         and method_named(summary.method).has_law
@@ -160,8 +177,6 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
-    if summary.recording is not None:
-        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
 
 
 def _print_coupling(coupling: RunCoupling) -> None:

@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: ten sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: eleven sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -16,6 +16,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
+| timing      | delay of the force, energy that it may have given | timing                        |
 """
 
 from __future__ import annotations
@@ -36,7 +37,6 @@ from hapticbridge.kernel.law import (
     Gains,
     bind_coupling,
     implicit_gains,
-    releasable_energy,
     set_tuning_goal,
 )
 from hapticbridge.kernel.ledger import (
@@ -51,7 +51,6 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
-    cap_dissipation,
     observe_reset,
 )
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
@@ -62,6 +61,7 @@ from hapticbridge.kernel.tick_guard import (
     restart_ramp,
     set_commanded,
 )
+from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
 
 _FROM_PARAMETERS = (
@@ -118,6 +118,7 @@ STATE_DTYPE = np.dtype(
         ("guard", GUARD_DTYPE),
         ("observer", OBSERVER_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
+        ("timing", TIMING_DTYPE),
     ]
 )
 """The kernel's state; the module's docstring has a table of its sub-records."""
@@ -160,7 +161,7 @@ class BoundKernel:
 
     @property
     def external_flags(self) -> NDArray[np.int64]:
-        """Flags ``STALE_SAMPLE`` and ``REANCHORED`` of the next tick; the loop fills this view."""
+        """Flag ``STALE_SAMPLE`` of the next tick; the loop fills this view."""
         return cast(NDArray[np.int64], self.state["loop"]["external_flags"])
 
     @property
@@ -182,12 +183,10 @@ class BoundKernel:
             gains: Gains of its actuators (``rendering.Method.gains``).
             ticks: Length of the change in ticks, >= 1.
         """
-        cap_dissipation(self._record)
         set_tuning_goal(self._record["coupling"], parameters, gains, ticks)
 
     def command(self, bits: int) -> None:
         """Sets the commands in force from the next tick on, ``FORCE_OFF`` and ``CLUTCHED``."""
-        cap_dissipation(self._record)
         set_commanded(self._record["guard"], bits)
 
     def handle_reset(self) -> None:
@@ -282,7 +281,6 @@ class BoundKernel:
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
             direct(restart_lossless, s)
-        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

@@ -58,6 +58,7 @@ from hapticbridge.kernel.lossless import (
     finish_lossless,
     lossless_flag,
     lossless_wrench,
+    note_slip,
 )
 from hapticbridge.kernel.mujoco_c import (
     floats,
@@ -82,6 +83,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
+from hapticbridge.kernel.timing import meter_delay, note_delay, skip_delay
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -116,12 +118,14 @@ LOOP_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
-next. ``external_flags`` are ``STALE_SAMPLE`` and ``REANCHORED`` as the live loop or a recording has
-them, set before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
+next. ``external_flags`` is ``STALE_SAMPLE`` as the live loop or a recording has it, set
+before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
 ``motion`` is the tool's, in m and rad; wrenches in N and N m, peaks since the start."""
 
 
 # Before MuJoCo's step
+
+_AT_REST = (0.0, 0.0, 0.0)
 
 
 @compiled
@@ -177,19 +181,22 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
-    if s.run.has_law and s.loop.tick > s.guard.start_tick:
+    if s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick:
         charge_lateness(s, interval)
+        meter_delay(s, max(elapsed, s.run.period), interval)
+    else:
+        skip_delay(s)
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
         max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
-    if slip(s, max_stretch, max_twist) or share < 1.0:
+    has_slipped = slip(s, max_stretch, max_twist)
+    if has_slipped and s.run.scheme == Scheme.MIDPOINT:
+        note_slip(s)
+    if has_slipped or (share < 1.0 and (moved != _AT_REST or turned != _AT_REST)):
         anchor_handle(pose)
         note_anchored(s.guard)
-    handle = vector_of(pose.handle_position)
-    orientation = quaternion_of(pose.handle_quaternion)
-
     row[0].buttons = buttons
     _record_sample(s, row)
     return OK
@@ -390,7 +397,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
 def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device.
 
-    In this order: scale, passivity controller, limit by norm, limit of change, ramp and fade.
+    In this order: scale, share of the lever, and of the passivity controller's damping what fits.
     """
     run = s.run
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
@@ -557,6 +564,7 @@ def finish_tick(
     code = close_tick(state, row, has_positions)
     if code != OK:
         return code
+    note_delay(state[0], read_ns, write_ns)
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 
@@ -677,7 +685,7 @@ def simulate_recorded(
     Args:
         state: The bound state.
         samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` and ``REANCHORED`` as recorded, one per tick.
+        external_flags: ``STALE_SAMPLE`` as recorded, one per tick.
         elapsed: Time between two samples in s, one per tick.
         row: The bound record.
         rows: Receives the records; as long as ``samples``.

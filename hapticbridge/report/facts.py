@@ -16,6 +16,7 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_si, format_wrenches
 
 Facts = list[tuple[str, str]]
@@ -72,7 +73,7 @@ _GUARD = {
     "max_rotational_damping": "N m s/rad",
     "stale_ticks": "ticks",
     "fade_ticks": "ticks",
-    "longest_stall": "s",
+    "has_hand": "",
     "stretch": "m",
     "angle": "rad",
     "speed": "m/s",
@@ -168,8 +169,12 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("largest force", format_wrenches(None if evidence.info.is_prescribed else hand, tool)),
         ("controller", _controller_words(evidence)),
     ]
+    kept = report.timekeeping
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    facts.append(("device condition", borne[report.certified]))
+    words = NOT_KEPT if kept is not None and kept.fault else borne[report.certified]
+    facts.append(("device condition", words + (kept.clause if kept and report.certified else "")))
+    if kept is not None and (kept.share < 1.0 or kept.mean_delay > 0.0):
+        facts.append(("time kept", f"{kept.words}, {format_si(kept.mean_delay, 's')} to the force"))
     if report.slack_share:
         facts.append(("slack used", f"{report.slack_share:.0%}"))
     return [*facts, ("simulated again", report.resimulation or "not reached")]

@@ -123,10 +123,14 @@ def is_warned(report: AuditReport) -> bool:
 def _device_notes(report: AuditReport) -> list[str]:
     if report.verdict != "passive":
         return []
+    kept = report.timekeeping
     if report.certified:
-        return ["The device bears this coupling, in any hand."]
+        clause = "" if kept is None or not kept.clause else f",{kept.clause}"
+        return [f"The device bears this coupling, in any hand{clause}."]
     if report.certified is None:
         return ["It is not known if the device bears this coupling in any hand."]
+    if kept is not None and kept.fault:  # the reason has the numbers
+        return ["The device is not certified. This run stayed passive; another one need not."]
     return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
         "passive; another one need not."

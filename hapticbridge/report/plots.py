@@ -181,7 +181,6 @@ def draw_motion(evidence: Evidence) -> Figure:
 FLAGS = (
     (TickFlag.RAMPING, "force rises"),
     (TickFlag.FORCE_LIMITED, "force limited"),
-    (TickFlag.SLEW_LIMITED, "slew limited"),
     (TickFlag.CONTROLLER_ACTIVE, "controller"),
     (TickFlag.CLUTCH, "let go: clutch or dead man"),
     (TickFlag.REANCHORED, "re-anchored"),

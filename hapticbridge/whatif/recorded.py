@@ -14,7 +14,13 @@ from hapticbridge.clock import period_of
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.guard import CONTROLLERS, Limits, guard_parameters_for
+from hapticbridge.guard import (
+    CONTROLLERS,
+    IDLE_FORCE,
+    IDLE_TORQUE,
+    Limits,
+    guard_parameters_for,
+)
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
@@ -149,6 +155,8 @@ class RecordedRun:
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
+            hold_force=_requested_hold(guarding.hold_force, guarding.idle_force - IDLE_FORCE),
+            hold_torque=_requested_hold(guarding.hold_torque, guarding.idle_torque - IDLE_TORQUE),
             ramp=p.ramp_ticks * p.period,
             stretch=invert_exactly(
                 guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
@@ -209,6 +217,11 @@ class RecordedRun:
         prepare(scene, settings.coupling, 1.0 / step[0], *step[1:], warns=False)
         found = hashlib.sha256(compiled_model(scene.model)).hexdigest()
         return found == self.recording.meta.get("scene_sha256")
+
+
+def _requested_hold(hold: float, load: float) -> float:
+    """Returns the limit that was asked for, without the tool's load, to nine decimals."""
+    return hold if hold == math.inf else round(hold - load, 9)
 
 
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
