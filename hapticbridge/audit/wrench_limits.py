@@ -212,7 +212,10 @@ def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviati
     """Compares the wrench on the device with the share of the wrench on the tool."""
     ticks = block.ticks
     axes = np.array(parameters.axes).reshape(3, 3)
-    wrench = -parameters.force_scale * ticks["share"][:, None] * ticks["wrench_on_tool"]
+    on_tool = ticks["wrench_on_tool"].copy()
+    for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
+        on_tool[:, part] = _shortened(on_tool[:, part], limit)  # on the tool too with a law
+    wrench = -parameters.force_scale * ticks["share"][:, None] * on_tool
     expected = np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )

@@ -366,7 +366,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         force, torque, moved, turned = lossless_wrench(s)
     else:
         force, torque, moved, turned = compared_wrench(s, is_last)
-        force, torque = limited_wrench(s, force, torque)
+        if s.run.has_law:
+            force, torque = limited_wrench(s, force, torque)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
@@ -408,6 +409,8 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
     In this order: scale, share of the lever, and of the passivity controller's damping what fits.
     """
     run = s.run
+    if not run.has_law:  # nothing limits the wrench on the tool, so the device alone is spared
+        force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
     share = s.guard.share
