@@ -1,18 +1,19 @@
 """Springs and dampers of the tool's tree at the midpoint, beside a lossless coupling.
 
 MuJoCo takes the forces of joints and tendons at the end of the step, which is of first order. The
-implicit midpoint rule takes the force
+implicit midpoint rule takes
 
-    F_k = ½ (S_{k−1} + S_k) + D(u_k)
+    F_k = ½ (S_{k−1} + S_k) + D_k
 
-with S the spring's force at the positions q_k and D the damper's at the step's velocity u_k =
-(q_k − q_{k−1})/T. Half of F_k acts in step k and half in step k + 1, as with the coupling:
+with S the springs' force at the positions q, and D the dampers' at the step's velocity
+u_k = (q_k − q_{k−1})/T. As with the coupling, half of F_k acts in step k, the rest in step k + 1:
 
-    ½ F_k = ¼ S_{k−1} + [¼ S_k + ½ D(u_k)]
+    step k        ¼ S_{k−1} + Q_k,    Q_k ≈ ¼ S_k + ½ D_k
+    step k + 1    R_k = F_k − ¼ S_{k−1} − Q_k
 
-MuJoCo solves the bracket if stiffness is a quarter and damping half of the scene's; the rest is
-known before the step. The model has these shares from a lossless step's start until its energy is
-taken, and the scene's own values at all other times.
+MuJoCo solves Q_k if the model has a quarter of the stiffness and half of the damping. Its lever
+arms are those of the step's start; R_k makes up for it. The model has these shares from the start
+of a lossless step until its energy is taken, and the scene's own values at all other times.
 """
 
 from __future__ import annotations
