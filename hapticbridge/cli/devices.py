@@ -43,7 +43,7 @@ class Devices:
         out.print("[bold]supported[/bold]")
         for driver in all_drivers():
             out.print(f"{driver.name}: {plain(driver.about)}")
-            out.print(f"  axes {driver.axes}; force {driver.force}; rate {driver.rate}")
+            out.print(f"  axes {driver.axes}; force on the hand {driver.force}; rate {driver.rate}")
             if driver.on_stall:
                 out.print(f"  if this machine stands still: {plain(driver.on_stall)}")
             if driver.medium is not None:
