@@ -118,9 +118,7 @@ class Rotor(SimulatedDevice):
 COUPLING = Coupling(2000.0, 2.0, 2.0, 2e-3)
 
 
-FREE = Limits(
-    force=100.0, torque=10.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf
-)
+FREE = Limits(force=100.0, torque=10.0, ramp=0.0, stretch=np.inf, angle=np.inf, energy=np.inf)
 
 
 TURNED_TOOL = """

@@ -197,6 +197,8 @@ WRITERS = {
     "loop": "tick",
     "energy": "ledger",
     "guard": "tick_guard",
+    "level": "force_level",
+    "watch": "swing_watch",
     "observer": "passivity_controller",
     "lossless": "lossless",
 }

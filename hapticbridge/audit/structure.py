@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -243,6 +244,8 @@ def _flag_faults(
         (TickFlag.RAMPING, is_partial, is_partial),
         (TickFlag.SLEW_LIMITED, none, none),
         (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
+        (TickFlag.SWINGING, none, every & math.isfinite(guarding.swing_energy)),
+        (TickFlag.RUNS_AWAY, none, every & math.isfinite(guarding.runaway_speed)),
     ):
         has = has_flag(ticks, flag)
         name = (flag.name or "").lower()

@@ -33,7 +33,7 @@ from hapticbridge.certificate import (
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method
-from hapticbridge.summary import coupling_sentences, was_never_lossless
+from hapticbridge.summary import coupling_sentences, was_never_lossless, watch_sentence
 from hapticbridge.units import format_energy
 
 # End of a run
@@ -246,7 +246,8 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        notes = (found["reason"], unusual_end(recording.events), facts["unchecked"])
+        watched = watch_sentence(recording.flags)
+        notes = (found["reason"], watched, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 

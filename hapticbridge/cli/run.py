@@ -143,6 +143,8 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
+    if summary.watch:
+        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
     if summary.fault is not None:
         tick, port = summary.fault
         out.print(f"from tick {tick} on, at port {port}")

@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: ten sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: eleven sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -15,6 +15,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
 | guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
+| watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 """
 
@@ -54,6 +55,7 @@ from hapticbridge.kernel.passivity_controller import (
     cap_dissipation,
     observe_reset,
 )
+from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
 from hapticbridge.kernel.tick_guard import (
     GUARD_DTYPE,
@@ -117,6 +119,7 @@ STATE_DTYPE = np.dtype(
         ("energy", ENERGY_DTYPE),
         ("guard", GUARD_DTYPE),
         ("observer", OBSERVER_DTYPE),
+        ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
     ]
 )
@@ -268,6 +271,7 @@ class BoundKernel:
         )
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
+        bind_watch(s["watch"], parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record

@@ -25,6 +25,7 @@ from hapticbridge.film_process import MIN_REFERENCE
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
+from hapticbridge.summary import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
@@ -59,6 +60,7 @@ class LiveRun:
         model: The scene.
         parameters: Parameters of the run.
         reference: Largest force in N so far, or ``MIN_REFERENCE``.
+        flags: Combined flags of the records so far.
         trace: The curves so far.
     """
 
@@ -70,6 +72,7 @@ class LiveRun:
         self._gathered, self._shown = 0, -1
         self.trace = Trace(TRACE)
         self.reference = MIN_REFERENCE
+        self.flags = 0
 
     def look(self) -> Sight | None:
         """Returns the newest instant; None if it was returned before."""
@@ -92,6 +95,7 @@ class LiveRun:
         number, rows = self._ring.since(self._gathered)
         self._gathered = number + len(rows)
         if rows.size:
+            self.flags |= int(np.bitwise_or.reduce(rows["flags"]))
             self.trace.add(rows, slack)
 
 
@@ -160,7 +164,10 @@ def _follow(
             page.reference = live.reference
             page.show(sight)
             force = float(np.linalg.norm(sight.force))
-            page.status.content = f"**{sight.time:.1f} s**, {force:.2f} N"
+            watched = watch_sentence(live.flags)
+            page.status.content = f"**{sight.time:.1f} s**, {force:.2f} N" + (
+                f"; **{watched}**" if watched else ""
+            )
         now = time.monotonic()
         if now - plotted >= REPLOT and len(live.trace) > 1:
             plotted = now
