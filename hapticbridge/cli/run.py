@@ -120,6 +120,14 @@ def _true_weld(effective: Coupling, requested: Coupling) -> str:
     )
 
 
+def _print_faults(summary: Summary) -> None:
+    if summary.watch:
+        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
+    if summary.fault is not None:
+        tick, port = summary.fault
+        out.print(f"from tick {tick} on, at port {port}")
+
+
 def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = True) -> None:
     """Prints what a run was, whether the device bears it, and what to do next.
 
@@ -143,11 +151,7 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     out.print(table)
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    if summary.watch:
-        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
-    if summary.fault is not None:
-        tick, port = summary.fault
-        out.print(f"from tick {tick} on, at port {port}")
+    _print_faults(summary)
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     if summary.effective is not None:

@@ -506,12 +506,12 @@ def _coarse(_since: int, sample: NDArray[np.void]) -> None:
 
 NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
 
-UNGUARDED = {"controller": 0, **NO_TRIPS}
+UNWATCHED = {"swing_energy": np.inf, "runaway_speed": np.inf}
+
+UNGUARDED = {"controller": 0, **NO_TRIPS, **UNWATCHED}
 
 RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
 """The one that loses records, after its cause; they are counted."""
-
-UNWATCHED = {"swing_energy": np.inf, "runaway_speed": np.inf}
 
 
 def unseen(name: str, change: Callable[[], Change], hand: Hand, says: str = "lowered") -> Fault:
@@ -530,8 +530,8 @@ UNSEEN = (
     unseen("motor holds for 10 ms", holding(10), FINGERS),
     unseen("reversed axis", lambda: _reversed_x, DEFAULT_HAND, "taken away"),
     unseen("reversed axis, two fingers", lambda: _reversed_x, FINGERS, "taken away"),
-    unseen("frame that turns by 1 rad/s", turning(1.0), DEFAULT_HAND),
-    unseen("frame that turns by 1 rad/s, fingers", turning(1.0), FINGERS),
+    unseen("frame that rotates by 1 rad/s", turning(1.0), DEFAULT_HAND),
+    unseen("frame that rotates by 1 rad/s, fingers", turning(1.0), FINGERS),
 )
 """Faults that only the watch finds (``kernel.swing_watch``)."""
 

@@ -201,8 +201,8 @@ class Outcome:
         is_finite: Whether all of it was.
         energy: Largest energy given to the hand beyond what it had put in, in J.
         zero_after: Ticks from the cause to the first zero wrench; None where none came.
-        found_after: Ticks from ``FELT`` to the tick in which the watch lowered the force; None where
-            it did not.
+        found_after: Ticks from ``FELT`` to the tick in which the watch lowers the force; None where
+            it does not.
         last_is_zero: Whether the last write was zero.
         error: What was raised, or nothing.
         ticks: Ticks that were done, and ``rows`` records of them in the file.
@@ -259,4 +259,5 @@ class Outcome:
         )
 
     def has_flag(self, flag: TickFlag) -> bool:
-        return bool((self.flags & int(flag)).any())
+        """Tells whether a flag is up after the start, whose ramp anchors the handle."""
+        return bool((self.flags[CAUSE // 2 :] & int(flag)).any())
