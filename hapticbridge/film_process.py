@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from hapticbridge.audit.replay import Resimulator, obstacle
+from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.snapshot import MAX_CONTACTS
 from hapticbridge.recording.timeline import Timeline
 from hapticbridge.run_description import parameters_of
 
@@ -35,9 +38,6 @@ the picture."""
 MIN_REFERENCE = 0.1
 """Force in N at which the arrow has its full length in a run with smaller forces. Such forces are
 drawn small."""
-
-CONTACT_SIZE = 0.4
-"""Size of a contact's disc relative to MuJoCo's default, which would hide the tool."""
 
 SHADOW = 2048
 """Largest side of the shadow map in pixels. On two busy cores without a graphics card, MuJoCo's
@@ -56,6 +56,39 @@ _PALE, _RED = np.array([0.75, 0.87, 0.98]), np.array([0.70, 0.15, 0.12])
 # pale to dark as well, for colour-blind readers
 _GHOST = (0.1, 0.37, 0.71, 0.45)
 _HAND = (0.90, 0.38, 0.0, 1.0)
+_CONTACT = (0.30, 0.82, 0.88, 1.0)
+
+
+# Forces and their owners: on the hand, on the tool, in contacts
+
+
+def is_held(meta: Mapping[str, str]) -> bool:
+    """Returns True if a hand feels the force of the run's device."""
+    return not DeviceInfo.from_json(meta.get("device", "")).is_prescribed
+
+
+def peak_forces(rows: NDArray[np.void], axes: ArrayLike) -> tuple[float, float]:
+    """Returns the largest force on the hand and on the tool in some records, in N."""
+    hand, tool = force_on_hand(rows, axes), rows["wrench_on_tool"][:, :3]
+    return float(np.linalg.norm(hand, axis=1).max()), float(np.linalg.norm(tool, axis=1).max())
+
+
+def contacts_of(
+    model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
+) -> NDArray[np.float64]:
+    """Returns position in m and force in N of contacts in the world frame, (n, 2, 3).
+
+    Contacts without a force are left out: MuJoCo also lists pairs within their geoms' gap. A tool
+    without mass has none, because MuJoCo solves for no force there.
+    """
+    found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
+    wrench = np.zeros(6)
+    for index in range(data.ncon if parameters.properties.has_tool_mass else 0):
+        mujoco.mj_contactForce(model, data, index, wrench)
+        if wrench[:3].any() and len(found) < MAX_CONTACTS:
+            frame = data.contact.frame[index].reshape(3, 3)
+            found.append((data.contact.pos[index].copy(), frame.T @ wrench[:3]))
+    return np.array(found, dtype=np.float64).reshape(len(found), 2, 3)
 
 
 def force_colour(force: float, reference: float) -> NDArray[np.float64]:
@@ -85,7 +118,10 @@ class Stage:
         data: State at the tick last shown, with contacts as they were solved.
         row: Record of that tick, one element of ``TICK_DTYPE``.
         passed: Records after the tick shown before and before this one.
-        reference: Largest force on the tool in the run, in N, or ``MIN_REFERENCE``.
+        hand_force: Force of the device on the hand at that tick, (3,) in N in the scene's frame;
+            zero for a prescribed motion, which no hand feels.
+        hand_reference: Largest force on the hand in the run, in N, or ``MIN_REFERENCE``.
+        tool_reference: Largest force on the tool in the run, in N, or ``MIN_REFERENCE``.
 
     Raises:
         RecordingError: The file is no recording, or cannot be simulated again here.
@@ -106,11 +142,14 @@ class Stage:
         self._block = next(self._rest)
         self._at = 0  # index within the block
         self.row = self.passed = self._block[:1]
-        forces = (block["wrench_on_tool"][:, :3] for block in self.recording.blocks())
-        largest = (float(np.linalg.norm(force, axis=1).max()) for force in forces)
-        self.reference = max(MIN_REFERENCE, *largest)
+        self._is_held = is_held(self.recording.meta)
+        hand, tool = zip(
+            *(peak_forces(block, self.parameters.axes) for block in self.recording.blocks()),
+            strict=True,
+        )
+        self.hand_reference = max(MIN_REFERENCE, *hand)
+        self.tool_reference = max(MIN_REFERENCE, *tool)
         self._line = Timeline(self.recording.blocks(), self.parameters.period)
-        self._scale_contact_forces()
 
     @property
     def duration(self) -> float:
@@ -168,25 +207,37 @@ class Stage:
                 f"the record of tick {tick} says; 'hapticbridge audit' tells more"
             )
 
-    def _scale_contact_forces(self) -> None:
-        longest = LONGEST_ARROW * self.model.stat.extent / self.reference
-        self.model.vis.map.force = longest * self.model.stat.meanmass
-        self.model.vis.scale.contactwidth *= CONTACT_SIZE
-        self.model.vis.scale.contactheight *= CONTACT_SIZE
+    @property
+    def hand_force(self) -> NDArray[np.float64]:
+        """Force of the device on the hand at the tick shown."""
+        return force_on_hand(self.row, self.parameters.axes)[0] * self._is_held
+
+    def contacts(self) -> NDArray[np.float64]:
+        """Returns the contacts of the tick shown that carry a force; see ``contacts_of``."""
+        return contacts_of(self.model, self.data, self.parameters)
+
+    def add_contacts(self, scene: mujoco.MjvScene) -> None:
+        """Draws the contacts that carry a force into a scene made from ``data``."""
+        size, extent = 0.006 * self.model.stat.extent, self.model.stat.extent
+        contacts = self.contacts()
+        strongest = np.linalg.norm(contacts[:, 1], axis=1).max(initial=self.tool_reference)
+        for place, force in contacts:
+            _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, _CONTACT, position=place, size=size)
+            tip = place + force * (LONGEST_ARROW * extent / strongest)
+            _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, _CONTACT, between=(place, tip), size=size)
 
     def add_coupling(self, scene: mujoco.MjvScene) -> None:
-        """Draws handle, coupling and the force in the hand into a scene made from ``data``."""
+        """Draws handle, coupling and the force on the hand into a scene made from ``data``."""
         row, size = self.row[0], 0.015 * self.model.stat.extent
-        handle, tool = row["handle_position"], row["tool_position"]
-        force = row["wrench_on_tool"][:3]
-        strength = float(np.linalg.norm(force))
-        colour = (*force_colour(strength, self.reference), 1.0)
+        handle, tool, force = row["handle_position"], row["tool_position"], self.hand_force
+        pull = float(np.linalg.norm(row["wrench_on_tool"][:3]))
+        colour = (*force_colour(pull, self.tool_reference), 1.0)
         _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, _GHOST, position=handle, size=size)
         if np.linalg.norm(handle - tool) > 0:
             capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
             _add(scene, capsule, colour, between=(tool, handle), size=0.3 * size)
-        if strength > 0:
-            tip = handle - force * (LONGEST_ARROW * self.model.stat.extent / self.reference)
+        if force.any():
+            tip = handle + force * (LONGEST_ARROW * self.model.stat.extent / self.hand_reference)
             arrow = mujoco.mjtGeom.mjGEOM_ARROW
             _add(scene, arrow, _HAND, between=(handle, tip), size=0.5 * size)
 
@@ -246,14 +297,14 @@ class Camera:
         self._shown.sitegroup[:] = 0
         flags = mujoco.mjtVisFlag
         model.vis.map.alpha = TOOL_ALPHA
-        for flag in (flags.mjVIS_CONTACTPOINT, flags.mjVIS_CONTACTFORCE, flags.mjVIS_TRANSPARENT):
-            self._shown.flags[flag] = True
+        self._shown.flags[flags.mjVIS_TRANSPARENT] = True
         self.renderer = mujoco.Renderer(model, height, width)
 
     def frame(self, tick: int) -> Frame:
         """Returns the picture of a tick, (height, width, 3)."""
         self._stage.show(tick)
         self.renderer.update_scene(self._stage.data, self._camera, self._shown)
+        self._stage.add_contacts(self.renderer.scene)
         self._stage.add_coupling(self.renderer.scene)
         return np.array(self.renderer.render(), dtype=np.uint8)
 

@@ -343,10 +343,6 @@ FADE = 0.02
 """Duration in s of the fading of the wrench. A shorter one feels like a blow, a longer one pushes
 without knowledge of the hand."""
 
-LONGEST_STALL, STALL_PERIODS = 0.05, 5
-"""Longest stall of the loop: 50 ms, or five periods if these are longer. Afterwards the hand's
-position is unknown: at 0.4 m/s it has moved 20 mm."""
-
 IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
 """Force in N and torque in N m, beyond the tool's weight, to which the coupling relaxes while the
 hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
@@ -437,8 +433,8 @@ def guard_parameters_for(
             math.inf if info.rotational_inertia is None else info.rotational_inertia / period,
         ),
         energy_credit_limit=ENERGY_CREDIT,
+        has_hand=True,
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
-        longest_stall=max(LONGEST_STALL, STALL_PERIODS * period),
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,

@@ -11,26 +11,25 @@ from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 class TickFlag(IntFlag):
-    """Bits of the record's ``flags``.
+    """Bits of the record's ``flags``; 8 is in recordings of earlier versions only.
 
     Attributes:
         OVERRUN: The tick started a period or more after its deadline; deadlines were skipped.
         DROPPED_BEFORE: Records before this one were lost because the ring was full.
         FORCE_LIMITED: Force or torque was scaled down to its limit.
-        SLEW_LIMITED: The change of the wrench was cut to the slew limit.
-        RAMPING: The wrench is rising after the start or after a re-anchoring of the coupling.
+        RAMPING: The device gets less than the whole wrench, and the handle follows it in part.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
         CONTACT: MuJoCo found at least one contact in the scene.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had no new sample since the previous tick.
         TRIP: The guard stopped the run in this tick and sent zero wrench. A tick that is not finite
             is not recorded; the event ``trip`` names it.
-        REANCHORED: The coupling was re-anchored before this tick: the handle was set to the tool at
-            the device's present pose, and the wrench rises from zero again.
+        REANCHORED: The handle slipped, or followed the device in part: its pose belongs to the
+            device's present pose from this tick on.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
         SWINGING: The device's force comes late and swings; the force was lowered before this tick
             and stays lower.
@@ -41,7 +40,6 @@ class TickFlag(IntFlag):
     OVERRUN = 1
     DROPPED_BEFORE = 2
     FORCE_LIMITED = 4
-    SLEW_LIMITED = 8
     RAMPING = 16
     CONTROLLER_ACTIVE = 32
     CONTACT = 64
@@ -90,7 +88,8 @@ after the step. Positions are in m, quaternions (w, x, y, z) with w >= 0, energi
 works in J. Wrenches (force in N, torque in N m) are in the world frame about the grip
 (``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
-of that kind. ``share`` is the share of the wrench that ramp and fade transmitted, 0 to 1."""
+of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
+the wrench that was sent, and of the device's motion to the next sample that the handle makes."""
 
 LATER_FIELDS = ("share",)
 """Fields that recordings of earlier versions lack; such a recording is read without them.
@@ -98,6 +97,20 @@ LATER_FIELDS = ("share",)
 A new field needs an entry here, in ``TICK_DTYPE`` and in ``UNITS``, a line in ``kernel.tick`` that
 writes it, and a check in the audit.
 """
+
+
+def force_on_hand(ticks: NDArray[np.void], axes: ArrayLike) -> NDArray[np.float64]:
+    """Returns the force of the device on the hand in the scene's frame, (n, 3) in N.
+
+    It is ``wrench_on_device``, what the motors were sent, and opposite to the force on the tool
+    times ``force_scale`` and the recorded share.
+
+    Args:
+        ticks: Records, ``TICK_DTYPE``, (n,).
+        axes: Row-major rotation from the device's frame to the scene's, 9 numbers.
+    """
+    rotation = np.asarray(axes, dtype=np.float64).reshape(3, 3)
+    return np.asarray(ticks["wrench_on_device"][:, :3] @ rotation.T)
 
 
 def has_flag(ticks: NDArray[np.void], flag: TickFlag) -> NDArray[np.bool_]:

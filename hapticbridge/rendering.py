@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import DeviceError, SceneError, choices
+from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME, Scheme
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
@@ -151,6 +151,116 @@ def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> No
             f"method '{method.name}' on a real device: {method.hazard}; use 'implicit', or consent "
             "with --i-know (Bridge(i_know=True))"
         )
+
+
+# Coupling of a run under its three names
+
+
+@dataclass(frozen=True, slots=True)
+class RunCoupling:
+    """Coupling of a run: as requested, in the law, and effective at the hand.
+
+    Attributes:
+        requested: K and B that the user asked for; None if unknown.
+        law: K and B of the law, whose B counts in the device condition b >= K T/2 + B. It is
+            smaller than the requested B if the integration adds damping by itself. None without a
+            coupling law.
+        effective: K and B that a hand meets away from contact, to first order in the time step;
+            None if the method gives no number.
+        remark: Reason of an effective coupling that the method's name does not suggest, or empty.
+    """
+
+    requested: Coupling | None
+    law: Coupling | None
+    effective: Coupling | None
+    remark: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        method: Method,
+        timestep: float,
+        requested: Coupling | None = None,
+        *,
+        law: Coupling | None = None,
+        measured: Coupling | None = None,
+        is_always_implicit: bool = False,
+    ) -> RunCoupling:
+        """Completes the three couplings from the requested one, or from the law's.
+
+            B_effective = B_law + added_share K h
+
+        Args:
+            method: The rendering method.
+            timestep: MuJoCo's h in s.
+            requested: The requested coupling; None if unknown.
+            law: K and B of the law; None computes it from ``requested``.
+            measured: Effective coupling of a weld.
+            is_always_implicit: True if the tool of a lossless coupling is never free. The coupling
+                is then always implicit and adds the implicit form's damping.
+        """
+        if not method.has_law:
+            return cls(requested, None, measured)
+        if law is None:
+            if requested is None:
+                raise HapticBridgeError("a coupling needs its requested or its law's gains")
+            law = method.law_coupling(requested, timestep)
+        adds, remark = method.added_share, ""
+        if is_always_implicit and method.scheme == Scheme.MIDPOINT:
+            adds, remark = IMPLICIT_SHARE, f"{method.name} is always implicit here"
+        if adds is None:
+            return cls(requested, law, None)
+        effective = replace(
+            law,
+            damping=effective_damping(law.stiffness, law.damping, timestep, adds),
+            rotational_damping=effective_damping(
+                law.rotational_stiffness, law.rotational_damping, timestep, adds
+            ),
+        )
+        return cls(requested, law, effective, remark)
+
+    def sentences(self) -> tuple[str, ...]:
+        """Returns a sentence on translation, and one on rotation if it has a spring.
+
+        ``K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7)``. Without an effective
+        coupling the next name comes first.
+        """
+        named = {name: getattr(self, name) for name in ("effective", "law", "requested")}
+        known = {name: coupling for name, coupling in named.items() if coupling is not None}
+        if not known:
+            return ()
+        first = next(iter(known))
+        notes = [] if self.effective is not None or self.law is None else ["effective unknown"]
+        notes += [self.remark] if self.remark else []
+        return tuple(
+            _sentence(first, known, symbols, notes)
+            for symbols in (_TRANSLATION, _ROTATION)
+            if getattr(known[first], symbols[0]) > 0
+        )
+
+
+_TRANSLATION = "stiffness", "damping", "K", "B", "N/m", "N s/m"
+_ROTATION = "rotational_stiffness", "rotational_damping", "K_r", "B_r", "N m/rad", "N m s/rad"
+
+
+def _sentence(
+    first: str, known: dict[str, Coupling], symbols: tuple[str, ...], notes: list[str]
+) -> str:
+    spring, damper, k, b, spring_unit, damper_unit = symbols
+    stiffness = getattr(known[first], spring)
+    others = []
+    for name, coupling in known.items():
+        if name != first:
+            other, damping = getattr(coupling, spring), f"{getattr(coupling, damper):.4g}"
+            is_equal = math.isclose(other, stiffness)
+            others.append(
+                f"{name} {damping if is_equal else f'{k} = {other:.4g}, {b} = {damping}'}"
+            )
+    beside = f" ({', '.join([*others, *notes])})" if others or notes else ""
+    return (
+        f"{k} = {stiffness:.4g} {spring_unit}, "
+        f"{b} = {getattr(known[first], damper):.4g} {damper_unit} {first}{beside}"
+    )
 
 
 # Rendering methods of the product, and the registry of all methods

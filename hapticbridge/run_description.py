@@ -205,6 +205,7 @@ def describe_run(
     parameters: RunParameters,
     binding: BoundKernel,
     *,
+    requested: Coupling,
     method: str,
     device: DeviceInfo,
     clock: str,
@@ -224,7 +225,8 @@ def describe_run(
         "ramp_ticks": str(parameters.ramp_ticks),
         "guard": parameters.guarding.to_json(),
         "method": method,
-        "felt": json.dumps(effective and [getattr(effective, name) for name in _GAINS]),
+        "requested": json.dumps([getattr(requested, name) for name in _GAINS]),
+        "effective": json.dumps(effective and [getattr(effective, name) for name in _GAINS]),
         "discretization": method_named(method).discretization,
         "grip": parameters.grip,
         "clock": clock,
@@ -245,7 +247,28 @@ def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
     """Returns a weld's measured coupling; None for other methods."""
     if not method.is_weld:
         return None
-    return Coupling(*meta_numbers(meta, "felt", len(_GAINS)))
+    return Coupling(*meta_numbers(meta, "effective", len(_GAINS)))
+
+
+def requested_of(meta: Mapping[str, str]) -> Coupling:
+    """Returns the requested coupling of a recorded run; its law follows from it.
+
+    Raises:
+        RecordingError: It is missing or out of range, or the method makes another law of it.
+    """
+    numbers = meta_numbers(meta, "requested", len(_GAINS))
+    parameters, method = parameters_of(meta), method_named(meta["method"])
+    try:
+        requested = Coupling(*numbers)
+        law = method.law_coupling(requested, parameters.period / parameters.substeps)
+    except HapticBridgeError as error:
+        raise RecordingError(f"metadata 'requested' is out of range: {error}") from None
+    if law != parameters.coupling:
+        raise RecordingError(
+            f"metadata 'requested' is {meta['requested']!r:.80}, of which method '{method.name}' "
+            "makes another law than the recorded one"
+        )
+    return requested
 
 
 def parameters_of(meta: Mapping[str, str]) -> RunParameters:

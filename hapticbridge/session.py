@@ -286,6 +286,7 @@ class Session:
             self.setup.scene,
             self.parameters,
             self.kernel.bound,
+            requested=self.setup.coupling,
             method=self.setup.method.name,
             device=self.device.info,
             clock=self.clock.name,
@@ -429,6 +430,7 @@ class Session:
             dropped=self.stream.dropped,
             stopped_by=self.stopped_by,
             recording=self.output.path,
+            is_realtime=self.setup.is_realtime,
         )
         setup = self.setup
         return Summary.of(

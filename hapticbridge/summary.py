@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS
 from hapticbridge.kernel.lossless import tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
-from hapticbridge.rendering import Method
-from hapticbridge.theory.compensation import IMPLICIT_SHARE, effective_damping
+from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 
 # Sentences on the effective coupling and its law
 
@@ -42,61 +42,6 @@ def was_always_implicit(ticks: NDArray[np.void]) -> bool:
 def was_never_lossless(count: int, flags: int) -> bool:
     """Returns True if no record was lossless, by the number of records and their combined flags."""
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
-
-
-def coupling_sentences(
-    law: Coupling, method: Method, period: float, substeps: int, *, is_always_implicit: bool = False
-) -> tuple[str, ...]:
-    """Describes effective and law coupling: translation, then rotation if it has a spring.
-
-        B = B' + adds K h,    h = T / substeps        (away from contact, to first order in h)
-
-    A hand feels K and B. The law uses a smaller B' if the integration adds damping by itself, and
-    the device condition b >= K T/2 + B' counts B'.
-
-    Args:
-        law: K and B' of the law.
-        method: The rendering method; without a coupling law there are no sentences.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
-        is_always_implicit: True if the tool of a lossless coupling is never free. The coupling is
-            then always implicit and adds the implicit form's damping. No effect on other methods.
-    """
-    if not method.has_law:
-        return ()
-    kinds = [_AxisGains("K", "B", law.stiffness, law.damping, "N/m", "N s/m")]
-    if law.rotational_stiffness > 0:
-        rotation = law.rotational_stiffness, law.rotational_damping
-        kinds.append(_AxisGains("K_r", "B_r", *rotation, "N m/rad", "N m s/rad"))
-    name, adds = method.name, method.added_share
-    if is_always_implicit and method.scheme == Scheme.MIDPOINT:
-        name, adds = f"{name}, here always implicit,", IMPLICIT_SHARE
-    return tuple(_sentence(name, adds, period / substeps, substeps, kind) for kind in kinds)
-
-
-class _AxisGains(NamedTuple):
-    """Gains of the law along one kind of axis, with their symbols and units."""
-
-    spring: str
-    damper: str
-    stiffness: float
-    damping: float
-    spring_unit: str
-    damper_unit: str
-
-
-def _sentence(name: str, adds: float | None, step: float, substeps: int, gains: _AxisGains) -> str:
-    spring, damper, stiffness, damping, spring_unit, damper_unit = gains
-    start = f"{spring} = {stiffness:.4g} {spring_unit}, {damper} ="
-    if adds is None:
-        return f"{start} {damper}' = {damping:.4g} {damper_unit} ({name} uses it as requested)"
-    effective = effective_damping(stiffness, damping, step, adds)
-    parts = substeps / adds
-    added = ("KT" if spring == "K" else f"{spring} T") + (f"/{parts:g}" if parts != 1 else "")
-    return (
-        f"{start} {effective:.4g} {damper_unit} felt ({name} adds {added} to its {damper}' = "
-        f"{damping:.4g})"
-    )
 
 
 def watch_sentence(flags: int) -> str:
@@ -215,6 +160,7 @@ class RunOutcome:
         stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
             ``Bridge.stop``.
         recording: The recording, or None.
+        is_realtime: True if real time was requested from the system.
     """
 
     ticks: int
@@ -223,6 +169,10 @@ class RunOutcome:
     dropped: int
     stopped_by: str
     recording: Path | None
+    is_realtime: bool
+
+
+_PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,8 +185,12 @@ class Summary:
         overruns: Ticks that started a period or more after their deadline.
         skipped: Skipped deadlines.
         dropped: Records lost because the recorder was too far behind.
-        peak_force: Largest norm of the force on the tool in N.
-        peak_torque: Largest norm of the torque on the tool in N m.
+        peak_force: Largest norm of the force on the hand in N; without a hand, as a prescribed
+            motion has none, of the force that would be on it.
+        peak_torque: Largest norm of the torque on the hand in N m.
+        peak_tool_force: Largest norm of the force on the tool in N. It differs from that on the
+            hand by ``force_scale``, and while the force rises or fades.
+        peak_tool_torque: Largest norm of the torque on the tool in N m.
         energies: Energies by name in J.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used.
@@ -244,19 +198,16 @@ class Summary:
         about: Description of the method in a sentence.
         hazard: Hazard on a real device beyond the device condition, in a sentence; empty without
             one.
-        requested: Requested coupling: K and B to be felt.
-        law: Coupling of the law, with the damping B' of the device condition.
-        coupling_sentences: Sentences on effective and law coupling. They hold away from contact, or
-            everywhere if the tool was never released.
-        effective: Effective coupling of a weld (its stiffest axis, measured at the start); None
-            with a coupling law.
+        coupling: Requested, law and effective coupling. For a weld the effective one is that of its
+            stiffest axes, measured at the start.
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
             coupling law the device port is not metered during the run. A certified device needs no
             metering; for any other the audit of the recording decides.
         conditions: Device conditions, as sentences.
-        is_certified: True if b >= scale · force_scale · (KT/2 + B') holds for the device in
-            translation and rotation. None if its damping is unknown, or if no coupling law makes
-            the condition sufficient.
+        is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
+            translation and rotation, and the run kept its time. None if its damping is unknown, or
+            if no coupling law makes the condition sufficient.
+        timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
@@ -271,19 +222,19 @@ class Summary:
     dropped: int
     peak_force: float
     peak_torque: float
+    peak_tool_force: float
+    peak_tool_torque: float
     energies: dict[str, float]
     environment: str
     slack_share: float
     method: str
     about: str
     hazard: str
-    requested: Coupling
-    law: Coupling
-    coupling_sentences: tuple[str, ...]
-    effective: Coupling | None
+    coupling: RunCoupling
     fault: tuple[int, str] | None
     conditions: tuple[str, ...]
     is_certified: bool | None
+    timekeeping: Timekeeping
     stopped_by: str
     recording: Path | None
     reach: float | None
@@ -307,33 +258,40 @@ class Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
+        timing = state["timing"][0]
+        times = RunTimes(
+            ticks=outcome.ticks,
+            due=outcome.ticks + outcome.skipped,
+            mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
+            delay_energy=float(timing["most_uncovered"]),
+            is_realtime=outcome.is_realtime,
+        )
+        timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,
             overruns=outcome.overruns,
             skipped=outcome.skipped,
             dropped=outcome.dropped,
-            peak_force=float(state["loop"]["peak_force"][0]),
-            peak_torque=float(state["loop"]["peak_torque"][0]),
+            **{name: float(state["loop"][name][0]) for name in _PEAKS},
             energies=ledger.energies(),
             environment=ledger.environment,
             slack_share=ledger.slack_share,
             method=method.name,
             about=method.about,
             hazard=method.hazard,
-            requested=requested,
-            law=parameters.coupling,
-            coupling_sentences=coupling_sentences(
-                parameters.coupling,
+            coupling=RunCoupling.of(
                 method,
-                parameters.period,
-                parameters.substeps,
+                parameters.period / parameters.substeps,
+                requested,
+                law=parameters.coupling,
+                measured=parameters.effective,
                 is_always_implicit=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
             ),
-            effective=parameters.effective,
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
-            is_certified=is_run_certified(conditions, method),
+            is_certified=timekeeping.certified(is_run_certified(conditions, method)),
+            timekeeping=timekeeping,
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,

@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.plotting import new_figure
-from hapticbridge.rendering import COMPENSATED, IMPLICIT, Method, default_method
+from hapticbridge.rendering import (
+    COMPENSATED,
+    IMPLICIT,
+    Method,
+    RunCoupling,
+    default_method,
+)
 from hapticbridge.theory.bounds import minimum_damping, worst_frequency
-from hapticbridge.theory.compensation import effective_damping
 from hapticbridge.theory.spectrum import damping_spectrum
 from hapticbridge.theory.transfer import Discretization
 from hapticbridge.theory.transmission_line import transmission_line_spectrum
@@ -61,12 +66,12 @@ class Alternative:
 def alternatives(requested: Coupling, period: float, filter_time: float) -> tuple[Alternative, ...]:
     """Returns the requirements of a coupling by method, and by each way around the bound.
 
-    The methods with a guarantee come first, the default one leading. Each uses the damping B' of
-    ``Method.law_coupling``; if that would be negative, the effective damping exceeds the requested
-    one. Laws with B' = B follow: at half the period; with a first-order low-pass behind the damper;
-    with Tustin's damper; with one sample of delay against a wall, and for any environment. Last is
-    a lossless transmission line of equal static stiffness, with impedance Z = K T and one sample
-    each way, terminated by the device.
+    The methods with a guarantee come first, the default one leading. Each uses the law of
+    ``Method.law_coupling``; if its damping would be negative, the effective damping exceeds the
+    requested one. Laws with the requested damping follow: at half the period; with a first-order
+    low-pass behind the damper; with Tustin's damper; with one sample of delay against a wall, and
+    for any environment. Last is a lossless transmission line of equal static stiffness, with
+    impedance Z = K T and one sample each way, terminated by the device.
 
     Args:
         requested: Requested K and B; only the translation counts.
@@ -102,21 +107,21 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
 
     def by(method: Method) -> Alternative:
         used = method.law_coupling(requested, period)
-        shown = effective_damping(used.stiffness, used.damping, period, method.added_share or 0.0)
-        name = f"method {method.name}: B = {shown:.4g} felt, B' = {used.damping:.4g}"
+        shown = RunCoupling.of(method, period, requested).effective or used
+        name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
     methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B
-    anywhere = Alternative("B' = B, one tick late, any environment", float("inf"), None, None)
+    anywhere = Alternative("B_law = B, one tick late, any scene", float("inf"), None, None)
     return (
         *methods,
-        way("B' = B at half the period", step=period / 2),
-        way(f"B' = B, low-pass of {1e3 * filter_time:g} ms on the damper", low_pass=filter_time),
-        way("B' = B, Tustin's damper", scheme="tustin"),
-        way("B' = B, one tick late, against a wall", delay=1),
+        way("B_law = B at half the period", step=period / 2),
+        way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
+        way("B_law = B, Tustin's damper", scheme="tustin"),
+        way("B_law = B, one tick late, against a wall", delay=1),
         anywhere,
         Alternative(
             "transmission line of that stiffness", float(line.max()), None, (frequency, line)
@@ -164,8 +169,13 @@ def draw_alternatives(
 
 
 def recommended(z: ZWidth) -> Coupling:
-    """Returns the corner as a requested coupling of the default method, without clipping of B'."""
+    """Returns the coupling to request of the default method, whose law is then the corner."""
     return default_method().requested_coupling(z.corner, z.period)
+
+
+def recommended_coupling(z: ZWidth) -> RunCoupling:
+    """Returns the recommended coupling as requested, in the law and effective."""
+    return RunCoupling.of(default_method(), z.period, recommended(z), law=z.corner)
 
 
 def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | None = None) -> Figure:
@@ -192,8 +202,8 @@ def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | Non
     corner = z.corner
     axes.plot(corner.damping, corner.stiffness, "o", color="black", ms=7, label="to be used")
     axes.annotate(
-        f"K = {corner.stiffness:.4g} N/m\nB' = {corner.damping:.3g} N s/m\n"
-        f"B = {recommended(z).damping:.3g} N s/m felt",
+        f"K = {corner.stiffness:.4g} N/m\nB = {recommended(z).damping:.3g} N s/m effective\n"
+        f"(law {corner.damping:.3g})",
         (corner.damping, corner.stiffness),
         xytext=(0, -10),
         textcoords="offset points",
@@ -210,7 +220,7 @@ def draw_z_width(z: ZWidth, measured: Sequence[tuple[float, float, float]] | Non
         region = max(region, max(stiffness) / HIGHEST_SHOWN)
     axes.set_ylim(0, min(1.08 * highest, HIGHEST_SHOWN * region))
     axes.set_xlim(0, z.damping[-1])
-    axes.set_xlabel("damping that the coupling uses, B' (N s/m)")
+    axes.set_xlabel("damping of the law, B_law (N s/m)")
     axes.set_ylabel("coupling stiffness K (N/m)")
     axes.grid(alpha=0.3)
     facts = [f"b = {z.device_damping:g} N s/m", f"{1 / z.period:g} Hz"]

@@ -4,17 +4,52 @@ from __future__ import annotations
 
 import math
 
-_PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
+_PREFIXES = (
+    (1e6, "M"),
+    (1e3, "k"),
+    (1.0, ""),
+    (1e-3, "m"),
+    (1e-6, "µ"),
+    (1e-9, "n"),
+    (1e-12, "p"),
+)
 
 
 def format_si(value: float, unit: str) -> str:
     """Formats a number with an SI prefix and three digits: ``-3.41 mJ``, ``0 J``."""
-    if value == 0 or not math.isfinite(value):
+    if value == 0:
+        return f"0 {unit}"  # without the sign of -0.0
+    if not math.isfinite(value):
         return f"{value:g} {unit}"
+    rounded = float(f"{value:.3g}")  # 0.9996 J is 1 J and not 1e+03 mJ
     for factor, prefix in _PREFIXES:
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}{unit}"
+        if abs(rounded) >= factor:
+            return f"{rounded / factor:.3g} {prefix}{unit}"
     return f"{value:.2g} {unit}"
+
+
+def format_forces(hand: float | None, tool: float, unit: str = "N") -> str:
+    """Names whose a force or torque is: ``1.7 N on the hand, 5.67 N on the tool``.
+
+    ``hand`` is None without a hand that feels it. Equal numbers are written once, as the hand's.
+    """
+    return format_wrenches(None if hand is None else (hand,), (tool,), (unit,))
+
+
+def format_wrenches(
+    hand: tuple[float, ...] | None, tool: tuple[float, ...], units: tuple[str, ...] = ("N", "N m")
+) -> str:
+    """Names whose the force and the torque are; as ``format_forces`` for both at once."""
+    texts = [
+        ", ".join(format_si(value, unit) for value, unit in zip(values, units, strict=True))
+        for values in (hand, tool)
+        if values is not None
+    ]
+    if hand is None:
+        return f"{texts[0]} on the tool"
+    if texts[0] == texts[1]:
+        return f"{texts[0]} on the hand"
+    return f"{texts[0]} on the hand; {texts[1]} on the tool"
 
 
 def format_energy(joules: float) -> str:

@@ -4,7 +4,8 @@ A hand here is a source of motion: it moves the device as it likes, up to 3 m/s,
 force without noise or delay. It pumps, stretches the coupling far beyond the force limit and
 yields, presses and releases buttons, and changes the coupling while it is stretched. The device
 has just the damping b that the coupling needs. ``Attack.run`` returns the most energy that the hand
-ever had in hand beyond what b had burned and the scene had given up of its own storage.
+ever had in hand beyond what b had burned, the scene had given up of its own storage, and the
+coupling had booked as owed by late samples.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ SCENES = (
 )
 HEAVY = ("point_mass",)
 """Scenes whose tool gets a random mass."""
+
+UNPAID = 1e-6
+"""Largest energy in J that a hand may have beyond what it put in; rounding leaves less."""
 
 HANDS = 5
 CHUNK = 50
@@ -153,8 +157,6 @@ def _attack(
         _shorten(d, FASTEST * elapsed)
         _shorten(t, FASTEST_TURN * elapsed)
         h.net += np.sum((w[:3] - b / elapsed * d) * d) + np.sum((w[3:] - b_r / elapsed * t) * t)
-        released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
-        h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * released)
         h.position[:] += d
         _turn(h.quaternion, t)
         sample[0].buttons = int(habits[6])
@@ -169,6 +171,10 @@ def _attack(
         code = after_step(state, row, 0)
         if code != OK:
             return code
+        released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
+        # a force that was held too long may have given more than its spring held; that is owed
+        owed = s.coupling.owed[0] + s.coupling.owed[1]
+        h.most = max(h.most, h.net + s.run.force_scale / s.run.scale * (released - owed))
         h.saturated += s.level.flags != 0
         h.tick += 1
     return OK
@@ -249,7 +255,9 @@ class Attack:
             scheme=method.scheme,
             device_damping=b,
             device_rotational_damping=b_r,
-            guarding=GuardParameters(clutch=1, fade_ticks=max(round(0.02 / period), 1)),
+            guarding=GuardParameters(
+                clutch=1, fade_ticks=max(round(0.02 / period), 1), has_hand=True
+            ),
         )
         kernel = BoundKernel(scene.model, scene.data, parameters)
         hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)

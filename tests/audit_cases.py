@@ -234,6 +234,10 @@ class SlowClock(SimulatedClock):
         self._now += (1 + skipped) * self._period
         return self._now, self.now(), skipped
 
+    def spend(self, share: float) -> None:
+        """Lets a share of the period pass within the tick."""
+        self._lateness += round(share * self._period)
+
     def now(self) -> int:
         return self._now + self._lateness
 

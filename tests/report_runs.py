@@ -150,7 +150,8 @@ def active_by_repeated_samples(folder: Path) -> Path:
     device = LossyDevice(mass=0.4, damping=2.0, hand=LIGHT_HAND)
     # a device whose delay is known would be certified, and not be watched
     device.info = replace(device.info, delay=None)
-    recorded(path, str(scene), device, Coupling(3500.0, 0.05, 0.1, 1e-4), duration=2.0, limits=FULL)
+    coupling = Coupling(3500.0, 0.05, 0.1, 1e-4)
+    recorded(path, str(scene), device, coupling, duration=2.0, limits=FULL, is_guarded=False)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.wrench_limits import wrench_deviations
 from hapticbridge.coupling import Coupling
+from hapticbridge.guard import Limits
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
@@ -126,14 +128,17 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     coupling = Coupling(2e4, 0.5, 2.4, 5e-4)
 
     def press(tick: int) -> tuple[float, ...]:
-        x = 0.0115 * min(tick / 100, 1) + 1e-3 * np.sin(2 * np.pi * 0.02 * tick)
+        since = max(tick - 60, 0)  # the force has risen
+        x = 0.0115 * min(since / 100, 1) + 1e-3 * np.sin(2 * np.pi * 0.02 * since)
         return (x, 0, 0, 1, 0, 0, 0)
 
     path = tmp_path / "wall.mcap"
-    recorded(path, scene, ScriptedDevice(press), coupling, duration=0.3)
+    device = ScriptedDevice(press, strength=100.0, damping=20.0)
+    limits = Limits(force=100.0, torque=5.0, ramp=0.05, energy=math.inf)
+    recorded(path, scene, device, coupling, duration=0.3, limits=limits)
     report = audit(path)
     assert (report.verdict, report.exit_code) == ("active", 1)
-    assert report.tick is not None and 100 < report.tick < 140
+    assert report.tick is not None and 160 < report.tick < 200
     assert read_recording(path).ticks["contacts"][report.tick - 10 : report.tick].any()
 
 
@@ -173,7 +178,11 @@ def test_certificate_is_the_device_condition_with_what_is_used(
     report = audit(path)
     assert report.verdict == "passive"
     assert report.certified is certified
-    assert "B' = 0.5" in report.coupling_sentences[0]
+    assert "law 0.5" in report.coupling_sentences[0]
+    assert report.coupling is not None
+    assert report.coupling.requested == felt
+    assert report.coupling.law is not None
+    assert report.coupling.law.damping == pytest.approx(0.5)
     assert report.exit_code == (0 if certified else 1)
     assert any("<" in sentence for sentence in report.conditions) is not certified
 

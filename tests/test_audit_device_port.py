@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,7 @@ from audit_cases import ScriptedDevice, balance_of, recorded
 from random_hands import random_motion
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.energy import (
-    EnergyBalance,
-    SpringPath,
-    stored_in_coupling,
-    work_of_commands,
-)
+from hapticbridge.audit.energy import EnergyBalance, released_by_coupling
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import Limits
@@ -44,92 +40,56 @@ RUN = RunParameters(
 )
 
 
-@pytest.mark.parametrize("change", [0.0, 0.5])
-def test_the_balance_is_the_identity_behind_the_bound(change: float) -> None:
-    """Any motion of handle and tool; the first tick is a jump of both, out of rest.
+def held(run: RunParameters, stretch: np.ndarray) -> np.ndarray:
+    """Returns what the coupling's springs hold at some stretches."""
+    gains = np.tile([run.coupling.stiffness, run.coupling.damping, 0.0, 0.0], (len(stretch), 1))
+    motion: Any = SimpleNamespace(stretch=stretch, twist=np.zeros_like(stretch))
+    return released_by_coupling(run, gains, motion)
 
-    Also where K and B are others in every tick: what that does to the spring is the command's.
-    """
+
+def test_the_balance_is_the_identity_behind_the_bound() -> None:
+    """Any motion of handle and tool out of rest."""
     generator = np.random.default_rng(5)
-    count = 40
-    k = RUN.coupling.stiffness * (1 + change * generator.uniform(-1, 1, count))
-    b = RUN.coupling.damping * (1 + change * generator.uniform(-1, 1, count))
-    none = np.zeros(count)
-    gains = np.stack([k, b, none, none], axis=1)
-    gains_before = np.concatenate([gains[:1], gains[:-1]])
+    count, k, b = 40, RUN.coupling.stiffness, RUN.coupling.damping
     h, x = generator.normal(0, 1e-3, (2, count, 3))
+    h[0] = x[0] = 0.0
     d, moved = (np.diff(v, axis=0, prepend=np.zeros((1, 3))) for v in (h, x))
     e, de = h - x, d - moved
-    force = k[:, None] * e + b[:, None] / T * de
-    still = np.zeros((count, 3))
-    whole = np.ones(count)
-    paths = (
-        SpringPath(e + moved, e, de, np.sum(force * moved, axis=1), whole),
-        SpringPath(still, still, still, none, whole),
-    )
-    share_before = np.concatenate([[0.0], whole[:-1]])
-    is_start = np.arange(count) == 0
-    parts, held = stored_in_coupling(RUN, gains, paths, is_start, whole, share_before)
-    parts = parts - work_of_commands(RUN, gains_before, gains, paths, share_before)
-    kept = np.cumsum(parts) + held
+    force = k * e + b / T * de
+    kept = np.sum(force * moved) + held(RUN, e)[-1]
 
-    def norm(v: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
+    def norm(v: np.ndarray, weight: float) -> np.ndarray:
         return np.asarray(weight * np.sum(v**2, axis=-1))
 
-    own = 1.5  # N s/m, burnt over every tick but the jump
+    own = 1.5  # N s/m, burnt over every tick
     last = count - 1
     given = -np.sum(force[:-1] * d[1:]) - np.sum(norm(d[1:], own / T))
     middle, before = slice(1, last), slice(0, last - 1)
     squares = (
-        norm(moved[middle], (k + b / T)[middle] / 2)
-        + norm(de[before] + d[middle], b[before] / T / 2)
-        + norm(d[middle], (own - (b[before] + b[middle]) / 2) / T - k[before] / 2)
+        norm(moved[middle], (k + b / T) / 2)
+        + norm(de[before] + d[middle], b / T / 2)
+        + norm(d[middle], (own - b) / T - k / 2)
     ).sum()
-    squares += norm(de[last - 1] + d[last], b[last - 1] / T / 2)
-    squares += norm(d[last], own / T - k[last - 1] / 2 - b[last - 1] / T / 2)
-    squares += norm(moved[last], k[last] / 2) - b[last] / T * np.sum(de[last] * moved[last])
-    assert given + kept[last] == pytest.approx(-squares, rel=1e-12)
+    squares += norm(de[last - 1] + d[last], b / T / 2)
+    squares += norm(d[last], own / T - k / 2 - b / T / 2)
+    squares += norm(moved[last], k / 2) - b / T * np.sum(de[last] * moved[last])
+    assert given + kept == pytest.approx(-squares, rel=1e-12)
 
 
-def kept(
-    run: RunParameters, stretch: list[float], passed: float = 1.0, work: float = 0.0
-) -> list[float]:
-    """Returns what was kept after each tick from the start, of a spring along x."""
-    count = len(stretch)
-    e = np.zeros((count, 3))
-    e[:, 0] = stretch
-    none = np.zeros((count, 3))
-    coupling = run.coupling
-    gains = np.tile([coupling.stiffness, coupling.damping, 0.0, 0.0], (count, 1))
-    share = np.minimum(np.arange(1.0, count + 1) / (run.ramp_ticks + 1), 1.0)
-    paths = (
-        SpringPath(e, e, none, np.full(count, work), np.full(count, passed)),
-        SpringPath(none, none, none, np.zeros(count), np.ones(count)),
-    )
-    share_before = np.concatenate([[0.0], share[:-1]])
-    is_start = np.arange(count) == 0
-    parts, held = stored_in_coupling(run, gains, paths, is_start, share, share_before)
-    return [float(value) for value in np.cumsum(parts) + held]
-
-
-def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit() -> None:
+@pytest.mark.parametrize(
+    ("changed", "spring"),
     # K = 2000 N/m: 1 N at 0.5 mm, 0.5 N at 0.25 mm
-    for run, spring in (
-        (replace(RUN, force_limit=1.0), 0.25e-3 + 1.5e-3),
-        (replace(RUN, force_limit=1.0, force_scale=2.0), 0.0625e-3 + 0.5 * 1.75e-3),
-        (RUN, 4e-3),
-    ):
-        assert kept(run, [0.0, 2e-3]) == pytest.approx([0.0, spring])
-
-
-def test_a_force_that_rises_finds_the_spring_stretched() -> None:
-    run = replace(RUN, ramp_ticks=1)  # half of the force in the first tick
-    assert kept(run, [1e-3, 1e-3]) == pytest.approx([0.0, 0.0], abs=1e-15)
-    assert kept(run, [1e-3, 2e-3]) == pytest.approx([0.0, 0.5 * (4e-3 - 1e-3)])
-
-
-def test_work_counts_as_far_as_its_force_reached_the_device() -> None:
-    assert kept(RUN, [0.0, 0.0, 0.0], passed=0.25, work=8.0) == [0.0, 2.0, 4.0]
+    [
+        ({"force_limit": 1.0}, 0.25e-3 + 1.5e-3),
+        ({"force_limit": 1.0, "force_scale": 2.0}, 0.0625e-3 + 0.5 * 1.75e-3),
+        ({}, 4e-3),
+    ],
+)
+def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit(
+    changed: dict[str, float], spring: float
+) -> None:
+    stretch = np.array([[0.0, 0.0, 0.0], [2e-3, 0.0, 0.0]])
+    assert held(replace(RUN, **changed), stretch) == pytest.approx([0.0, spring])
 
 
 def test_half_the_force_is_half_the_energy(tmp_path: Path) -> None:

@@ -56,7 +56,6 @@ def test_deadlines_must_follow_the_period_and_the_overrun_flag(
         TickFlag.DROPPED_BEFORE,
         TickFlag.RAMPING,
         TickFlag.CLUTCH,
-        TickFlag.REANCHORED,
     ],
 )
 def test_a_flag_that_its_record_contradicts_is_found_without_a_simulation(

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
+from hapticbridge.export import export
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.format import Digest
 from hapticbridge.run_description import (
@@ -115,7 +116,7 @@ def test_no_changed_parameter_is_missed(
 def test_no_changed_pose_of_the_start_is_missed(held: Recording, folder: Path, name: str) -> None:
     numbers = json.loads(held.meta[name])
     for index in range(len(numbers)):
-        if (name, index) == ("device_start", 3):
+        if index == 3:
             continue  # the scalar part of no rotation: any length of it is no rotation
         other = [*numbers]
         other[index] += 1e-12
@@ -232,36 +233,17 @@ def test_numpy_alone_finds_what_exceeds_its_tolerance(
     assert report.resimulation == ""
 
 
-OLDER = {"versions": json.dumps(versions() | {"hapticbridge": "0.0.1"})}
-
-
-@pytest.mark.parametrize("meta", [{}, OLDER])
-def test_a_recording_without_the_share_is_read_judged_and_repaired(
-    tap: Recording, held: Recording, tmp_path: Path, meta: dict[str, str]
+def test_a_recording_of_an_earlier_version_is_refused_exported_and_repaired(
+    tap: Recording, tmp_path: Path
 ) -> None:
-    for number, recording in enumerate((tap, held)):
-        old = tmp_path / f"{number}.mcap"
-        rewritten(recording, old, ticks=without_share(recording), meta=meta)
-        assert "share" not in (read_recording(old).ticks.dtype.names or ())
-        report = audit(old)
-        assert report.verdict == "passive", report.reason
-        assert report.energies == pytest.approx(audit(recording.path).energies)
-        if meta:
-            assert "without 'share' by an earlier version" in report.unchecked
-        else:
-            assert report.resimulation == "bit for bit"
-        old.write_bytes(old.read_bytes()[:-100])
-        assert repair(old, tmp_path / f"{number}_mended.mcap").record == without_share(tap).dtype
-
-
-@pytest.mark.parametrize(("name", "amount"), [("wrench_on_tool", 1e-6), ("wrench_on_device", 11.0)])
-def test_a_recording_without_the_share_is_still_held_to_law_and_limit(
-    held: Recording, folder: Path, name: str, amount: float
-) -> None:
-    ticks = without_share(held)
-    ticks[name][150, 2] += amount
-    report = verdict_of(held, folder, ticks=ticks, meta=OLDER)
-    assert (report.verdict, report.port, report.tick) == ("invalid", name, 150)
+    old, mended = tmp_path / "old.mcap", tmp_path / "mended.mcap"
+    rewritten(tap, old, ticks=without_share(tap))
+    report = audit(old)
+    assert report.verdict == "invalid"
+    assert "recorded by an earlier version" in report.reason
+    assert export(old, "csv").recording.count == len(tap.ticks)
+    old.write_bytes(old.read_bytes()[:-100])
+    assert repair(old, mended).record == without_share(tap).dtype
 
 
 def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder: Path) -> None:

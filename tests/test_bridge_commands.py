@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Command, Couple, Mark, Reset, Switch
 from hapticbridge.commands.execution import tuning_ticks
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CommandError, DeviceError, RecordingError, SafetyTrip
+from hapticbridge.errors import CommandError, DeviceError, RecordingError
 from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording
 
@@ -138,30 +137,36 @@ def stretched(tick: int) -> tuple[float, ...]:
     return (way, 0, 0, 1, 0, 0, 0)
 
 
-def grown(path: Path, change: float) -> float:
-    """Returns by how much springs that grow by a part of K in each tick of a change grow."""
+NOTHING = 1e-6
+"""Energy in J that a hand may be given from nothing; it is the error of the limited law."""
+
+
+def most_given(path: Path, damping: float = 2.0, rotational: float = 2e-3) -> float:
+    """Returns the most energy in J that the hand had received beyond what the damping burned."""
     ticks = read_recording(path).ticks
-    stretch = ticks["handle_position"][1:] - ticks["tool_position"][:-1]
-    squares = np.sum(stretch[249 : 249 + STEPS] ** 2, axis=1)
-    return float(np.sum(0.5 * change / STEPS * squares))
+    sent, q = ticks["wrench_on_device"][:-1], ticks["device_quaternion"]
+    moved, angle = np.diff(ticks["device_position"], axis=0), 2 * np.arctan2(q[:, 2], q[:, 0])
+    turn = np.diff(angle)  # about y alone
+    given = np.sum((sent[:, :3] - damping / T * moved) * moved, axis=1)
+    given += (sent[:, 4] - rotational / T * turn) * turn
+    return float(np.cumsum(given).max())
 
 
 @pytest.mark.parametrize("stiffness", [1000.0, 3000.0])
-def test_a_change_of_stiffness_gives_the_spring_half_of_it_times_its_stretch_squared(
+def test_a_raised_stiffness_lets_the_handle_slip_and_gives_no_energy(
     run: Callable[..., Any], stiffness: float
 ) -> None:
-    change = stiffness - 2000.0
-    summary, path, script = run({250: Couple(stiffness, 1.1)}, 0.85, ANVIL, stretched)
-    # 2 mm, while the anvil of 20 t gives way by 0.05 mm
-    assert summary.energies["tuning_work"] == pytest.approx(0.5 * change * 2e-3**2, rel=0.05)
-    assert summary.energies["tuning_work"] == pytest.approx(grown(path, change), rel=1e-9)
-    # the audit says so too, from its own sum
-    assert (
-        f"which gave the coupling {grown(path, change):.3g} J" in audit(path).coupling_sentences[-1]
-    )
+    summary, path, script = run({250: Couple(stiffness, 1.1)}, 1.2, ANVIL, stretched)
+    ticks = read_recording(path).ticks
+    stretch = np.linalg.norm(ticks["handle_position"] - ticks["tool_position"], axis=1)
+    before, after = stretch[[249, 249 + STEPS]]
+    slipped = min(math.sqrt(2000.0 / stiffness), 1.0)  # the spring holds as much as before
+    assert after == pytest.approx(slipped * before, rel=0.03)  # the anvil of 20 t gives way
+    assert most_given(path) <= NOTHING
     climb = np.diff(script.stiffness)[250 : 250 + STEPS]
-    np.testing.assert_allclose(climb, change / STEPS, rtol=1e-9)
+    np.testing.assert_allclose(climb, (stiffness - 2000.0) / STEPS, rtol=1e-9)
     assert summary.energies["environment_energy"] <= 1e-9
+    assert audit(path).resimulation == "bit for bit"
 
 
 def turned(tick: int) -> tuple[float, ...]:
@@ -171,26 +176,25 @@ def turned(tick: int) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("method", ["lossless", "implicit", "explicit"])
-def test_a_change_of_turning_stiffness_gives_half_of_it_times_the_angle_squared(
+def test_a_raised_turning_stiffness_lets_the_handle_slip(
     run: Callable[..., Any], method: str
 ) -> None:
     commands = {250: Couple(2000.0, 0.8, 3.0, 4e-4)}
-    summary, path, _ = run(commands, 0.85, ANVIL, turned, method=method)
-    ticks = read_recording(path).ticks
-    both = ticks["handle_quaternion"][1:], ticks["tool_quaternion"][:-1]
-    angle = 2 * np.arccos(np.sum(both[0] * both[1], axis=1))[249 : 249 + STEPS]
-    assert 0.09 < angle.mean() < 0.1  # the anvil gives way by some milliradians
-    # from 2 to 3 N m/rad in equal steps, while nothing is stretched
-    grown_by = float(np.sum(0.5 / STEPS * angle**2))
-    assert summary.energies["tuning_work"] == pytest.approx(grown_by, rel=1e-6)
-    event = next(e for e in read_recording(path).events if e["event"] == "coupling")
+    _, path, _ = run(commands, 0.85, ANVIL, turned, method=method)
+    recording = read_recording(path)
+    both = recording.ticks["handle_quaternion"], recording.ticks["tool_quaternion"]
+    angle = 2 * np.arccos(np.minimum(np.sum(both[0] * both[1], axis=1), 1.0))
+    # from 2 to 3 N m/rad in equal steps, in which the spring never gains energy
+    stiffness = 2.0 + np.arange(STEPS + 1) / STEPS
+    assert np.diff(0.5 * stiffness * angle[249 : 250 + STEPS] ** 2).max() <= 1e-9
+    assert most_given(path) <= NOTHING
+    event = next(e for e in recording.events if e["event"] == "coupling")
     assert event["rotational_stiffness"] == 3.0
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert "K_r = 3 N m/rad" in report.coupling_sentences[-1]
     # the torque in the end is that of the new spring
-    last = 2 * np.arccos(np.sum(both[0][-1] * both[1][-1]))
-    assert ticks["wrench_on_tool"][-1, 4] == pytest.approx(3.0 * last, rel=0.02)
+    assert recording.ticks["wrench_on_tool"][-1, 4] == pytest.approx(3.0 * angle[-1], rel=0.02)
 
 
 def test_a_change_of_the_one_kind_of_gains_leaves_the_other(run: Callable[..., Any]) -> None:
@@ -202,24 +206,7 @@ def test_a_change_of_the_one_kind_of_gains_leaves_the_other(run: Callable[..., A
     assert audit(path).resimulation == "bit for bit"
 
 
-def test_what_a_command_gave_to_the_device_is_not_called_activity(run: Callable[..., Any]) -> None:
-    # a device without the damping that the coupling needs, so that its port is watched
-    soft = Coupling(1000.0, 0.1, 2.0, 1e-3)
-    options = {"method": "implicit", "pose": stretched, "scene": ANVIL, "damping": 0.55}
-    _, path, _ = run({}, 1.2, coupling=replace(soft, damping=0.2), **options)
-    assert audit(path).certified is False
-    energy = read_recording(path).ticks["device_energy"][-1]
-    assert energy < 0  # what was put in came out, but for the dampers' share
-    _, path, _ = run(
-        {300: Couple(1050.0, 0.0)}, 1.2, coupling=replace(soft, damping=0.2), **options
-    )
-    recording, report = read_recording(path), audit(path)
-    assert report.certified is False
-    assert recording.ticks["device_energy"][-1] > energy + 0.5 * 0.5 * 50.0 * 2e-3**2
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-
-
-GUARDED = Limits(force=10.0, torque=0.5, ramp=0.05)
+FREE = Limits(force=10.0, torque=0.5, ramp=0.05, energy=math.inf)
 
 
 def rubbed_and_pressed(tick: int) -> tuple[float, ...]:
@@ -272,83 +259,53 @@ OF_AN_ANVIL: dict[str, Any] = {
     "coupling": Coupling(2000.0, 0.9, 2.0, 5e-4),
 }
 TURNED = {"pose": rubbed_and_turned, "coupling": Coupling(2000.0, 0.5, 2.0, 9e-4)}
-COMMANDED: tuple[tuple[dict[str, Any], dict[int, Command], str], ...] = (
-    # pressed in at 200 N/m, let out at 3000 N/m: 0.2 J from whoever turns the gains
-    (OF_AN_ANVIL, {1900: Couple(200.0, 0.0), 2900: Couple(3000.0, 0.0)}, "tick 36"),
-    # turned in at 0.2 N m/rad, let out at 3 N m/rad and 0.5 N m at most: 0.18 J
+COMMANDED: tuple[tuple[dict[str, Any], dict[int, Command]], ...] = (
+    # pressed in at 200 N/m, let out at 3000 N/m
+    (OF_AN_ANVIL, {1900: Couple(200.0, 0.0), 2900: Couple(3000.0, 0.0)}),
+    # turned in at 0.2 N m/rad, let out at 3 N m/rad
     (
         OF_AN_ANVIL | TURNED,
         {1900: Couple(2000.0, 0.5, 0.2, 0.0), 2900: Couple(2000.0, 0.5, 3.0, 0.0)},
-        "tick 3[4-7]",
     ),
-    # ½ 250 (40 mm)² = 0.2 J go in while nothing is felt, and would come out with up to 10 N; what
-    # is rubbed away meanwhile does not pay for it
-    (OF_A_SPRING, {1000: Switch(force=False), 2700: Switch(force=True)}, "tick"),
-    # what a hand put into the scene comes back
-    (OF_A_SPRING, {2600: Switch(force=False), 2700: Switch(force=True)}, ""),
+    # a spring of the scene pushed in while nothing is felt
+    (OF_A_SPRING, {1000: Switch(force=False), 2700: Switch(force=True)}),
+    (OF_A_SPRING, {2600: Switch(force=False), 2700: Switch(force=True)}),
     # 40 mm at 2000 N/m and 10 N: 0.375 J go in and come out
-    (OF_AN_ANVIL, {2950: Couple(1990.0, 0.9)}, ""),
+    (OF_AN_ANVIL, {2950: Couple(1990.0, 0.9)}),
 )
 
 
-@pytest.mark.parametrize(("options", "commands", "trip"), COMMANDED)
-def test_a_command_gives_a_hand_no_more_than_it_put_in_and_takes_none_of_it(
-    run: Callable[..., Any], options: dict[str, Any], commands: dict[int, Command], trip: str
+@pytest.mark.parametrize(("options", "commands"), COMMANDED)
+def test_a_command_gives_a_hand_no_energy(
+    run: Callable[..., Any], options: dict[str, Any], commands: dict[int, Command]
 ) -> None:
-    more = {"limits": GUARDED, "controller": None}
-    if trip:
-        with pytest.raises(SafetyTrip, match=f"{trip}.*more energy beyond what the hand put in"):
-            run(commands, 5.0, **options, **more)
-        return
-    summary, path, _ = run(commands, 4.0, **options, **more)
-    assert summary.stopped_by == "duration"
+    _, path, _ = run(commands, 4.0, **options, limits=FREE, controller=None)
+    assert most_given(path) <= NOTHING
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    # but for what damper and pause took away
-    work = read_recording(path).ticks["device_energy"]
-    assert work[-1] - work[2720] > 0.1
+    if 2950 in commands:
+        work = read_recording(path).ticks["device_energy"]
+        assert work[-1] - work[2950] > 0.3
 
 
-def test_what_a_hand_rubbed_away_would_pay_if_it_were_not_forgotten(
-    run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "commands",
+    [
+        {600: Switch(force=False), 800: Switch(force=True)},
+        {600: Switch(clutch=True), 800: Switch(clutch=False)},
+    ],
+)
+def test_a_hand_that_lets_go_by_command_moves_no_handle_and_feels_nothing(
+    run: Callable[..., Any], commands: dict[int, Command]
 ) -> None:
-    options, commands, _ = COMMANDED[1]
-    monkeypatch.setattr("hapticbridge.kernel.state.cap_dissipation", lambda _state: None)
-    summary, *_ = run(commands, 4.0, **options, limits=GUARDED, controller=None)
-    assert summary.stopped_by == "duration"
-
-
-def test_a_stretch_that_was_not_felt_saves_nothing(run: Callable[..., Any]) -> None:
-    script = Script({1000: Switch(force=False), 2900: Switch(force=True)})
-    given: list[float] = []
-
-    def on_tick(bridge: Bridge, tick: int) -> None:
-        script(bridge, tick)
-        given.append(float(bridge.session.kernel.bound.state["observer"]["net_device_energy"][0]))
-
-    run({}, 3.0, ANVIL, rubbed_and_pressed, on_tick=on_tick, limits=GUARDED)
-    # 40 mm at 2000 N/m and 10 N would be 0.375 J, but the coupling is re-seated
-    assert given[2900] < -0.5
-    assert given[2901] == pytest.approx(-0.05, abs=0.01)
-
-
-def test_force_off_sends_none_and_the_tool_still_follows(run: Callable[..., Any]) -> None:
-    _, path, _ = run({600: Switch(force=False)}, 1.0)
+    _, path, _ = run(commands, 1.0)
     ticks = read_recording(path).ticks
-    assert not ticks["wrench_on_device"][621:].any()
     assert np.abs(ticks["wrench_on_device"][:600]).max() > 0.1
-    aside = ticks["tool_position"][:, 0]
-    assert np.ptp(aside[650:]) > 5e-3
+    assert not ticks["wrench_on_device"][621:800].any()
+    assert np.ptp(ticks["handle_position"][650:800], axis=0).max() < 1e-4
+    assert np.ptp(ticks["device_position"][600:800], axis=0).max() > 5e-3
+    assert (ticks["share"][821:] == 1.0).all()
     assert audit(path).verdict == "passive"
-
-
-def test_a_clutch_by_command_is_one_by_button(run: Callable[..., Any]) -> None:
-    _, path, _ = run({600: Switch(clutch=True), 800: Switch(clutch=False)}, 1.0)
-    ticks = read_recording(path).ticks
-    handle = ticks["handle_position"]
-    np.testing.assert_array_equal(handle[600:800], np.tile(handle[599], (200, 1)))
-    np.testing.assert_allclose(handle[800], ticks["tool_position"][799], atol=1e-15)
-    assert np.abs(np.diff(ticks["device_position"][600:800], axis=0)).max() > 0
 
 
 def test_a_reset_puts_the_scene_back_and_books_what_that_takes(run: Callable[..., Any]) -> None:

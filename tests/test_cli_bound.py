@@ -49,7 +49,9 @@ def test_the_json_is_null_where_none_suffices(
     assert (ended, facts["holds"]) == (code, holds)
     assert facts["largest_stiffness"] == (0 if device else None)  # B alone is too much
     assert facts["frequency_hz"] is None  # without damper it is every frequency
-    assert (facts["method"], facts["used_damping"]) == ("lossless", 0.0)
+    coupling, names = facts["coupling"], ("requested", "law", "effective")
+    assert [coupling[name]["damping"] for name in names] == [1.0, 0.0, 1.0]
+    assert facts["method"] == "lossless"
     assert [way["needed"] is None for way in facts["alternatives"]] == [
         *(False, False, False, False, False, True, False, True, False)
     ]

@@ -32,12 +32,16 @@ def test_the_next_command_runs_certified_and_is_rendered_as_it_asks(
     code, out, err = call(*f"{following.strip()} --fast --duration 0.05 --json".split())
     told, asked = json.loads(out), following.split("--damping ")[1].split()[0]
     assert (code, told["is_certified"], "warning" in err) == (0, True, False)
-    assert f"B = {float(asked):.4g} N s/m felt" in told["coupling_sentences"][0]
+    for name in ("requested", "effective"):
+        assert told["coupling"][name]["damping"] == pytest.approx(float(asked), rel=1e-3)
 
 
 def test_the_json_holds_the_whole_region(call: Called) -> None:
     facts = facts_of(call, f"{ZWIDTH} --json")
-    assert facts["corner"]["stiffness"] == pytest.approx(2400, rel=1e-12)
+    for name, damping in (("requested", 1.7), ("law", 0.5), ("effective", 1.7)):
+        coupling = facts["corner"][name]
+        assert coupling["stiffness"] == pytest.approx(2400, rel=1e-12)
+        assert coupling["damping"] == pytest.approx(damping, rel=1e-12)
     assert facts["corner"]["limited_by"] == "passive for any hand"
     lengths = {len(line["stiffness"]) for line in facts["lines"]}
     assert lengths == {len(facts["damping"])} == {len(facts["limit"])}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.profile import read_profile
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
+from hapticbridge.guard import limits_for
 from hapticbridge.identify import identify
 from hapticbridge.identify.profile import measured_profile
 from hapticbridge.options import Workspace
@@ -100,7 +101,10 @@ def haply() -> Rig:
     device = bench.opened(damping=2.0)
     (inverse,) = bench.service.devices.values()
     later = lambda s: bench.time.advance(bench.time.now + s)  # noqa: E731
-    return Rig(device, DrivingClock(bench.time), bench.service, bench, lambda: inverse.force, later)
+    # this hand moves at once, so that a force that rises slowly would leave the peg beside the hole
+    scene = {"scene": "peg_in_hole", "limits": replace(limits_for(device.info, None), ramp=0.0)}
+    force = lambda: inverse.force  # noqa: E731
+    return Rig(device, DrivingClock(bench.time), bench.service, bench, force, later, scene)
 
 
 def force_dimension(kind: int = OMEGA3) -> Rig:

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from adversary import Attack
+from adversary import UNPAID, Attack
 
 from hapticbridge.kernel.codes import OK
 
-UNPAID = 1e-6
-"""Largest energy in J that a hand may have beyond what it put in."""
-
 ATTACKS = 300
-FAILING = (52, 68)
-"""Seeds of hands that a limit on the device alone fails."""
 
 
 @pytest.mark.parametrize("start", range(0, ATTACKS, 50))

@@ -50,7 +50,7 @@ def test_a_wall_of_one_and_a_half_times_the_limit_swings_without_and_decays_with
     without = knocked(tmp_path, 1.5, hand, "off")
     assert largest(without, 950) > 0.7 * largest(without, 50) > 1.0
     with_it = knocked(tmp_path, 1.5, hand, "damper")
-    assert largest(with_it, 950) < 0.1
+    assert largest(with_it, 950) < 0.05 * largest(without, 950)
     assert not (without.flags & ACTIVE).any()
     # what it did is computed again by two other routes
     assert with_it.report.verdict != "invalid", with_it.report.reason

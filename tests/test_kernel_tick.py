@@ -183,37 +183,34 @@ def test_diverged_scene_gives_zero_wrench_and_a_trip(value: float) -> None:
     assert len(run.ticks) == 30
 
 
-def test_force_over_the_limit_keeps_its_direction() -> None:
+def test_force_over_the_limit_keeps_its_direction_on_tool_and_device() -> None:
     turning = Rotation.from_rotvec(sines(600, 1.0, 2.0))
     samples = samples_of(sines(600, 0.02, 3.0), turning)
-    free = fast(FREE_BALL, samples)
-    limited = fast(FREE_BALL, samples, force_limit=0.5, torque_limit=0.002)
-    assert (free.ticks["wrench_on_tool"] == limited.ticks["wrench_on_tool"]).all()
-    is_over = np.zeros(600, bool)
-    for part, limit in ((slice(0, 3), 0.5), (slice(3, 6), 0.002)):
-        wanted, sent = free.ticks["wrench_on_device"][:, part], limited.ticks["wrench_on_device"]
-        norm = np.linalg.norm(wanted, axis=1)
-        assert (norm > limit).any()
-        assert (norm < limit).any()
-        factor = np.minimum(1.0, limit / norm)
-        assert sent[:, part] == pytest.approx(factor[:, None] * wanted, rel=1e-12, abs=1e-18)
-        is_over |= norm > limit
-    flags = limited.ticks["flags"]
-    assert ((flags & TickFlag.FORCE_LIMITED > 0) == is_over).all()
-    assert not (free.ticks["flags"] & TickFlag.FORCE_LIMITED).any()
+    limited = fast(FREE_BALL, samples, force_limit=5.0, torque_limit=0.02).ticks
+    is_at_limit = np.zeros(600, bool)
+    for part, limit in ((slice(0, 3), 5.0), (slice(3, 6), 0.02)):
+        on_tool = limited["wrench_on_tool"][:, part]
+        norm = np.linalg.norm(on_tool, axis=1)
+        assert norm.max() <= limit * (1 + 1e-12)
+        assert norm.min() < 0.9 * limit
+        assert (limited["wrench_on_device"][:, part] == -on_tool).all()
+        is_at_limit |= norm > limit * (1 - 1e-12)
+    assert 1 < np.count_nonzero(is_at_limit) < 590
+    assert ((limited["flags"] & TickFlag.FORCE_LIMITED > 0) == is_at_limit).all()
 
 
-def test_wrench_rises_linearly_over_the_ramp_after_the_limit() -> None:
-    samples = samples_of(sines(100, 0.02, 3.0))
-    full = fast(FREE_BALL, samples, force_limit=0.5)
-    ramped = fast(FREE_BALL, samples, force_limit=0.5, ramp_ticks=40)
-    factor = np.minimum((np.arange(100) + 1) / 41, 1.0)
-    assert ramped.ticks["wrench_on_device"] == pytest.approx(
-        factor[:, None] * full.ticks["wrench_on_device"], rel=1e-12, abs=1e-18
+def test_share_rises_linearly_over_the_ramp_and_the_handle_follows_by_it() -> None:
+    ramped = fast(FREE_BALL, samples_of(sines(100, 0.02, 3.0)), ramp_ticks=40).ticks
+    share = np.minimum((np.arange(100) + 1) / 41, 1.0)
+    np.testing.assert_allclose(ramped["share"], share, rtol=1e-12)
+    np.testing.assert_allclose(
+        ramped["wrench_on_device"], -share[:, None] * ramped["wrench_on_tool"], atol=1e-15
     )
-    is_ramping = ramped.ticks["flags"] & TickFlag.RAMPING > 0
+    moved = np.diff(ramped["device_position"], axis=0)
+    followed = np.diff(ramped["handle_position"], axis=0)
+    np.testing.assert_allclose(followed, share[:-1, None] * moved, atol=1e-15)
+    is_ramping = ramped["flags"] & TickFlag.RAMPING > 0
     assert is_ramping.tolist() == [True] * 40 + [False] * 60
-    assert not (full.ticks["flags"] & TickFlag.RAMPING).any()
 
 
 @pytest.mark.parametrize(("scale", "force_scale"), [(1.0, 1.0), (3.0, 3.0), (3.0, 0.5)])
@@ -307,10 +304,11 @@ def test_record_holds_the_tick_the_sample_and_the_pose_after_the_step() -> None:
     assert (run.ticks["tool_quaternion"][:, 0] >= 0).all()
     assert (run.ticks["tool_position"][-1] == run.scene.data.qpos[:3]).all()
     loop = run.binding.state["loop"]
-    force = np.linalg.norm(run.ticks["wrench_on_tool"][:, :3], axis=1)
-    torque = np.linalg.norm(run.ticks["wrench_on_tool"][:, 3:], axis=1)
-    assert loop["peak_force"][0] == pytest.approx(force.max(), rel=1e-15)
-    assert loop["peak_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
+    for port, wrench in (("peak", "wrench_on_device"), ("peak_tool", "wrench_on_tool")):
+        force = np.linalg.norm(run.ticks[wrench][:, :3], axis=1)
+        torque = np.linalg.norm(run.ticks[wrench][:, 3:], axis=1)
+        assert loop[f"{port}_force"][0] == pytest.approx(force.max(), rel=1e-15)
+        assert loop[f"{port}_torque"][0] == pytest.approx(torque.max(), rel=1e-15)
 
 
 def test_publish_writes_one_record_and_refuses_a_full_ring() -> None:

@@ -20,7 +20,7 @@ ORDER = (
     ("scene", "inputs"),
     ("rendering", "device"),
     ("certificate", "identify", "realtime", "run_description", "theory_plots"),
-    ("guard", "summary", "export"),
+    ("guard", "summary", "timekeeping", "export"),
     ("commands", "check"),
     ("audit", "compare", "options"),
     ("session", "film_process", "report"),
@@ -193,14 +193,15 @@ WRITERS = {
     "mj": "state",
     "run": "state",
     "coupling": "law",
+    "level": "force_level",
     "pose": "handle",
     "loop": "tick",
     "energy": "ledger",
     "guard": "tick_guard",
-    "level": "force_level",
     "watch": "swing_watch",
     "observer": "passivity_controller",
     "lossless": "lossless",
+    "timing": "timing",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""
 

@@ -41,8 +41,9 @@ def test_task_in_the_bridge_is_audited_passive(name: str, method: str, tmp_path:
     assert summary.peak_force < FORCE_LIMIT
     assert hb.audit(file).verdict == "passive"
     if method == "implicit":
-        # the bridge and the run without the package end alike: what follows is true of both
-        assert ended == pytest.approx(reference.run_of_own_path(name).joints[-1], abs=2e-4)
+        # the bridge and the run without the package end alike, but for the load that the bridge's
+        # handle carries from the start: what follows is true of both
+        assert ended == pytest.approx(reference.run_of_own_path(name).joints[-1], abs=3e-4)
 
 
 # --- drawer ---------------------------------------------------------------------------------------

@@ -188,7 +188,7 @@ def test_inputs_that_cannot_be_metered_are_refused(method: str) -> None:
         ("explicit", {"method": "implicit"}),
         ("implicitfast", {"method": "implicit"}),
         ("explicit", {"method": "explicit:rk4"}),
-        ("weld", {"felt": "[1.0, 0.0, 0.0, 0.0]"}),
+        ("weld", {"effective": "[1.0, 0.0, 0.0, 0.0]"}),
     ],
 )
 def test_recording_that_claims_another_method_or_a_softer_weld_is_invalid(
@@ -610,8 +610,9 @@ def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
     assert report.certified is (method == "implicit")
     assert report.environment == "strict"  # (14) alone would not have seen it
     if method == "weld":
-        assert summary.effective is not None
-        stiffness = summary.effective.rotational_stiffness
+        assert summary.coupling.law is None
+        assert summary.coupling.effective is not None
+        stiffness = summary.coupling.effective.rotational_stiffness
         assert stiffness == pytest.approx(3.6e-4 * 2e4 / 0.05, rel=1e-6)
         assert (report.tick, report.port) == summary.fault
         assert report.port == "device"

@@ -40,8 +40,8 @@ from hapticbridge.view.server import serve, stop
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 CLUTCH = "clutch (the hand moves alone)"
-K, B = "stiffness K (N/m)", "damping B (N s/m)"
-KR, BR = "turning stiffness K_r (N m/rad)", "turning damping B_r (N m s/rad)"
+K, B = "stiffness K (N/m)", "requested damping B (N s/m)"
+KR, BR = "turning stiffness K_r (N m/rad)", "requested turning damping B_r (N m s/rad)"
 
 PATIENCE = 60.0
 """In s, for anything to happen in a run; it ends by itself after twice as long."""
@@ -98,7 +98,7 @@ def test_a_slider_of_the_page_moves_the_stiffness_and_the_recording_says_so(tmp_
         before = stiffness(bridge)
         page.press("Home")  # its least value
         until(lambda: stiffness(bridge) == pytest.approx(200.0))
-        page.wait_for("document.body.innerText.includes('K goes to 200 N/m')")
+        page.wait_for("document.body.innerText.includes('goes to K = 200 N/m')")
         assert page.complaints == []
         own = ("data:", "blob:", window.url.partition("?")[0])
         assert [request[:99] for request in page.requests if not request.startswith(own)] == []
@@ -206,7 +206,7 @@ def test_a_browser_changes_the_value_of_an_element_and_nothing_else_of_it() -> N
         until(lambda: Stop() in asked and len(asked) > 1)
         assert [each.stiffness for each in asked if isinstance(each, Couple)] == [2000.0]
         shown.note(coupled(stiffness=1234.567))  # which bounds the sliders, if they are still some
-        assert "K goes to 1235 N/m" in shown.answer.content
+        assert "goes to K = 1235 N/m" in shown.answer.content
 
 
 def test_commands_reach_the_bridge_slowly_and_the_newest_wins() -> None:

@@ -173,7 +173,8 @@ def sight(handle: tuple[float, float, float], force: tuple[float, float, float])
         handle=np.array(handle),
         handle_turn=one,
         grip=np.zeros(3),
-        force=np.array(force),
+        hand_force=np.array(force),
+        tool_force=-np.array(force) / 0.3,
         contact_places=nothing,
         contact_forces=nothing,
     )
@@ -197,8 +198,8 @@ def test_the_ghost_is_all_of_the_tool_that_is_seen_and_a_little_larger() -> None
 def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> None:
     canvas: Any = Canvas()
     ghost = Ghost(canvas, mujoco.MjModel.from_xml_string(TOOL), "grip")
-    seen = sight((0, 0, -stretch), (0, 0, -5.0))  # pushed down, the tool is above
-    ghost.show(seen, 10.0)
+    seen = sight((0, 0, -stretch), (0, 0, 5.0))  # pushed down, the tool is above
+    ghost.show(seen, 10.0, 20.0)
     line = canvas.__dict__["/coupling"].points
     start, end = line[0, 0], line[-1, 1]
     np.testing.assert_allclose(canvas.__dict__["/handle"].position, seen.handle)
@@ -212,7 +213,7 @@ def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> N
         out = min((0.06 + SHELL) / np.sin(np.radians(20)), 0.2 + SHELL + 0.05)
         assert 0.1 < start[2] - seen.handle[2] <= out
         np.testing.assert_allclose(end - start, (0, 0, ghost.times * stretch), atol=1e-6)
-    tail, tip = canvas.__dict__["/force in the hand"].points[0]
+    tail, tip = canvas.__dict__["/force on the hand"].points[0]
     np.testing.assert_allclose(tail, end, atol=1e-6)
     np.testing.assert_allclose(tip - tail, (0, 0, 0.5 * LONGEST_ARROW), atol=1e-6)
 

@@ -25,7 +25,6 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Sight
 from hapticbridge.view.process import LiveRun, run_of
-from hapticbridge.view.replay import contacts_of
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -92,21 +91,24 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
     time, lines = watcher.live.trace.curves()
     ticks = read_recording(path).ticks
     at = np.searchsorted(ticks["deadline_ns"], np.round(1e9 * time).astype(np.int64))
-    np.testing.assert_allclose(lines[2], 1e3 * ticks["device_energy"][at])
-    force = np.linalg.norm(ticks["wrench_on_tool"][:, :3], axis=1)
-    assert lines[0].max() == pytest.approx(force[: at[-1] + 1].max())
+    np.testing.assert_allclose(lines[3], 1e3 * ticks["device_energy"][at])
+    for line, wrench in zip(lines, ("wrench_on_device", "wrench_on_tool"), strict=False):
+        force = np.linalg.norm(ticks[wrench][:, :3], axis=1)
+        assert line.max() == pytest.approx(force[: at[-1] + 1].max())
     stage, touched = Stage(path), 0
     lift = stage.model.body("lift").id
     for sight in sights:
         stage.show(stage.tick_at(sight.time))
-        contacts = contacts_of(stage.model, stage.data)
-        again = Sight.of(stage.model, stage.data, stage.row, Tendons(stage.model), contacts)
+        seen = stage.contacts(), stage.hand_force
+        again = Sight.of(stage.model, stage.data, stage.row, Tendons(stage.model), *seen)
         assert sight.time == again.time
         np.testing.assert_array_equal(sight.places, again.places)
         np.testing.assert_array_equal(sight.turns, again.turns)
         np.testing.assert_array_equal(sight.contact_places, again.contact_places)
         np.testing.assert_allclose(sight.contact_forces, again.contact_forces, atol=1e-12)
         np.testing.assert_array_equal(sight.grip, again.grip)
+        np.testing.assert_array_equal(sight.hand_force, again.hand_force)
+        assert np.linalg.norm(sight.contact_forces, axis=1).all()
         touched += len(sight.contact_places) > 0
     assert touched > 5
     assert np.ptp([sight.places[lift, 2] for sight in sights]) > 0.008

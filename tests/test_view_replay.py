@@ -49,10 +49,11 @@ def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay:
         np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
         np.testing.assert_allclose(sight.handle, row["handle_position"])
     still = replay.at(1.5)
-    assert np.linalg.norm(still.force) > 1
+    assert np.linalg.norm(still.hand_force) > 1
+    np.testing.assert_allclose(still.hand_force, -still.tool_force)  # as force_scale is 1
     assert len(still.contact_places) == 1
     # at rest what the coupling pushes the floor gives back
-    np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.force, atol=2e-2)
+    np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.tool_force, atol=2e-2)
     assert not len(replay.at(0.0).contact_places)
 
 

@@ -149,7 +149,7 @@ def test_a_prescribed_motion_is_the_recorded_one(softer: WhatIf) -> None:
         prescribed.ticks["device_position"], before.ticks["device_position"]
     )
     # pressed in as far, a quarter as stiff; K e is nearly all of the force
-    ratio = prescribed.peaks["force on device"] / before.peaks["force on device"]
+    ratio = prescribed.peaks["force on hand"] / before.peaks["force on hand"]
     assert ratio == pytest.approx(0.25, abs=0.03)
     assert prescribed.report.certified is True  # judged as the recorded device, not as nobody
 
@@ -344,7 +344,7 @@ REPEATED: dict[str, tuple[ScriptedDevice, dict[str, Any], TickFlag]] = {
     "limits": (
         ScriptedDevice(lambda tick: (0.004 * (tick > 60), 0, 0, 1, 0, 0, 0)),
         {"limits": EVERY_LIMIT, "workspace": Workspace(scale=2.0)},
-        TickFlag.SLEW_LIMITED,
+        TickFlag.FORCE_LIMITED,
     ),
     "the edge of the reach": (
         ScriptedDevice(drift(1e-4)),

@@ -19,9 +19,10 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
-from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.parameters import EARLIER_VERSION, RunParameters
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import Method, method_named
+from hapticbridge.rendering import Method, RunCoupling, method_named
 from hapticbridge.run_description import meta_start, parameters_of
 
 Array = NDArray[np.float64]
@@ -110,18 +111,19 @@ class RunEvents:
         """Returns True for each tick that began with a reset."""
         return np.isin(numbers, self.resets)
 
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """Sentences about changes of the coupling; empty without any."""
+    def changes_of_coupling(self, method: Method) -> tuple[str, ...]:
+        """Returns sentences about changes of the coupling; empty without any."""
         first, last = self.couplings[0], self.couplings[-1]
         if last is first:
             return ()
-        turning = ""
-        if last.rotational_stiffness != first.rotational_stiffness:
-            turning = f", K_r = {last.rotational_stiffness:g} N m/rad"
+        run = self.parameters
+        coupling = RunCoupling.of(method, run.period / run.substeps, law=last)
+        translation, *rotation = coupling.sentences()
+        if last.rotational_stiffness == first.rotational_stiffness:
+            rotation = []
         return (
             f"so it began; commands changed the coupling {len(self.couplings) - 1} times, last to "
-            f"K = {last.stiffness:g} N/m{turning}, B' = {last.damping:g} N s/m used",
+            f"{'; '.join([translation, *rotation])}",
         )
 
 
@@ -149,6 +151,8 @@ class AuditedRun:
             RecordingError: They are damaged or do not describe a run.
         """
         meta, parameters = recording.meta, parameters_of(recording.meta)
+        if recording.record != TICK_DTYPE:
+            raise RecordingError(EARLIER_VERSION)
         try:
             info = DeviceInfo.from_json(meta.get("device", ""))
             limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))

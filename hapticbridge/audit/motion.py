@@ -70,7 +70,7 @@ class Motion:
         tool_turn: Rotation of the tool.
         stretch: e = h − x.
         twist: Rotation from the tool to the handle.
-        twist_before: Rotation from the tool to the handle in the previous tick.
+        twist_before: Rotation from the tool to the handle in the previous tick; a slip is in it.
         carried: Rotation of the tool in each tick as quaternions, (n, 4).
         handle_before: Handle pose in the previous tick, (n, 7).
         tool_before: Tool pose in the previous tick, (n, 7).
@@ -103,14 +103,16 @@ class Motion:
         moved = parameters.scale * np.diff(device[:, :3], axis=0) @ axes.T
         # a rotation vector turns with the axes: log(A R Aᵀ) = A log(R)
         turned = turn_between(device[:-1, 3:], device[1:, 3:]) @ axes.T
+        handle_turn = share[:, None] * turned
+        turned_back = quaternion_product(quaternion_of(-handle_turn), handle[:, 3:])
         return cls(
             handle_step=share[:, None] * moved,
-            handle_turn=share[:, None] * turned,
+            handle_turn=handle_turn,
             tool_step=tool[:, :3] - tool_before[:, :3],
             tool_turn=turn_between(tool_before[:, 3:], tool[:, 3:]),
             stretch=handle[:, :3] - tool[:, :3],
             twist=turn_between(tool[:, 3:], handle[:, 3:]),
-            twist_before=turn_between(tool_before[:, 3:], handle_before[:, 3:]),
+            twist_before=turn_between(tool_before[:, 3:], turned_back),
             carried=quaternion_product(tool[:, 3:], conjugate(tool_before[:, 3:])),
             handle_before=handle_before,
             tool_before=tool_before,

@@ -180,7 +180,7 @@ class Resimulator:
             ticks["device_quaternion"],
         )
         samples["buttons"] = ticks["buttons"]
-        outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE | TickFlag.REANCHORED)
+        outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE)
         elapsed = self._elapsed(ticks)
         rows = np.zeros(len(ticks), TICK_DTYPE)
         done = 0

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from hapticbridge.files import finite_or_null
+from hapticbridge.rendering import RunCoupling
+from hapticbridge.timekeeping import Timekeeping
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +21,8 @@ class AuditReport:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
-        certified: True if the recorded device bears the coupling; None if its damping is unknown or
-            its motion is prescribed.
+        certified: True if the recorded device bears the coupling and the run kept its time; None if
+            its damping is unknown or its motion is prescribed.
         reason: The verdict in a sentence.
         tick: First tick at fault, or None.
         port: Port at fault, ``environment`` or ``device``, or the field.
@@ -33,15 +35,18 @@ class AuditReport:
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
         conditions: Device condition per kind of axis, as sentences.
-        coupling_sentences: Sentences on effective and law coupling. They hold away from contact, or
-            everywhere if the tool was never released.
+        coupling: Requested, law and effective coupling at the start; None if invalid.
+        coupling_sentences: Sentences on them, and on changes by commands. They hold away from
+            contact, or everywhere if the tool was never released.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
             re-simulation a recording whose wrench is such a part is invalid instead of passive. Any
             other then names the changes that would pass: those of ``wrench_on_device`` and
             ``share`` that fit each other.
-        damping_margin: Smallest share of the device's damping that the coupling leaves, 1 − needed
-            / b over the kinds of axis. It is negative if more is needed than available; None if b
-            is unknown or the motion prescribed.
+        timekeeping: Time that the run kept, and the device conditions at this time; None where the
+            records could not be read.
+        damping_margin: Smallest share of the device's damping that the coupling leaves at the time
+            that the run kept, 1 − needed / b over the kinds of axis. It is negative if more is
+            needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
         events: Number of events of each kind.
     """
@@ -60,8 +65,10 @@ class AuditReport:
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
+    coupling: RunCoupling | None = None
     coupling_sentences: tuple[str, ...] = ()
     unchecked: str = ""
+    timekeeping: Timekeeping | None = None
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)

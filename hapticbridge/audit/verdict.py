@@ -23,6 +23,7 @@ from hapticbridge.audit.structure import (
     first_row,
     structure_fault,
 )
+from hapticbridge.audit.timing import TimingTally
 from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
@@ -30,10 +31,13 @@ from hapticbridge.certificate import (
     is_run_certified,
     run_conditions,
 )
+from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.rendering import Method
-from hapticbridge.summary import coupling_sentences, was_never_lossless, watch_sentence
+from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.run_description import requested_of
+from hapticbridge.summary import was_never_lossless, watch_sentence
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
 # End of a run
@@ -225,18 +229,22 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         run = AuditedRun.of(recording)
         facts |= _device_facts(run, recording)
         sentences = facts["coupling_sentences"]
-        facts["coupling_sentences"] = sentences + run.events.sentences
+        facts["coupling_sentences"] = sentences + run.events.changes_of_coupling(run.method)
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
         fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
         if fault is None:
             energies = PassivityTally(is_watched=facts["certified"] is not True)
-            fault, facts["duration"] = _check_records(recording, run, energies)
+            timing = TimingTally(run.parameters)
+            fault, facts["duration"] = _check_records(recording, run, energies, timing)
             facts["energies"] = energies.energies
+            facts |= _time_facts(run, recording, timing, facts["certified"])
         if fault is None:
             outcome = compare_resimulation(recording, run.parameters)
             facts["resimulation"] = outcome.agreement
             fault = _replay_fault(outcome)
+        if fault is None:
+            requested_of(recording.meta)
     except RecordingError as error:
         fault = Fault(str(error))
     # without a simulation again, some methods leave a wrench that no other computation covers
@@ -246,16 +254,18 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        watched = watch_sentence(recording.flags)
-        notes = (found["reason"], watched, unusual_end(recording.events), facts["unchecked"])
+        kept, watched = facts.get("timekeeping"), watch_sentence(recording.flags)
+        not_kept = "" if kept is None else kept.fault
+        ending = unusual_end(recording.events)
+        notes = (found["reason"], not_kept, watched, ending, facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 
 
 def _check_records(
-    recording: RecordingFile, run: AuditedRun, energies: PassivityTally
+    recording: RecordingFile, run: AuditedRun, energies: PassivityTally, timing: TimingTally
 ) -> tuple[Fault | None, float]:
-    """Compares all records with their second computation and collects their energies.
+    """Compares all records with their second computation; collects energies and times.
 
     Returns:
         The earliest fault or None, and the due time of the last record in s.
@@ -265,6 +275,7 @@ def _check_records(
     delay = min(run.delay, recording.count)
     for block, balance in energy_balances(recording.blocks(), start, run.events, delay):
         energies.add(block.ticks, balance)
+        timing.add(block, run.events)
         duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
         fault = fault or _block_fault(block, balance, run.events)
     return fault, duration
@@ -302,21 +313,50 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
     info, method, parameters = run.info, run.method, run.parameters
     try:
         worst = run.worst
+        coupling = RunCoupling.of(
+            method,
+            parameters.period / parameters.substeps,
+            _requested(recording),
+            law=parameters.coupling,
+            measured=parameters.effective,
+            is_always_implicit=was_never_lossless(recording.count, recording.flags),
+        )
         conditions = run_conditions(info, worst, method)
         return {
             "certified": is_run_certified(conditions, method),
             "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
-            "coupling_sentences": coupling_sentences(
-                parameters.coupling,
-                method,
-                parameters.period,
-                parameters.substeps,
-                is_always_implicit=was_never_lossless(recording.count, recording.flags),
-            ),
+            "coupling": coupling,
+            "coupling_sentences": coupling.sentences(),
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
+
+
+def _requested(recording: RecordingFile) -> Coupling | None:
+    try:
+        return requested_of(recording.meta)
+    except RecordingError:
+        return None  # a fault, named after those that may have caused it
+
+
+def _time_facts(
+    run: AuditedRun, recording: RecordingFile, timing: TimingTally, certified: bool | None
+) -> dict[str, Any]:
+    """Returns the time that a run kept, and its device's verdict and margin at this time."""
+    times = RunTimes(
+        ticks=timing.ticks,
+        due=timing.due,
+        mean_delay=timing.delays / max(timing.ticks, 1),
+        delay_energy=timing.most_uncovered,
+        is_realtime=any(event.get("event") == "real_time" for event in recording.events),
+    )
+    conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
+    kept = Timekeeping.of(times, run.worst, conditions)
+    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified)}
+    if kept.conditions:
+        facts["damping_margin"] = damping_margin(kept.conditions)
+    return facts
 
 
 def _unchecked(run: AuditedRun) -> str:

@@ -121,7 +121,7 @@ class AuditedBlock:
 
 def first_share(parameters: RunParameters) -> float:
     """Returns r before the first tick and after a pause."""
-    return 1.0 if parameters.ramp_ticks == 0 else 0.0
+    return 0.0 if parameters.guarding.has_hand or parameters.ramp_ticks > 0 else 1.0
 
 
 def _newest(is_on: Flags) -> NDArray[np.int64]:

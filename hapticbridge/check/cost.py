@@ -12,8 +12,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.fault import Fault
 from hapticbridge.check.observe import not_finite, rehearsal_parameters
 from hapticbridge.check.version import SceneVariant
+from hapticbridge.clock import LOWEST_RATE
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
@@ -146,6 +149,23 @@ class Cost:
     highest_rate: float
     by_contacts: Growth
     by_rows: Growth
+
+    def fault(self, case: SceneUnderCheck) -> Fault | None:
+        """Returns a fault if this machine cannot hold the rate; None if it can."""
+        rate = 1.0 / case.period
+        if not self.highest_rate < rate:
+            return None
+        highest = math.floor(self.highest_rate)
+        p99, left = 1e6 * self.all_ticks.p99, 1e6 * TICK_SHARE * case.period
+        lower = f"and run with --rate {highest}; or " if highest >= LOWEST_RATE else ""
+        return Fault(
+            "rate",
+            case.places.option("timestep"),
+            f"cannot hold {rate:g} Hz here: 99 of 100 ticks take up to {p99:.3g} µs; beside the "
+            f"device and late wake-ups {left:.3g} µs of a period are left for them",
+            f"{case.places.option_change('timestep', f'{1.0 / max(highest, 1):.3g}')} {lower}"
+            "see with 'hapticbridge check --lean' what may go",
+        )
 
 
 def measure_cost(

@@ -30,6 +30,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.sweep.results import Interrupted, Table
+from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
@@ -74,7 +75,7 @@ def print_unreadable(table: Table) -> None:
 
 
 def _why(verdict: str, reason: str, certified: str) -> str:
-    if verdict == "passive" and certified == "no":
+    if verdict == "passive" and certified == "no" and NOT_KEPT not in reason:
         return "the device has less damping than the coupling needs"
     return plain(" ".join(reason.splitlines()))
 
@@ -264,9 +265,14 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  {plain(sentence)}")
     if not report.conditions:
         out.print(
-            "  device condition b >= KT/2 + B': not applicable, the motion is prescribed or the "
+            "  device condition b >= KT/2 + B_law: not applicable, the motion is prescribed or the "
             "damping unknown"
         )
+    kept = report.timekeeping
+    if kept is not None and report.certified:
+        out.print(f"  device certified{kept.clause}")
+    elif kept is not None and kept.fault:
+        out.print(f"  device not certified: {NOT_KEPT}")
     if report.is_cut:
         out.print(
             "  the file is cut: the verdict is on what it holds; "
@@ -276,7 +282,8 @@ def _print_report(report: AuditReport) -> None:
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
-    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s")
+    rate = "" if kept is None or kept.share == 1.0 else f", {kept.words}"
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}")
     energies = [
         f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +15,7 @@ from hapticbridge.cli.zwidth import DEFAULT_RATE, next_command
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.plotting import check_ending
-from hapticbridge.rendering import default_method
+from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.theory.compensation import largest_effective_damping, law_damping
 from hapticbridge.theory.transfer import scalar
 from hapticbridge.theory_plots import Alternative, alternatives, draw_alternatives
@@ -25,8 +25,8 @@ from hapticbridge.theory_plots import Alternative, alternatives, draw_alternativ
 class Bound:
     """Compute the device damping that a coupling needs.
 
-    Alternative laws are listed beside it. K and B are those at the hand; the law of the default
-    method uses B' = B - KT/2, at least 0. Exit code 1 if --device-damping does not suffice.
+    Alternative laws are listed beside it. K and B are the requested ones; the law of the default
+    method uses B - KT/2, at least 0. Exit code 1 if --device-damping does not suffice.
 
     Example:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
@@ -35,7 +35,7 @@ class Bound:
     stiffness: float
     """Coupling stiffness K in N/m."""
     damping: float = 0.0
-    """Coupling damping B in N s/m at the hand."""
+    """Requested damping B of the coupling in N s/m."""
     rate: float = DEFAULT_RATE
     """Ticks per second."""
     filter_time: float | None = None
@@ -75,15 +75,17 @@ class Bound:
             "frequency_hz": _hertz(ways[0]),
             "holds": None if b is None else b >= ways[0].needed,
             "method": default_method().name,
-            "used_damping": law_damping(
-                self.stiffness, self.damping, period, default_method().compensated_share
-            ),
+            "coupling": asdict(self._coupling(period)),
             "largest_stiffness": self._largest_stiffness(period),
             "alternatives": [
                 {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
                 for way in ways
             ],
         }
+
+    def _coupling(self, period: float) -> RunCoupling:
+        requested = Coupling(self.stiffness, self.damping, 0.0, 0.0)
+        return RunCoupling.of(default_method(), period, requested)
 
     def _largest_stiffness(self, period: float) -> float | None:
         """Returns the largest K that the device bears; None without a device, 0 if none."""
@@ -94,7 +96,8 @@ class Bound:
 
     def _print(self, ways: tuple[Alternative, ...], period: float) -> None:
         b, method = self.device_damping, default_method()
-        out.print("B is felt, B' is what the damper uses; the device needs b >= KT/2 + B'")
+        (sentence,) = self._coupling(period).sentences()
+        out.print(f"{sentence}; the device needs b >= KT/2 + B_law")
         table = Table("", "damping needed", "most at", box=None, pad_edge=False)
         if b is not None:
             table.add_column("holds")

@@ -46,6 +46,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.plotting import check_ending, write_picture
+from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import read_scene, settings_from
 from hapticbridge.units import format_si
 
@@ -172,11 +173,11 @@ def print_case(case: SceneUnderCheck) -> None:
     """Prints what is checked, and how."""
     extent = 1e3 * np.ptp(case.motion.table[:, 1:4], axis=0)
     size = " x ".join(f"{edge:.3g}" for edge in extent)
+    sentence, *_ = RunCoupling.of(default_method(), case.period, case.coupling).sentences()
     out.print(f"[bold]{plain(case.scene.name)}[/]  {plain(str(case.source.path))}")
     out.print(
         f"  motion: {plain(case.motion_name)}, {case.motion.duration:.3g} s, {size} mm; "
-        f"coupling: {case.coupling.stiffness:.4g} N/m, {case.coupling.damping:.3g} N s/m felt, "
-        f"{1 / case.period:.4g} Hz"
+        f"coupling: {sentence}, {1 / case.period:.4g} Hz"
     )
 
 
@@ -391,6 +392,8 @@ class Check:
                 cost = measure_cost(
                     case.scene, case.samples, case.coupling, case.period, progress=show
                 )
+            slow = cost.fault(case)
+            faults = faults if slow is None else (*faults, slow)
         if not self.as_json:
             print_case(case)
             print_inventory(inventory)

@@ -22,11 +22,9 @@ from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import FORCE_SHARE, TRAVEL, UNHELD, duration_at
 from hapticbridge.identify.profile import draw_identification, measured_profile
 from hapticbridge.plotting import check_ending
-from hapticbridge.rendering import default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import coupling_sentences
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.theory_plots import draw_z_width, recommended
+from hapticbridge.theory_plots import draw_z_width, recommended, recommended_coupling
 from hapticbridge.units import format_si
 
 
@@ -97,9 +95,9 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
-        f"{z.limit[0]:.4g} N/m at B' = 0 ({z.corner_limited_by})"
+        f"{z.limit[0]:.4g} N/m at B_law = 0 ({z.corner_limited_by})"
     )
-    (sentence,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    (sentence,) = recommended_coupling(z).sentences()
     coupling = recommended(z)
     out.print(f"use {sentence}")
     out.print(f"next: {plain(next_command(coupling.stiffness, coupling.damping, 1.0 / z.period))}")
@@ -124,9 +122,7 @@ def facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[s
         "confidence": CONFIDENCE,
         "assumed": UNHELD,
         "largest_stiffness": None if z is None else float(z.limit[0]),
-        "coupling": None
-        if z is None
-        else {"stiffness": recommended(z).stiffness, "damping": recommended(z).damping},
+        "coupling": None if z is None else asdict(recommended_coupling(z)),
         "profile": None if path is None else str(path),
     }
 

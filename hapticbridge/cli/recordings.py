@@ -145,6 +145,8 @@ def _size(difference: Difference) -> str:
         return "no number" if any(map(math.isnan, difference.values)) else "infinitely much"
     if difference.unit == "1":
         return f"{difference.size:.3g}"
+    if difference.unit == "ns":
+        return format_si(1e-9 * difference.size, "s")
     return format_si(difference.size, difference.unit)
 
 

@@ -18,7 +18,8 @@ class Render:
     """Draw a recorded run: a picture, or a film of it.
 
     No display is needed: EGL or OSMesa draws, and MUJOCO_GL chooses between them. The handle is a
-    ghost, the coupling a line that turns red with its force, the arrow the force in the hand.
+    ghost, the coupling a line that turns red with the force on the tool. The orange arrow is the
+    force on the hand, turquoise ones are contact forces.
 
     Examples:
         hapticbridge render run.mcap run.png --at 2.5

@@ -7,7 +7,7 @@ import math
 import shlex
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, astuple, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -31,18 +31,18 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
-from hapticbridge.rendering import default_method, method_named
+from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import Summary, coupling_sentences, is_always_implicit
-from hapticbridge.units import format_energy, format_si
+from hapticbridge.summary import Summary, is_always_implicit
+from hapticbridge.units import format_energy, format_si, format_wrenches
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
 
 
 def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
-    """Prints the rendered coupling and the device conditions that do not hold.
+    """Prints the coupling and the device conditions that do not hold.
 
     ``is_method_chosen`` is true if the user named the method.
     """
@@ -50,16 +50,9 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     scene, device = escape(setup.scene.name), escape(setup.info.name)
     err.print(f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}")
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
-    for sentence in coupling_sentences(
-        setup.law, method, setup.period, substeps, is_always_implicit=held
-    ):
+    rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
+    for sentence in rendered.sentences():
         err.print(f"  {sentence}")
-    if not method.has_law:
-        err.print(
-            f"  requested: K = {coupling.stiffness:g} N/m, B = {coupling.damping:g} N s/m, "
-            f"K_r = {coupling.rotational_stiffness:g} N m/rad, "
-            f"B_r = {coupling.rotational_damping:g} N m s/rad"
-        )
     usual = default_method()
     if is_method_chosen and method != usual:
         err.print(f"  {method.name}: {escape(method.about)}")
@@ -103,7 +96,9 @@ def announce_measured(bridge: Bridge) -> None:
     if setup.method.has_law:
         return
     if parameters.effective is not None:
-        err.print(_true_weld(parameters.effective, setup.coupling))
+        measured = RunCoupling(setup.coupling, None, parameters.effective)
+        for sentence in measured.sentences():
+            err.print(f"  {sentence}: {_WELD}")
     conditions = run_conditions(setup.info, parameters, setup.method)
     met = {condition.sentence() for condition in conditions if condition.holds}
     for sentence in bridge.conditions():
@@ -111,13 +106,7 @@ def announce_measured(bridge: Bridge) -> None:
         err.print(head + escape(sentence))
 
 
-def _true_weld(effective: Coupling, requested: Coupling) -> str:
-    k, b, kr, br = astuple(effective)
-    wanted = ", ".join(f"{value:.4g}" for value in astuple(requested))
-    return (
-        f"the weld is {k:.4g} N/m, {b:.4g} N s/m, {kr:.4g} N m/rad, {br:.4g} N m s/rad in its "
-        f"stiffest directions at the start; requested: {wanted}"
-    )
+_WELD = "the weld in its stiffest directions at the start"
 
 
 def _print_faults(summary: Summary) -> None:
@@ -138,11 +127,15 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     """
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
+    skipped = ""
+    if summary.skipped:
+        skipped = f" ({summary.skipped} deadlines skipped: {summary.timekeeping.words})"
     table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
-    table.add_row(
-        "peak", f"{format_si(summary.peak_force, 'N')}, {format_si(summary.peak_torque, 'N m')}"
+    hand, tool = (
+        (summary.peak_force, summary.peak_torque),
+        (summary.peak_tool_force, summary.peak_tool_torque),
     )
+    table.add_row("peak", format_wrenches(hand if has_hand else None, tool))
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
@@ -154,23 +147,35 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     _print_faults(summary)
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
-    if summary.effective is not None:
-        out.print(_true_weld(summary.effective, summary.requested))
+    _print_coupling(summary.coupling)
+    _print_certificate(summary, law_evaluations, has_hand=has_hand)
+    if hint := summary.timekeeping.hint:
+        out.print(hint)
+    if summary.recording is not None:
+        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
+
+
+def _print_certificate(summary: Summary, law_evaluations: int, *, has_hand: bool) -> None:
+    """Prints if the device bears the coupling at the time that the run kept."""
+    kept = summary.timekeeping
     if summary.is_certified is None and summary.conditions:
         for sentence in summary.conditions:
             out.print(escape(sentence))
         out.print("nothing proves that the device bears this")
-    else:
-        for sentence in summary.coupling_sentences[:1]:
-            out.print(sentence)
-        bound = "KT/2 + B'" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
-        certified = {
-            True: f"device certified: b >= {bound}",
-            False: f"device not certified: b < {bound}",
-            None: f"device unknown: b >= {bound} not checked",
-        }
-        unfelt = "the device feels no force: there is nothing to certify"
-        out.print(certified[summary.is_certified] if has_hand else unfelt)
+        return
+    if not has_hand:
+        out.print("the device feels no force: there is nothing to certify")
+        return
+    if kept.fault:
+        out.print(f"device not certified: {kept.fault}")
+        return
+    bound = "KT/2 + B_law" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
+    certified = {
+        True: f"device certified{kept.clause}: b >= {bound}",
+        False: f"device not certified: b < {bound}",
+        None: f"device unknown: b >= {bound} not checked",
+    }
+    out.print(certified[summary.is_certified])
     if (
         summary.is_certified is False
         and method_named(summary.method).has_law
@@ -178,8 +183,15 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
         out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
-    if summary.recording is not None:
-        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
+
+
+def _print_coupling(coupling: RunCoupling) -> None:
+    sentences = coupling.sentences()
+    if coupling.law is not None:
+        out.print(sentences[0])
+        return
+    for sentence in sentences:
+        out.print(f"{sentence}: {_WELD}" if coupling.effective else sentence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,8 +259,8 @@ class Run:
     stiffness: float | None = None
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
     damping: float | None = None
-    """Coupling damping B in N s/m at the hand. Damping of the law: B' = B - KT/2 with 'lossless',
-    B - KT with 'compensated', at least 0; B with all others. The device needs b >= KT/2 + B'."""
+    """Requested damping B of the coupling in N s/m. The law uses B - KT/2 with 'lossless', B - KT
+    with 'compensated', at least 0; B with all others. The device needs b >= KT/2 + B_law."""
     rotational_stiffness: float | None = None
     """Rotational coupling stiffness in N m/rad."""
     rotational_damping: float | None = None

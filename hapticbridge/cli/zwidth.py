@@ -18,9 +18,8 @@ from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import coupling_sentences
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.theory_plots import draw_z_width, recommended
+from hapticbridge.theory_plots import draw_z_width, recommended, recommended_coupling
 
 DEFAULT_RATE = 1000.0
 """Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
@@ -162,9 +161,7 @@ def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
         "limit": z.limit.tolist(),
         "limited_by": list(z.limited_by),
         "corner": {
-            "stiffness": z.corner.stiffness,
-            "damping": z.corner.damping,
-            "felt_damping": recommended(z).damping,
+            **asdict(recommended_coupling(z)),
             "method": default_method().name,
             "limited_by": z.corner_limited_by,
         },
@@ -174,7 +171,7 @@ def _z_width_facts(z: ZWidth, command: str | None) -> dict[str, object]:
 
 
 def _print_z_width(z: ZWidth, command: str | None) -> None:
-    table = Table("line", "K at B' = 0", "B' at K = 0", "because", box=None, pad_edge=False)
+    table = Table("line", "K at B_law = 0", "B_law at K = 0", "because", box=None, pad_edge=False)
     for line in z.lines:
         stiffness = f"{line.stiffness[0]:.5g} N/m"
         reason = line.reason if line.is_required else f"not kept: {line.reason}"
@@ -184,7 +181,7 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     out.print(f"limited by: {z.corner_limited_by} ({reason})")
     for note in z.notes:
         out.print(f"note: {note}")
-    (sentence,) = coupling_sentences(z.corner, default_method(), z.period, 1)
+    (sentence,) = recommended_coupling(z).sentences()
     out.print(f"use {sentence}: 80 % of the limit at a quarter of its damping")
     if command is None:
         out.print(
@@ -213,7 +210,7 @@ def _measured_facts(measured: MeasuredWidth | None) -> dict[str, object]:
 
 def _print_measured(measured: MeasuredWidth) -> None:
     """Prints what was borne beside what theory says."""
-    headings = ["B'", "borne to K", "not borne from K", "safe for any hand"]
+    headings = ["B_law", "borne to K", "not borne from K", "safe for any hand"]
     table = Table(*headings, "without a hand", box=None, pad_edge=False)
     unheld = measured.unheld or (None,) * len(measured.limits)
     for limit, safe, free in zip(measured.limits, measured.predicted, unheld, strict=True):
@@ -233,6 +230,6 @@ def _print_measured(measured: MeasuredWidth) -> None:
     ]
     if low:
         out.print(
-            f"[yellow]at B' = {low[0]:.3g} N s/m it bears less than theory allows:[/yellow] its "
+            f"[yellow]at B_law = {low[0]:.3g} N s/m it bears less than theory allows:[/yellow] its "
             "damping is less than was given, or it answers later; run 'hapticbridge identify'"
         )

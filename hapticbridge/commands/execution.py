@@ -122,9 +122,8 @@ INTERVAL = 0.05
 command costs the loop about 20 µs, and a flood must not become a load."""
 
 RESET_INTERVAL = 1.0
-"""Shortest time in s between two resets. The force fades before each and rises after it, which
-takes half a second. With a shorter interval, resets could follow each other without any force
-between them."""
+"""Shortest time in s between two resets. The force fades before each and rises after it. With
+a shorter interval, resets could follow each other without any force between them."""
 
 
 class CommandQueue:

@@ -100,7 +100,6 @@ JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 is too long; it is turned too far; the device received too much energy."""
 
 FORCE_LIMITED = int(TickFlag.FORCE_LIMITED)
-SLEW_LIMITED = int(TickFlag.SLEW_LIMITED)
 RAMPING = int(TickFlag.RAMPING)
 CONTROLLER_ACTIVE = int(TickFlag.CONTROLLER_ACTIVE)
 CONTACT = int(TickFlag.CONTACT)
@@ -114,8 +113,8 @@ RUNS_AWAY = int(TickFlag.RUNS_AWAY)
 """Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 
 FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41
-"""Bits of commands in force, above the device's own buttons: the wrench is switched off while the
-handle follows the device; the handle stays as if a clutch button were held."""
+"""Bits of commands in force, above the device's own buttons: the force is switched off; the handle
+stays as if a clutch button were held. Both let the hand go."""
 
 EQUALITY, LIMIT_JOINT, LIMIT_TENDON, CONTACT_PYRAMIDAL = 0, 3, 4, 6
 """Kinds of constraint rows, numbered as in MuJoCo's ``mjtConstraint``."""

@@ -116,14 +116,17 @@ def _restore_state(s: State) -> None:
 
 @compiled
 def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
-    """Returns P_F of a force and a torque on the tool, and notes if one was limited."""
+    """Returns P_F of a force and a torque on the tool, and notes if one was limited.
+
+    Numbers that are not finite stay, because they stop the run.
+    """
     level = s.level
     level.flags = 0
     size, size_r = norm(force), norm(torque)
-    if size > level.level[0]:
+    if level.level[0] < size < np.inf:
         force = scaled(level.level[0] / size, force)
         level.flags = FORCE_LIMITED
-    if size_r > level.level[1]:
+    if level.level[1] < size_r < np.inf:
         torque = scaled(level.level[1] / size_r, torque)
         level.flags = FORCE_LIMITED
     return force, torque

@@ -236,22 +236,6 @@ def _spring_energy(stiffness: float, length: float, limit: float) -> float:
 
 
 @compiled
-def releasable_energy(s: State) -> float:
-    """Returns r V(e) + r V(φ) in J, the energy that the springs can release to the device.
-
-    r = force_scale / scale; V is limited by the largest force and torque on the device.
-    """
-    pose, run = s.pose, s.run
-    ratio = run.force_scale / run.scale
-    stretch = norm(subtract(vector_of(pose.handle_position), vector_of(pose.tool_position)))
-    tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
-    twist = norm(rotation_between(tool, handle))
-    linear = _spring_energy(s.coupling.stiffness, stretch, run.force_limit / run.force_scale)
-    angular = _spring_energy(s.coupling.rotational_stiffness, twist, run.torque_limit / ratio)
-    return float(ratio * (linear + angular))
-
-
-@compiled
 def set_gains(s: State, share: float) -> None:
     """Gives the coupling's actuators a share of their gains."""
     mj = s.mj
@@ -336,6 +320,31 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
 
 
 @compiled
+def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float, float]:
+    """Returns the terms of a sample's lateness for translation (0) or rotation (1).
+
+    Args:
+        s: The bound state, with the handle's new step d.
+        kind: 0 or 1.
+        interval: Time t since the last new sample in s.
+
+    Returns:
+        K, K/2 + B'/T, K/2 + B'/T − b/t and ‖d‖². b is the device's damping seen at the handle, at
+        least what the condition needs.
+    """
+    k, run, pose = s.coupling, s.run, s.pose
+    stiffness, damping = k.stiffness, k.damping
+    b, d = run.device_damping / (run.force_scale * run.scale), vector_of(pose.handle_step)
+    if kind == 1:
+        stiffness, damping = k.rotational_stiffness, k.rotational_damping
+        b = run.device_rotational_damping * run.scale / run.force_scale
+        d = vector_of(pose.handle_turn)
+    b = max(b, 0.5 * stiffness * run.period + damping)
+    needed = 0.5 * stiffness + damping / run.period
+    return stiffness, needed, needed - b / interval, dot(d, d)
+
+
+@compiled
 def charge_lateness(s: State, interval: float) -> None:
     """Charges the springs with the energy that a late sample may have put in.
 
@@ -347,19 +356,9 @@ def charge_lateness(s: State, interval: float) -> None:
     hold less by D. b in N s/m is the device's damping seen at the handle, at least what the
     condition needs.
     """
-    k, run, pose = s.coupling, s.run, s.pose
-    ratio = run.force_scale * run.scale
-    d, turn = vector_of(pose.handle_step), vector_of(pose.handle_turn)
     for kind in range(2):
-        stiffness, damping = k.stiffness, k.damping
-        b, square = run.device_damping / ratio, dot(d, d)
-        if kind == 1:
-            stiffness, damping = k.rotational_stiffness, k.rotational_damping
-            b = run.device_rotational_damping * run.scale / run.force_scale
-            square = dot(turn, turn)
-        b = max(b, 0.5 * stiffness * run.period + damping)
-        lacking = 0.5 * stiffness + damping / run.period - b / interval
-        k.owed[kind] = max(k.owed[kind] + lacking * square, 0.0)
+        _, _, lacking, square = lateness(s, kind, interval)
+        s.coupling.owed[kind] = max(s.coupling.owed[kind] + lacking * square, 0.0)
 
 
 @compiled

@@ -64,6 +64,8 @@ from hapticbridge.pose import (
     Vector,
     add,
     conjugate,
+    product,
+    quaternion_exp,
     quaternion_of,
     rotated,
     rotation_between,
@@ -327,6 +329,15 @@ def twist_in_tool(s: State, tool: Quaternion) -> Vector:
 def note_twist(s: State) -> None:
     """Notes the present φ for the next tick."""
     store_vector(s.lossless.twist, twist_in_tool(s, quaternion_of(s.pose.tool_quaternion)))
+
+
+@compiled
+def note_slip(s: State) -> None:
+    """Notes φ of the last tick anew after a slip, as if the handle had slipped before its turn."""
+    back = quaternion_exp(scaled(-1.0, vector_of(s.pose.handle_turn)))
+    handle = product(back, quaternion_of(s.pose.handle_quaternion))
+    tool = quaternion_of(s.pose.tool_quaternion)
+    store_vector(s.lossless.twist, rotated(conjugate(tool), rotation_between(tool, handle)))
 
 
 @compiled

@@ -28,7 +28,6 @@ ALL_MOTORS = 63
 """Mask of six axes with a motor."""
 
 _POSITIVE = (
-    "longest_stall",
     "reach",
     "hold_force",
     "hold_torque",
@@ -47,6 +46,12 @@ _NOT_NEGATIVE = (
 )
 
 
+EARLIER_VERSION = (
+    "recorded by an earlier version of hapticbridge, whose force limits acted on the device alone; "
+    "this version cannot judge it, but 'hapticbridge export' reads it"
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
@@ -62,9 +67,10 @@ class GuardParameters:
         energy_credit_limit: Largest energy in J that earlier dissipation may pay for.
         stale_ticks: Ticks in a row without a new sample after which the wrench fades; 0 for never.
         fade_ticks: Ticks in which the wrench fades to zero.
+        has_hand: True if a hand holds the device. The handle then does not follow what the device
+            did before a start, when no force was on it, and slips for late samples.
         clutch: Mask of buttons; while one is held, the device moves without the handle.
         dead_man: Mask of buttons of which one must be held; 0 for none.
-        longest_stall: Time in s between two samples after which the handle is re-anchored.
         speed: Speed of the device in m/s above which the run is stopped.
         turn_speed: Angular speed of the device in rad/s above which the run is stopped.
         stretch: Length of the coupling in m above which the run is stopped.
@@ -93,9 +99,9 @@ class GuardParameters:
     energy_credit_limit: float = 0.0
     stale_ticks: int = 0
     fade_ticks: int = 1
+    has_hand: bool = False
     clutch: int = 0
     dead_man: int = 0
-    longest_stall: float = math.inf
     speed: float = math.inf
     turn_speed: float = math.inf
     stretch: float = math.inf
@@ -121,7 +127,14 @@ class GuardParameters:
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
-        smallest = {"stale_ticks": 0, "fade_ticks": 1, "clutch": 0, "dead_man": 0, "motors": 0}
+        smallest = {
+            "stale_ticks": 0,
+            "fade_ticks": 1,
+            "has_hand": 0,
+            "clutch": 0,
+            "dead_man": 0,
+            "motors": 0,
+        }
         for name, minimum in smallest.items():
             value = getattr(self, name)
             if not isinstance(value, int) or not minimum <= value < 2**MAX_BUTTONS:
@@ -145,10 +158,7 @@ class GuardParameters:
             values = {}
         names = {field.name for field in fields(cls)}
         if "controller" in values and "hold_force" not in values:
-            raise HapticBridgeError(
-                "recorded by an earlier version of hapticbridge, whose force limits acted on the "
-                "device alone; this version cannot judge it, but 'hapticbridge export' reads it"
-            )
+            raise HapticBridgeError(EARLIER_VERSION)
         if values.keys() != names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}

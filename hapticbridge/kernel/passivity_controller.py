@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.jit import compiled, direct
-from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, FORCE_OFF, Part, State
-from hapticbridge.kernel.law import releasable_energy
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, scaled
 
@@ -45,7 +44,6 @@ OBSERVER_DTYPE = np.dtype(
         ("observed_energy", "<f8"),
         ("net_device_energy", "<f8"),
         ("excess_device_energy", "<f8"),
-        ("stored_while_force_off", "<f8"),
         ("generated_energy", "<f8"),
         ("previous_generated", "<f8"),
         ("previous_net_storage", "<f8"),
@@ -71,34 +69,6 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     observer["energy_credit_limit"] = guarding.energy_credit_limit
 
 
-def cap_dissipation(s: State) -> None:
-    """Limits, before a command, the dissipation that may pay for energy to the device.
-
-        G ← max(G, −(A_max + r V + r max(S − S_0 − U, 0))),    r = force_scale / scale
-
-    G is ``net_device_energy``, A_max ``energy_credit_limit``, V the energy that the coupling's
-    springs can release, S − S_0 the energy that the scene has taken up; all in J. Both V and S −
-    S_0 may return to the hand. U is the energy that the scene took up while the force was off by
-    command; it may not return, and neither may V then, because the handle is re-anchored before
-    force is on again. Without the cap, a hand that has dissipated 1 J by rubbing could receive 1 J
-    by a slider that is moved, or a force that is switched, at the right moments.
-
-    Args:
-        s: The bound state, between two ticks.
-    """
-    observer, energy = s["observer"], s["energy"]
-    ratio = float(s["run"]["force_scale"] / s["run"]["scale"])
-    stored = float(
-        energy["kinetic"]
-        + energy["potential"]
-        - energy["start_energy"]
-        - observer["stored_while_force_off"]
-    )
-    released = 0.0 if s["guard"]["commanded"] & FORCE_OFF else direct(releasable_energy, s)(s)
-    limit = float(observer["energy_credit_limit"]) + released + ratio * max(stored, 0.0)
-    observer["net_device_energy"] = max(float(observer["net_device_energy"]), -limit)
-
-
 def observe_reset(s: State, stored_before: float) -> None:
     """Accounts for a reset of the scene: storage that it replaced pays for no energy to the device.
 
@@ -111,7 +81,6 @@ def observe_reset(s: State, stored_before: float) -> None:
     after = float(energy["kinetic"] + energy["potential"])
     lost_before, lost_after = min(stored_before - start, 0.0), min(after - start, 0.0)
     observer["net_device_energy"] += ratio * (lost_before - lost_after)
-    cap_dissipation(s)
 
 
 @compiled
@@ -143,22 +112,20 @@ def foreseen_excess(s: State) -> float:
 def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Updates the passivity observer with the previous tick's energy flow.
 
-        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + r c (ΔS − W), −A_max)
+        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + r (ΔS − W), −A_max)
 
     A > 0 means that device and scene together have delivered more energy than they received.
 
     Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the
     previous tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new
-    sample (s); r = force_scale / scale; c share of the wrench that the guard let through; ΔS change
-    of the stored energy (J); W work of the scene's motors and of user forces (J). A_max (J) caps
-    the credit, so that long dissipation cannot hide a short active phase.
+    sample (s); r = force_scale / scale; ΔS change of the stored energy (J); W work of the scene's
+    motors and of user forces (J). A_max (J) caps the credit, so that long dissipation cannot hide a
+    short active phase.
 
     Also updated, each in J:
         ``generated_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``excess_device_energy``: result of the function of that name. Work of the scene's motors
         does not reduce it.
-        ``stored_while_force_off``: energy that the scene took up while the force was off by
-        command and still stores. No hand supplied it (``cap_dissipation``).
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -180,10 +147,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.previous_generated = over
     net = stored - energy.actuator_work - energy.external_work
     change = net - observer.previous_net_storage
-    gained = (s.run.force_scale / s.run.scale) * s.guard.share * change
-    taken = change if s.guard.commanded & FORCE_OFF else 0.0
-    unfelt = max(observer.stored_while_force_off + taken, 0.0)
-    observer.stored_while_force_off = min(unfelt, max(stored, 0.0))
+    gained = (s.run.force_scale / s.run.scale) * change
     observer.previous_net_storage = net
     # before the first tick and in a pause, the time that the device took to move is unknown
     rate = 1.0 / interval if s.loop.tick > s.guard.start_tick else 0.0

@@ -17,6 +17,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | observer    | energy at the device, added damping               | passivity_controller          |
 | watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
+| timing      | delay of the force, energy that it may have given | timing                        |
 """
 
 from __future__ import annotations
@@ -37,7 +38,6 @@ from hapticbridge.kernel.law import (
     Gains,
     bind_coupling,
     implicit_gains,
-    releasable_energy,
     set_tuning_goal,
 )
 from hapticbridge.kernel.ledger import (
@@ -52,7 +52,6 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
-    cap_dissipation,
     observe_reset,
 )
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
@@ -64,6 +63,7 @@ from hapticbridge.kernel.tick_guard import (
     restart_ramp,
     set_commanded,
 )
+from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
 
 _FROM_PARAMETERS = (
@@ -121,6 +121,7 @@ STATE_DTYPE = np.dtype(
         ("observer", OBSERVER_DTYPE),
         ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
+        ("timing", TIMING_DTYPE),
     ]
 )
 """The kernel's state; the module's docstring has a table of its sub-records."""
@@ -163,7 +164,7 @@ class BoundKernel:
 
     @property
     def external_flags(self) -> NDArray[np.int64]:
-        """Flags ``STALE_SAMPLE`` and ``REANCHORED`` of the next tick; the loop fills this view."""
+        """Flag ``STALE_SAMPLE`` of the next tick; the loop fills this view."""
         return cast(NDArray[np.int64], self.state["loop"]["external_flags"])
 
     @property
@@ -185,12 +186,10 @@ class BoundKernel:
             gains: Gains of its actuators (``rendering.Method.gains``).
             ticks: Length of the change in ticks, >= 1.
         """
-        cap_dissipation(self._record)
         set_tuning_goal(self._record["coupling"], parameters, gains, ticks)
 
     def command(self, bits: int) -> None:
         """Sets the commands in force from the next tick on, ``FORCE_OFF`` and ``CLUTCHED``."""
-        cap_dissipation(self._record)
         set_commanded(self._record["guard"], bits)
 
     def handle_reset(self) -> None:
@@ -286,7 +285,6 @@ class BoundKernel:
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
             direct(restart_lossless, s)
-        direct(releasable_energy, s)  # ready for a command, because loading takes a millisecond
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

@@ -58,6 +58,7 @@ from hapticbridge.kernel.lossless import (
     finish_lossless,
     lossless_flag,
     lossless_wrench,
+    note_slip,
 )
 from hapticbridge.kernel.mujoco_c import (
     floats,
@@ -83,6 +84,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
+from hapticbridge.kernel.timing import meter_delay, note_delay, skip_delay
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -109,18 +111,22 @@ LOOP_DTYPE = np.dtype(
         ("law_work", "<f8"),
         ("peak_force", "<f8"),
         ("peak_torque", "<f8"),
+        ("peak_tool_force", "<f8"),
+        ("peak_tool_torque", "<f8"),
         ("wrench_on_tool", "<f8", 6),
         ("motion", "<f8", 6),
         ("wrench_on_device", "<f8", 6),
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
-next. ``external_flags`` are ``STALE_SAMPLE`` and ``REANCHORED`` as the live loop or a recording has
-them, set before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
+next. ``external_flags`` is ``STALE_SAMPLE`` as the live loop or a recording has it, set
+before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
 ``motion`` is the tool's, in m and rad; wrenches in N and N m, peaks since the start."""
 
 
 # Before MuJoCo's step
+
+_AT_REST = (0.0, 0.0, 0.0)
 
 
 @compiled
@@ -177,19 +183,22 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
-    if s.run.has_law and s.loop.tick > s.guard.start_tick:
+    if s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick:
         charge_lateness(s, interval)
+        meter_delay(s, max(elapsed, s.run.period), interval)
+    else:
+        skip_delay(s)
     if s.mj.nmocap > 1:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
         max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
-    if slip(s, max_stretch, max_twist) or share < 1.0:
+    has_slipped = slip(s, max_stretch, max_twist)
+    if has_slipped and s.run.scheme == Scheme.MIDPOINT:
+        note_slip(s)
+    if has_slipped or (share < 1.0 and (moved != _AT_REST or turned != _AT_REST)):
         anchor_handle(pose)
         note_anchored(s.guard)
-    handle = vector_of(pose.handle_position)
-    orientation = quaternion_of(pose.handle_quaternion)
-
     row[0].buttons = buttons
     _record_sample(s, row)
     return OK
@@ -391,7 +400,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
 def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device.
 
-    In this order: scale, passivity controller, limit by norm, limit of change, ramp and fade.
+    In this order: scale, share of the lever, and of the passivity controller's damping what fits.
     """
     run = s.run
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
@@ -426,8 +435,10 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
         return _refuse(s)
-    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_tool)))
-    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
+    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
+    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_device[3:6])))
+    loop.peak_tool_force = max(loop.peak_tool_force, norm(vector_of(loop.wrench_on_tool)))
+    loop.peak_tool_torque = max(loop.peak_tool_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     _record(s, row)
@@ -556,6 +567,7 @@ def finish_tick(
     code = close_tick(state, row, has_positions)
     if code != OK:
         return code
+    note_delay(state[0], read_ns, write_ns)
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 
@@ -576,7 +588,8 @@ def publish_positions(
         state: The bound state.
         cursors: Cursors of the ring; the record of this tick is the next one written there.
         head: Head of the snapshot.
-        numbers: Slack in J, positions, mocap poses, then per contact its point in m and force in N.
+        numbers: Slack in J, positions, mocap poses, then per contact with a force its point in m
+            and its force in N.
     """
     s = state[0]
     mj = s.mj
@@ -591,12 +604,19 @@ def publish_positions(
         for value in floats(source, count):
             numbers[end] = value
             end += 1
-    shown = min(ints(mj.ncon, 1)[0], (numbers.size - end) // 6)
-    for c in range(shown):
+    shown = 0
+    # MuJoCo solves for no contact forces of a tool without mass
+    count = 0 if s.run.scheme == Scheme.MASSLESS else ints(mj.ncon, 1)[0]
+    for c in range(count):
+        if end + 6 > numbers.size:
+            break
         contact = pointer_at(mj.contact) + c * mj.contact_size
         slot, frame = numbers[end : end + 6], floats(contact + mj.contact_frame, 9)
         mj_contact_force(mj.model, mj.data, c, slot.ctypes.data)  # along the axes of its frame
         normal, first, second = slot[0], slot[1], slot[2]
+        if normal == 0.0 and first == 0.0 and second == 0.0:
+            continue  # a near contact may exist without a force
+        shown += 1
         point = floats(contact + mj.contact_point, 3)
         for axis in range(3):
             slot[axis] = point[axis]
@@ -668,7 +688,7 @@ def simulate_recorded(
     Args:
         state: The bound state.
         samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` and ``REANCHORED`` as recorded, one per tick.
+        external_flags: ``STALE_SAMPLE`` as recorded, one per tick.
         elapsed: Time between two samples in s, one per tick.
         row: The bound record.
         rows: Receives the records; as long as ``samples``.

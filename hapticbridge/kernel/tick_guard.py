@@ -1,21 +1,13 @@
-"""The guard inside a tick: refusal of a sample, re-anchoring of the handle, limits of the wrench.
+"""The guard inside a tick: refusal of a sample, the lever between device and handle, added damping.
 
-After a start or a re-anchoring, the guard lets only a share r of the wrench through, and r grows
-from tick to tick. A coupling that is stretched meanwhile grows with r. From the identity behind
-eq. (6) of Brown & Colgate (1997), with the wrench r_k f_k in the place of f_k, the device receives
+A start, a fade, a clutch, a dead-man button, a force switched off and lost samples are one number,
+the ratio r of a lever from 0 to 1. The device gets r times the force, and the handle moves by r
+times the device's motion:
 
-    W = Σ (r_k − r_{k−1}) V(e_k),    V(e) = ∫ min(K e, F) de
+    w_k = −r_k s Aᵀ f_k,    h_{k+1} = h_k + r_k scale A (p_{k+1} − p_k)
 
-that no port has supplied: the spring is compressed while r is small and released when r is 1. F is
-the force limit in N, V an energy in J. A hand that moves 40 mm into a wall with F = 10 N during the
-ramp thus receives 0.2 J, and the guard's energy limit rightly ends the run. Therefore r rises in
-equal steps only while V is below V_0 (``ramp_energy``), and more slowly above:
-
-    r_k − r_{k−1} = min(1, V_0/V(e_k)) / (n + 1)
-
-with n the length of the ramp in ticks. This bounds W by V_0 in every n + 1 ticks, for any motion of
-the hand. Energy that the scene stored while r was small and releases later is not in V; there the
-energy limit alone protects.
+Work at the device and work at the handle are then equal for every course of r, and the tool keeps
+what carries it while r is 0.
 """
 
 from __future__ import annotations
@@ -58,15 +50,15 @@ _FROM_PARAMETERS = (
     "fade_ticks",
     "clutch",
     "dead_man",
-    "longest_stall",
+    "has_hand",
     "reach",
 )
 _THRESHOLDS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
 GUARD_DTYPE = np.dtype(
     [
-        *((name, "<i8") for name in _FROM_PARAMETERS[:4]),
-        *((name, "<f8") for name in _FROM_PARAMETERS[4:]),
+        *((name, "<i8") for name in _FROM_PARAMETERS[:5]),
+        ("reach", "<f8"),
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),
@@ -95,14 +87,13 @@ def bind_guard(guard: Part, parameters: RunParameters) -> None:
         guard[name] = getattr(limits, name)
     for name in _THRESHOLDS:
         guard[f"max_{name}"] = getattr(limits, name)
-    guard["rise_ticks"] = parameters.ramp_ticks
-    guard["share"] = 1.0 if parameters.ramp_ticks == 0 else 0.0
+    restart_ramp(guard, 0, parameters.ramp_ticks)
 
 
 def restart_ramp(guard: Part, tick: int, length: int) -> None:
-    """Lets the share rise from zero again, from a tick on and within so many ticks."""
+    """Lets the share rise from zero within so many ticks; without a hand it may be 1 at once."""
     guard["start_tick"], guard["rise_ticks"] = tick, length
-    guard["share"] = 1.0 if length == 0 else 0.0
+    guard["share"] = 0.0 if guard["has_hand"] or length > 0 else 1.0
 
 
 def let_go(guard: Part) -> None:

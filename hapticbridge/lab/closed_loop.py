@@ -216,7 +216,7 @@ class ClosedLoop:
             slack_share=ledger.slack_share,
             first_active=int(state["energy"]["first_active"][0]),
             fault=ledger.fault,
-            peak_force=float(state["loop"]["peak_force"][0]),
+            peak_force=float(state["loop"]["peak_tool_force"][0]),
             last_force=float(last.max(initial=0.0)),
             device_energy=ledger.device_energy,
             records=records[: min(done, records.size)],

@@ -18,7 +18,7 @@ from hapticbridge.recording.ring import attached, created, memory_folder
 SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
 """Indices into ``Snapshot.head``. The sequence is odd while the loop writes. The number is that
 of the tick's record in the ring, counted from the ring's start. The third is the number of
-contacts."""
+contacts with a force."""
 
 MAX_CONTACTS = 32
 """Largest number of contacts in a picture; in a larger heap no single one can be distinguished."""
@@ -50,8 +50,8 @@ class Picture:
         qpos: Generalised positions, (nq,).
         mocap_pos: Positions of mocap bodies in m, (nmocap, 3).
         mocap_quat: Orientations of mocap bodies, (nmocap, 4).
-        contacts: Position in m and force in N of each contact in the world frame, (n, 2, 3) with
-            n <= ``MAX_CONTACTS``.
+        contacts: Position in m and force in N of each contact with a force, in the world frame,
+            (n, 2, 3) with n <= ``MAX_CONTACTS``.
     """
 
     number: int

@@ -78,7 +78,7 @@ FASTEST = 20_000.0
 def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
     """Returns changes that satisfy the device condition, as a user would type them.
 
-    Stiffness and damping are the requested ones, not the law's B'. Each is changed alone; a change
+    Stiffness and damping are the requested ones, not the law's. Each is changed alone; a change
     that does not help alone is left out. A faster loop is no remedy for a delay (``is_late``). The
     device's damping must be known.
     """
@@ -291,7 +291,7 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
     return (
         f"{share:.0%} of the energy came in ticks whose motion was {COUNTED:g} steps of the "
         f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
-        f"friction of K D/2 + B' D/T = {rub:.3g} N, the device's is {has}"
+        f"friction of K D/2 + B_law D/T = {rub:.3g} N, the device's is {has}"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +20,13 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
+from hapticbridge.record import force_on_hand
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.recording.timeline import due_times
-from hapticbridge.rendering import Method, method_named
-from hapticbridge.run_description import MODEL_ATTACHMENT, parameters_of
-from hapticbridge.summary import coupling_sentences, was_always_implicit
+from hapticbridge.rendering import Method, RunCoupling, method_named
+from hapticbridge.run_description import MODEL_ATTACHMENT, parameters_of, requested_of
+from hapticbridge.summary import was_always_implicit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +55,13 @@ _ENERGIES = (
     ("device_energy", "given to the device", "#e69f00", "-"),
     ("kinetic", "kinetic", "#555555", "--"),
 )
-_DRAWN = ("wrench_on_tool", "tool_position", "handle_position", *(name for name, *_ in _ENERGIES))
+_DRAWN = (
+    "wrench_on_tool",
+    "wrench_on_device",
+    "tool_position",
+    "handle_position",
+    *(name for name, *_ in _ENERGIES),
+)
 
 
 def decimated(
@@ -83,6 +91,14 @@ def decimated(
     return time[index], values[index]
 
 
+def is_motion_prescribed(meta: Mapping[str, str]) -> bool:
+    """Returns True if no hand felt the recorded forces, or if the data sheet is damaged."""
+    try:
+        return DeviceInfo.from_json(meta.get("device", "")).is_prescribed
+    except HapticBridgeError:
+        return True
+
+
 def draw_recording(recording: Recording) -> Figure:
     """Draws force, position and energies over time.
 
@@ -100,8 +116,13 @@ def draw_recording(recording: Recording) -> Figure:
     figure = new_figure(8, 8)
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
     position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")
+    hand = force_on_hand(ticks, parameters.axes)
+    is_held = not is_motion_prescribed(meta)
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
-        force_axes.plot(*decimated(time, ticks["wrench_on_tool"][:, i]), color=colour, label=axis)
+        tool_force = decimated(time, ticks["wrench_on_tool"][:, i])
+        if is_held:
+            force_axes.plot(*decimated(time, hand[:, i]), color=colour, label=f"hand {axis}")
+        force_axes.plot(*tool_force, color=colour, ls=":", lw=1, label=f"tool {axis}")
         start = ticks["tool_position"][0, i]
         tool = 1e3 * (ticks["tool_position"][:, i] - start)
         handle = 1e3 * (ticks["handle_position"][:, i] - start)
@@ -110,22 +131,24 @@ def draw_recording(recording: Recording) -> Figure:
     for name, label, colour, style in _ENERGIES:
         drawn = decimated(time, 1e3 * ticks[name])
         energy_axes.plot(*drawn, color=colour, ls=style, label=label)
-    force_axes.set_ylabel("force on the tool (N)")
+    force_axes.set_ylabel("force on hand and tool (N)" if is_held else "force on the tool (N)")
     position_axes.set_ylabel("displacement (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
     method = method_named(meta.get("method", ""))
-    sentences = coupling_sentences(
-        parameters.coupling,
+    coupling = RunCoupling.of(
         method,
-        parameters.period,
-        parameters.substeps,
+        parameters.period / parameters.substeps,
+        requested_of(meta),
+        law=parameters.coupling,
+        measured=parameters.effective,
         is_always_implicit=was_always_implicit(ticks),
-    ) or ("no coupling law",)
+    )
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
     # a control character would break the SVG
     title = (
-        "".join(letter if letter.isprintable() else "�" for letter in title) + f"\n{sentences[0]}"
+        "".join(letter if letter.isprintable() else "�" for letter in title)
+        + f"\n{coupling.sentences()[0]}"
     )
     figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
@@ -197,8 +220,8 @@ class Evidence:
     def requested(self) -> Coupling:
         """Smallest requested coupling that leads to ``worst``.
 
-        If the law's B' is 0, the method removed all requested damping, which may have had any value
-        up to the effective one. It then counts as 0.
+        If the law's damping is 0, the method removed all requested damping, which may have had any
+        value up to the effective one. It then counts as 0.
         """
         law, step = self.worst.coupling, self.worst.period / self.worst.substeps
         requested = self.method.requested_coupling(law, step)

@@ -16,7 +16,8 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.units import format_si
+from hapticbridge.timekeeping import NOT_KEPT
+from hapticbridge.units import format_si, format_wrenches
 
 Facts = list[tuple[str, str]]
 
@@ -49,12 +50,12 @@ _RUN = {
     "ramp_ticks": "ticks",
     "scene_sha256": "",
 }
-"""Metadata on a page, with units. The gains are those of the law: B', not B."""
+"""Metadata on a page, with units. The gains are those of the law."""
 
 _NAMES = {
     "period_s": "period",
-    "damping": "damping used",
-    "rotational_damping": "rotational damping used",
+    "damping": "law damping",
+    "rotational_damping": "law rotational damping",
 }
 """Names on a page that differ from the metadata's."""
 
@@ -72,7 +73,7 @@ _GUARD = {
     "max_rotational_damping": "N m s/rad",
     "stale_ticks": "ticks",
     "fade_ticks": "ticks",
-    "longest_stall": "s",
+    "has_hand": "",
     "stretch": "m",
     "angle": "rad",
     "speed": "m/s",
@@ -153,8 +154,10 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     """Returns the main facts: setup, course of the run, and checks."""
     parameters, meta = evidence.parameters, evidence.recording.meta
     flags = evidence.ticks["flags"]
-    ports = evidence.ticks["wrench_on_device"]
-    force, torque = (float(np.linalg.norm(ports[:, p], axis=1).max()) for p in _PARTS)
+    hand, tool = (
+        tuple(float(np.linalg.norm(wrench[:, part], axis=1).max()) for part in _PARTS)
+        for wrench in (evidence.ticks["wrench_on_device"], evidence.ticks["wrench_on_tool"])
+    )
     in_time = "in simulated time" if meta.get("clock") == "simulated" else "no deadline missed"
     if late := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         missed = round(report.duration / parameters.period) - report.ticks
@@ -165,11 +168,15 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
         ("method", f"{evidence.method.name}, {1 / parameters.period:g} Hz"),
         *(("coupling", sentence) for sentence in report.coupling_sentences[:1]),
         ("ran", f"{report.duration:.3f} s, {report.ticks} ticks, {in_time}"),
-        ("largest force", f"{format_si(force, 'N')}, {format_si(torque, 'N m')} on the device"),
+        ("largest force", format_wrenches(None if evidence.info.is_prescribed else hand, tool)),
         ("controller", _controller_words(evidence)),
     ]
+    kept = report.timekeeping
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    facts.append(("device condition", borne[report.certified]))
+    words = NOT_KEPT if kept is not None and kept.fault else borne[report.certified]
+    facts.append(("device condition", words + (kept.clause if kept and report.certified else "")))
+    if kept is not None and (kept.share < 1.0 or kept.mean_delay > 0.0):
+        facts.append(("time kept", f"{kept.words}, {format_si(kept.mean_delay, 's')} to the force"))
     if report.slack_share:
         facts.append(("slack used", f"{report.slack_share:.0%}"))
     return [*facts, ("simulated again", report.resimulation or "not reached")]

@@ -123,10 +123,14 @@ def is_warned(report: AuditReport) -> bool:
 def _device_notes(report: AuditReport) -> list[str]:
     if report.verdict != "passive":
         return []
+    kept = report.timekeeping
     if report.certified:
-        return ["The device bears this coupling, in any hand."]
+        clause = "" if kept is None or not kept.clause else f",{kept.clause}"
+        return [f"The device bears this coupling, in any hand{clause}."]
     if report.certified is None:
         return ["It is not known if the device bears this coupling in any hand."]
+    if kept is not None and kept.fault:  # the reason has the numbers
+        return ["The device is not certified. This run stayed passive; another one need not."]
     return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "
         "passive; another one need not."
@@ -134,7 +138,7 @@ def _device_notes(report: AuditReport) -> list[str]:
 
 
 def telling_time(recording: Recording, report: AuditReport) -> float:
-    """Returns the time in s of the fault, or else of the largest force.
+    """Returns the time in s of the fault, or else of the largest force on the tool.
 
     Raises:
         RecordingError: The recording has no tick or no period.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.plotting import new_figure
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.record import TickFlag, force_on_hand, has_flag
 from hapticbridge.report.evidence import AXES, COLOURS, Evidence, decimated, finish
 
 if TYPE_CHECKING:
@@ -116,11 +116,14 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     label = "given to the device, unpaid" if report.port == "device" else "created in the scene"
     bounded(energy, numbers, judged[around], allowed[around], label)
     stretch = evidence.ticks["handle_position"] - evidence.ticks["tool_position"]
+    forces = force_on_hand(evidence.ticks, evidence.parameters.axes)
+    if evidence.info.is_prescribed:
+        forces = evidence.ticks["wrench_on_tool"][:, :3]
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
-        sent = evidence.ticks["wrench_on_device"][around, i]
-        force.plot(numbers, sent, color=colour, marker=".", ms=3, lw=1, label=axis)
+        force.plot(numbers, forces[around, i], color=colour, marker=".", ms=3, lw=1, label=axis)
         apart.plot(numbers, 1e3 * stretch[around, i], color=colour, lw=1, label=axis)
-    force.set_ylabel("force on\nthe device (N)")
+    is_held = not evidence.info.is_prescribed
+    force.set_ylabel("force on\nthe hand (N)" if is_held else "force on\nthe tool (N)")
     apart.set_ylabel("spring: handle\n− tool (mm)")
     for axes in (energy, force, apart):
         axes.axvline(tick, color="black", ls="--", lw=1, label=f"tick {tick}")
@@ -133,13 +136,20 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
 
 
 def draw_motion(evidence: Evidence) -> Figure:
-    """Draws force and torque on the tool, and the poses of tool and handle."""
+    """Draws the force on hand and tool, the torque on the tool, and the poses of tool and handle.
+
+    The force on the hand is left out for a prescribed motion, which no hand feels.
+    """
     ticks, time = evidence.ticks, evidence.time
-    figure = new_figure(8, 7.6)
-    force, torque, way, turn = figure.subplots(4, 1, sharex=True)
+    is_held = not evidence.info.is_prescribed
+    figure = new_figure(8, 9.0 if is_held else 7.6)
+    *hand, force, torque, way, turn = figure.subplots(4 + is_held, 1, sharex=True)
+    on_hand = force_on_hand(ticks, evidence.parameters.axes)
     start = ticks["tool_position"][0]
     way.plot([], [], color="grey", ls=":", lw=1, label="handle")
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
+        for axes in hand:
+            curve(axes, time, on_hand[:, i], color=colour, label=axis)
         curve(force, time, ticks["wrench_on_tool"][:, i], color=colour, label=axis)
         curve(torque, time, 1e3 * ticks["wrench_on_tool"][:, 3 + i], color=colour, label=axis)
         tool = 1e3 * (ticks["tool_position"][:, i] - start[i])
@@ -152,6 +162,7 @@ def draw_motion(evidence: Evidence) -> Figure:
         angle = np.linalg.norm(turn_between(first, ticks[f"{name}_quaternion"]), axis=1)
         curve(turn, time, np.degrees(angle), color=colour, ls=style, label=name)
     for axes, label in (
+        *((axes, "force on\nthe hand (N)") for axes in hand),
         (force, "force on\nthe tool (N)"),
         (torque, "torque on\nthe tool (mN m)"),
         (way, "displacement\n(mm)"),
@@ -170,7 +181,6 @@ def draw_motion(evidence: Evidence) -> Figure:
 FLAGS = (
     (TickFlag.RAMPING, "force rises"),
     (TickFlag.FORCE_LIMITED, "force limited"),
-    (TickFlag.SLEW_LIMITED, "slew limited"),
     (TickFlag.CONTROLLER_ACTIVE, "controller"),
     (TickFlag.CLUTCH, "let go: clutch or dead man"),
     (TickFlag.REANCHORED, "re-anchored"),

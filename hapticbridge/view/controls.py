@@ -26,7 +26,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
-from hapticbridge.rendering import method_named
+from hapticbridge.rendering import RunCoupling, method_named
 from hapticbridge.run_description import parameters_of
 
 PACE = 2.0 * INTERVAL
@@ -45,8 +45,8 @@ _ROUNDING = 1.0 + 1e-9  # restores 2 from a bound that was computed as 1.9999999
 
 SYMBOLS = {"translation": ("K", "B"), "rotation": ("K_r", "B_r")}
 _WORDS = {
-    "translation": ("stiffness", "damping"),
-    "rotation": ("turning stiffness", "turning damping"),
+    "translation": ("stiffness", "requested damping"),
+    "rotation": ("turning stiffness", "requested turning damping"),
 }
 
 
@@ -274,22 +274,15 @@ class Controls:
     def _take_coupling(self, event: Mapping[str, Any]) -> None:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
-        requested = method.requested_coupling(
-            Coupling(**law), allowance.period / allowance.substeps
-        )
+        step = allowance.period / allowance.substeps
+        requested = method.requested_coupling(Coupling(**law), step)
         self._gains = [sliders.span.gains(requested) for sliders in self._sliders]
         is_still = time.monotonic() - self._touched > STILL
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)
         self._bounds.content = self._ends()
-        text = "; ".join(
-            f"{symbol[0]} goes to {pair[0]:.4g} {unit[0]}, {symbol[1]} to {pair[1]:.3g} {unit[1]}"
-            for symbol, unit, pair in (
-                (SYMBOLS[sliders.span.axis], UNITS[sliders.span.axis], pair)
-                for sliders, pair in zip(self._sliders, self._gains, strict=True)
-            )
-        )
-        self._say("answer", text)
+        sentences = RunCoupling.of(method, step, law=Coupling(**law)).sentences()
+        self._say("answer", f"goes to {'; '.join(sentences[: len(self._sliders)])}")
 
     def _refuse(self, reason: str) -> None:
         """Shows the reason of a refusal, and sets the controls back to the state of the run."""

@@ -12,10 +12,12 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.film_process import force_colour
+from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.rendering import method_named
-from hapticbridge.summary import coupling_sentences, is_always_implicit
+from hapticbridge.rendering import RunCoupling, method_named
+from hapticbridge.run_description import requested_of
+from hapticbridge.summary import is_always_implicit
+from hapticbridge.units import format_forces, format_si
 from hapticbridge.view.geometry import (
     NOT_DRAWN,
     POINTS,
@@ -30,7 +32,7 @@ from hapticbridge.view.geometry import (
 Array = NDArray[np.float64]
 
 PLOTS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("Force (N)", ("on the tool",)),
+    ("Force (N)", ("on the hand", "on the tool")),
     ("Energy per port (mJ)", ("coupling", "device", "environment")),
     ("Passivity margin (mJ)", ("allowed − created",)),
     ("Lateness of a tick (µs)", ("latest",)),
@@ -46,9 +48,9 @@ _SMALL = {"font": "11px sans-serif", "ticks": {"size": 4}, "gap": 2}
 _AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, **_SMALL})
 
 _COLOURS_MEAN = (
-    "Blue ghost: the handle. Spring: the coupling, {length}, pale at rest, red at the largest "
-    "force. Orange arrow: the force on the hand, the longest is {longest} N. Turquoise: contacts "
-    "and their forces, the longest is {strongest} N."
+    "Blue ghost: the handle. Spring: the coupling, {length}, pale at rest, red at {pull} on the "
+    "tool. Orange arrow: the force on the hand, the longest is {longest}. Turquoise: contacts "
+    "and their forces, the longest is {strongest}."
 )
 
 _CONTACT = (77, 208, 225)
@@ -74,8 +76,9 @@ class Sight:
         handle: Position of the handle, (3,) in m.
         handle_turn: Orientation of the handle, a quaternion (4,).
         grip: Position of the grip on the tool, (3,) in m.
-        force: Force on the tool, (3,) in N; the hand feels the opposite.
-        contact_places: Positions of the contacts, (n, 3) in m.
+        hand_force: Force of the device on the hand, (3,) in N; zero without a hand.
+        tool_force: Force of the coupling on the tool, (3,) in N.
+        contact_places: Positions of the contacts with a force, (n, 3) in m.
         contact_forces: Forces of the contacts, (n, 3) in N.
         tendons: Straight pieces of each visible tendon, (m, 2, 3) in m.
     """
@@ -86,7 +89,8 @@ class Sight:
     handle: Array
     handle_turn: Array
     grip: Array
-    force: Array
+    hand_force: Array
+    tool_force: Array
     contact_places: Array
     contact_forces: Array
     tendons: tuple[NDArray[np.float32], ...] = ()
@@ -99,6 +103,7 @@ class Sight:
         row: NDArray[np.void],
         tendons: Tendons,
         contacts: Array,
+        hand_force: Array,
     ) -> Sight:
         """Returns the instant of a scene.
 
@@ -107,7 +112,8 @@ class Sight:
             data: Positions after the tick; the poses of bodies are computed here.
             row: Record of the tick, one element of ``TICK_DTYPE``.
             tendons: Tendons of the scene.
-            contacts: Position in m and force in N of each contact, (n, 2, 3).
+            contacts: Position in m and force in N of each contact with a force, (n, 2, 3).
+            hand_force: Force of the device on the hand in the world frame, (3,) in N.
         """
         mujoco.mj_kinematics(model, data)
         return cls(
@@ -117,7 +123,8 @@ class Sight:
             handle=row["handle_position"][0].copy(),
             handle_turn=row["handle_quaternion"][0].copy(),
             grip=row["tool_position"][0].copy(),
-            force=row["wrench_on_tool"][0, :3].copy(),
+            hand_force=hand_force.copy(),
+            tool_force=row["wrench_on_tool"][0, :3].copy(),
             contact_places=contacts[:, 0],
             contact_forces=contacts[:, 1],
             tendons=tendons.pieces(data),
@@ -127,14 +134,16 @@ class Sight:
 class Trace:
     """Curves of a run, thinned without losing a peak.
 
-    Each call of ``add`` adds one point: the largest force and lateness since the last call, and the
-    present energies.
+    Each call of ``add`` adds one point: the largest forces and lateness since the last call, and
+    the present energies.
 
     Args:
         length: Number of points to keep, >= 2; None keeps all.
+        is_held: True if a hand feels the force of the device.
     """
 
-    def __init__(self, length: int | None = None) -> None:
+    def __init__(self, length: int | None = None, *, is_held: bool = True) -> None:
+        self._is_held = is_held
         self._points: deque[tuple[float, ...]] = deque(maxlen=length)
 
     def add(self, rows: NDArray[np.void], slack: float) -> None:
@@ -152,7 +161,13 @@ class Trace:
         self._points.append(
             (
                 1e-9 * float(last["deadline_ns"]),
-                float(np.linalg.norm(rows["wrench_on_tool"][:, :3], axis=1).max()),
+                *(
+                    float(np.linalg.norm(rows[wrench][:, :3], axis=1).max()) * is_shown
+                    for wrench, is_shown in (
+                        ("wrench_on_device", self._is_held),
+                        ("wrench_on_tool", True),
+                    )
+                ),
                 1e3 * float(last["coupling_work"]),
                 1e3 * float(last["device_energy"]),
                 1e3 * created,
@@ -201,7 +216,7 @@ class Ghost:
             "/coupling", nothing, (0, 0, 0), thickness=0.012 * extent
         )
         self._arrow = scene.add_arrows(
-            "/force in the hand",
+            "/force on the hand",
             nothing[:1],
             linear(_HAND),
             shaft_radius=0.01 * extent,
@@ -214,19 +229,22 @@ class Ghost:
         self._longest = max(self._longest, stretch)
         self.times = enlargement(FARTHEST * self._extent, self._longest)
 
-    def show(self, sight: Sight, reference: float) -> None:
+    def show(self, sight: Sight, hand_reference: float, tool_reference: float) -> None:
         """Draws an instant.
 
         Args:
             sight: The instant.
-            reference: The force in N that is drawn longest and reddest, > 0.
+            hand_reference: The force on the hand in N that is drawn longest, > 0.
+            tool_reference: The force on the tool in N at which the spring is reddest, > 0.
         """
-        strength = float(np.linalg.norm(sight.force))
+        strength = float(np.linalg.norm(sight.hand_force))
         way = sight.grip - sight.handle
         stretch = float(np.linalg.norm(way))
         self.allow(stretch)
         self._handle.position, self._handle.wxyz = sight.handle, sight.handle_turn
-        colour = linear(255.0 * force_colour(strength, reference))
+        colour = linear(
+            255.0 * force_colour(float(np.linalg.norm(sight.tool_force)), tool_reference)
+        )
         # it begins on the ghost's surface, unless it truly ends at the tool
         start = sight.handle
         if self.times > 1 and stretch > 0.0:
@@ -238,10 +256,10 @@ class Ghost:
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)
         self._spring.colors = np.full((POINTS, 2, 3), colour, dtype=np.uint8)
-        self._arrow.visible = strength > 1e-3 * reference
+        self._arrow.visible = strength > 1e-3 * hand_reference
         if self._arrow.visible:
-            reach = LONGEST_ARROW * self._extent / max(reference, strength)
-            points = np.array([[end, end - reach * sight.force]])
+            reach = LONGEST_ARROW * self._extent / max(hand_reference, strength)
+            points = np.array([[end, end + reach * sight.hand_force]])
             self._arrow.points = points.astype(np.float32)
 
 
@@ -263,8 +281,11 @@ class Page:
         server: Server of the page.
         model: The run's scene.
         parameters: Parameters of the run.
-        facts: Scene and method, as recorded.
-        reference: The force in N that is drawn longest and reddest, > 0.
+        facts: Metadata of the run, as recorded.
+
+    Attributes:
+        hand_reference: The force on the hand in N that is drawn longest, > 0.
+        tool_reference: The force on the tool in N at which the spring is reddest, > 0.
     """
 
     def __init__(
@@ -273,9 +294,9 @@ class Page:
         model: mujoco.MjModel,
         parameters: RunParameters,
         facts: dict[str, str],
-        reference: float,
     ) -> None:
-        self._server, self.reference = server, reference
+        self._server, self._is_held = server, is_held(facts)
+        self.hand_reference = self.tool_reference = MIN_REFERENCE
         self._extent, self._strongest = float(model.stat.extent), 0.0
         self._build_scene(model)
         self._ghost = Ghost(server.scene, model, parameters.grip)
@@ -320,8 +341,9 @@ class Page:
         times = self._ghost.times
         said = _COLOURS_MEAN.format(
             length=f"{times} times as long as it is" if times > 1 else "as long as it is",
-            longest=f"{self.reference:.2g}",
-            strongest=f"{max(self._strongest, self.reference):.2g}",
+            pull=format_si(self.tool_reference, "N"),
+            longest=format_si(self.hand_reference, "N"),
+            strongest=format_si(max(self._strongest, self.tool_reference), "N"),
         )
         if self._words.content != said:
             self._words.content = said
@@ -339,10 +361,15 @@ class Page:
                 line.visible = bool(len(pieces))
                 if line.visible and not np.array_equal(line.points, pieces):
                     line.points = pieces
-            self._ghost.show(sight, self.reference)
+            self._ghost.show(sight, self.hand_reference, self.tool_reference)
             self._show_contacts(sight)
         if self._plots:
             self._explain()
+
+    def forces(self, sight: Sight) -> str:
+        """Names the forces of an instant: on the hand, and on the tool where it differs."""
+        hand = float(np.linalg.norm(sight.hand_force)) if self._is_held else None
+        return format_forces(hand, float(np.linalg.norm(sight.tool_force)))
 
     def plot(self, time: Array, lines: Sequence[Array]) -> None:
         """Draws the curves.
@@ -405,7 +432,7 @@ class Page:
         self._server.initial_camera.near = 0.01 * extent
 
     def _show_contacts(self, sight: Sight) -> None:
-        self._strongest = max(self._strongest, self.reference, _strongest(sight))
+        self._strongest = max(self._strongest, self.tool_reference, _strongest(sight))
         reach = LONGEST_ARROW * self._extent / self._strongest
         touches = bool(len(sight.contact_places))
         self._contacts.visible = self._pushes.visible = touches
@@ -417,19 +444,20 @@ class Page:
 
 
 def _strongest(sight: Sight) -> float:
-    """Returns the largest force of an instant; contacts at a lever carry far more than the hand."""
-    contacts = np.linalg.norm(sight.contact_forces, axis=1)
-    return float(max(np.linalg.norm(sight.force), contacts.max(initial=0.0)))
+    """Returns the largest contact force; contacts at a lever carry far more than the hand."""
+    return float(np.linalg.norm(sight.contact_forces, axis=1).max(initial=0.0))
 
 
 def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
     method = method_named(facts.get("method", ""))
-    sentences = coupling_sentences(
-        parameters.coupling,
+    coupling = RunCoupling.of(
         method,
-        parameters.period,
-        parameters.substeps,
+        parameters.period / parameters.substeps,
+        requested_of(facts),
+        law=parameters.coupling,
+        measured=parameters.effective,
         is_always_implicit=is_always_implicit(model, parameters.grip),
     )
-    lines = [f"Method **{method.name}**, {1 / parameters.period:g} Hz", *sentences, NOT_DRAWN]
+    head = f"Method **{method.name}**, {1 / parameters.period:g} Hz"
+    lines = [head, *coupling.sentences(), NOT_DRAWN]
     return "  \n".join(lines)

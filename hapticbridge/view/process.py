@@ -21,7 +21,8 @@ import numpy as np
 
 from hapticbridge.audit.replay import attached_model
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film_process import MIN_REFERENCE
+from hapticbridge.film_process import MIN_REFERENCE, is_held
+from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
@@ -59,7 +60,8 @@ class LiveRun:
     Attributes:
         model: The scene.
         parameters: Parameters of the run.
-        reference: Largest force in N so far, or ``MIN_REFERENCE``.
+        hand_reference: Largest force on the hand in N so far, or ``MIN_REFERENCE``.
+        tool_reference: Largest force on the tool in N so far, or ``MIN_REFERENCE``.
         flags: Combined flags of the records so far.
         trace: The curves so far.
     """
@@ -70,8 +72,9 @@ class LiveRun:
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
-        self.trace = Trace(TRACE)
-        self.reference = MIN_REFERENCE
+        self._is_held = is_held(run.meta)
+        self.trace = Trace(TRACE, is_held=self._is_held)
+        self.hand_reference = self.tool_reference = MIN_REFERENCE
         self.flags = 0
 
     def look(self) -> Sight | None:
@@ -86,8 +89,11 @@ class LiveRun:
         self._gather(picture.slack)
         self._data.qpos[:] = picture.qpos
         self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
-        sight = Sight.of(self.model, self._data, rows[:1], self._tendons, picture.contacts)
-        self.reference = max(self.reference, float(np.linalg.norm(sight.force)))
+        force = force_on_hand(rows[:1], self.parameters.axes)[0] * self._is_held
+        sight = Sight.of(self.model, self._data, rows[:1], self._tendons, picture.contacts, force)
+        self.hand_reference = max(self.hand_reference, float(np.linalg.norm(force)))
+        pull = float(np.linalg.norm(sight.tool_force))
+        self.tool_reference = max(self.tool_reference, pull)
         return sight
 
     def _gather(self, slack: float) -> None:
@@ -161,11 +167,11 @@ def _follow(
             controls.note(event)
         sight = live.look()
         if sight is not None:
-            page.reference = live.reference
+            page.hand_reference = live.hand_reference
+            page.tool_reference = live.tool_reference
             page.show(sight)
-            force = float(np.linalg.norm(sight.force))
             watched = watch_sentence(live.flags)
-            page.status.content = f"**{sight.time:.1f} s**, {force:.2f} N" + (
+            page.status.content = f"**{sight.time:.1f} s**, {page.forces(sight)}" + (
                 f"; **{watched}**" if watched else ""
             )
         now = time.monotonic()
@@ -189,7 +195,7 @@ def run() -> None:
         address = Address(job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
-        page = Page(server, live.model, live.parameters, dict(run.meta), live.reference)
+        page = Page(server, live.model, live.parameters, dict(run.meta))
         controls = Controls(server, allowance_of(run.meta), outlet.ask)
         page.add_curves()
     except HapticBridgeError as error:

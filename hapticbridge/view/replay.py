@@ -8,13 +8,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import mujoco
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
-from hapticbridge.film_process import Stage
-from hapticbridge.recording.snapshot import MAX_CONTACTS
+from hapticbridge.film_process import Stage, is_held
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
 from hapticbridge.view.server import serve, stop
@@ -51,13 +47,16 @@ class Replay:
         self.stage = stage = Stage(path)
         self.step = max(FRAME, stage.duration / MOST)
         self.sights: list[Sight] = []
-        self.trace = Trace()
+        self.trace = Trace(is_held=is_held(stage.recording.meta))
         count = max(1, int(stage.duration / self.step) + 1)
         tendons = Tendons(stage.model)
         for number in range(count):
             stage.show(stage.tick_at(min(number * self.step, stage.duration)))
-            contacts = contacts_of(stage.model, stage.data)
-            self.sights.append(Sight.of(stage.model, stage.data, stage.row, tendons, contacts))
+            self.sights.append(
+                Sight.of(
+                    stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
+                )
+            )
             self.trace.add(stage.passed, stage.slack)
             if progress is not None:
                 progress(number + 1, count)
@@ -67,17 +66,6 @@ class Replay:
         if math.isnan(moment):
             return self.sights[0]
         return self.sights[round(min(max(moment / self.step, 0.0), len(self.sights) - 1.0))]
-
-
-def contacts_of(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
-    """Returns position in m and force in N of contacts in the world frame, (n, 2, 3)."""
-    found = np.zeros((min(data.ncon, MAX_CONTACTS), 2, 3))
-    wrench = np.zeros(6)
-    for index, (place, force) in enumerate(found):
-        mujoco.mj_contactForce(model, data, index, wrench)
-        place[:] = data.contact.pos[index]
-        force[:] = data.contact.frame[index].reshape(3, 3).T @ wrench[:3]
-    return found
 
 
 class Theatre:
@@ -107,9 +95,9 @@ class Theatre:
                 "time (s)", 0.0, max(last, replay.step), 1e-3, 0.0
             )
             self._playing = self._server.gui.add_checkbox("play", initial_value=False)
-        self._page = Page(
-            self._server, stage.model, stage.parameters, dict(stage.recording.meta), stage.reference
-        )
+        self._page = Page(self._server, stage.model, stage.parameters, dict(stage.recording.meta))
+        self._page.hand_reference = stage.hand_reference
+        self._page.tool_reference = stage.tool_reference
         self._page.allow(replay.sights)
         self._page.add_curves()
         if len(replay.trace) > 1:
@@ -121,7 +109,7 @@ class Theatre:
         """Shows the instant nearest to a time in s."""
         sight = self._replay.at(moment)
         self._page.show(sight)
-        self._page.status.content = f"**{sight.time:.3f} s**, {np.linalg.norm(sight.force):.2f} N"
+        self._page.status.content = f"**{sight.time:.3f} s**, {self._page.forces(sight)}"
 
     def play(self, is_over: threading.Event) -> None:
         """Moves the slider with the time while playback is on, until the server is closed."""

@@ -13,7 +13,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.recording.timeline import due_times
 from hapticbridge.report import DRAWABLE, decimated
-from hapticbridge.report.evidence import BINS, Evidence
+from hapticbridge.report.evidence import BINS, Evidence, is_motion_prescribed
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
 from hapticbridge.units import format_si
@@ -33,6 +33,16 @@ Row = tuple[str, tuple[str, ...]]
 def rows(found: WhatIf) -> Iterator[Row]:
     """Yields a name and a text per run, in the order of ``found.runs``."""
     runs = found.runs
+    for name in ("effective", "law", "requested"):
+        couplings = [getattr(run.report.coupling, name, None) for run in runs]
+        if any(couplings):
+            yield (
+                f"{name} K, B",
+                tuple(
+                    f"{c.stiffness:.4g} N/m, {c.damping:.4g} N s/m" if c else "unknown"
+                    for c in couplings
+                ),
+            )
     yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
         unit = _PEAK_UNITS[name.split()[0]]
@@ -79,11 +89,15 @@ _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 
 
 def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
-    """Draws force on the device, handle displacement, and the energies of both ports over time.
+    """Draws force, handle displacement, and the energies of both ports over time.
+
+    The force is that on the hand; on the tool if the recorded motion was prescribed.
 
     Raises:
         RecordingError: A run holds a number that cannot be drawn.
     """
+    is_held = not is_motion_prescribed(found.runs[0].recording.meta)
+    wrench = "wrench_on_device" if is_held else "wrench_on_tool"
     figure = new_figure(8, 11)
     panels = figure.subplots(4, 1, sharex=True)
     origin = found.runs[0].ticks["handle_position"][0]
@@ -93,7 +107,7 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
             continue
         time = due_times(ticks, run.period)
         drawn = (
-            np.linalg.norm(ticks["wrench_on_device"][:, :3], axis=1),
+            np.linalg.norm(ticks[wrench][:, :3], axis=1),
             1e3 * np.linalg.norm(ticks["handle_position"] - origin, axis=1),
             1e3 * ticks["environment_energy"],
             1e3 * ticks["device_energy"],
@@ -105,7 +119,7 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
                 *decimated(time, values, bins), color=colour, ls=line, lw=width, label=run.name
             )
     labels = (
-        "force on the device (N)",
+        "force on the hand (N)" if is_held else "force on the tool (N)",
         "handle's distance from its start (mm)",
         "energy that the environment\ncreated (+) or dissipated (−) (mJ)",
         "energy that the device was\ngiven (+) or gave (−) (mJ)",

@@ -6,23 +6,32 @@ import hashlib
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import period_of
-from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.guard import CONTROLLERS, Limits, guard_parameters_for
+from hapticbridge.guard import (
+    CONTROLLERS,
+    IDLE_FORCE,
+    IDLE_TORQUE,
+    Limits,
+    guard_parameters_for,
+)
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.rendering import Method, method_named, prepare
-from hapticbridge.run_description import SOURCE_PREFIX, compiled_model, parameters_of
+from hapticbridge.run_description import (
+    SOURCE_PREFIX,
+    compiled_model,
+    parameters_of,
+    requested_of,
+)
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.whatif.settings import Settings
 
@@ -36,8 +45,8 @@ more would only cost time."""
 def invert_exactly(wanted: float, function: Callable[[float], float], guess: float) -> float:
     """Returns the input near a guess whose computed value equals the wanted one bit for bit.
 
-    A recording holds T and B', not the requested rate and B. Recomputed from 1/T and B' + K T/2, T
-    and B' may differ in the last digit, and the repetition would no longer be exact.
+    A recording holds T, not the requested rate. Recomputed from 1/T, T may differ in the last
+    digit, and the repetition would no longer be exact.
 
     Returns:
         The input, or the guess if no neighbour gives the value.
@@ -115,14 +124,13 @@ class RecordedRun:
         """
         parameters = parameters_of(recording.meta)
         method = method_named(recording.meta["method"])
-        step = parameters.period / parameters.substeps
         try:
             info = DeviceInfo.from_json(recording.meta.get("device", ""))
             values = dict(read_json(recording.meta.get("scene_parameters", "{}")))
         except (HapticBridgeError, ValueError, TypeError) as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         settings = Settings(
-            coupling=_requested_coupling(parameters.coupling, method, step),
+            coupling=requested_of(recording.meta),
             method=method,
             rate=invert_exactly(parameters.period, period_of, 1.0 / parameters.period),
             substeps=parameters.substeps,
@@ -147,6 +155,8 @@ class RecordedRun:
         return Limits(
             force=p.force_limit,
             torque=p.torque_limit,
+            hold_force=_requested_hold(guarding.hold_force, guarding.idle_force - IDLE_FORCE),
+            hold_torque=_requested_hold(guarding.hold_torque, guarding.idle_torque - IDLE_TORQUE),
             ramp=p.ramp_ticks * p.period,
             stretch=invert_exactly(
                 guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
@@ -209,18 +219,9 @@ class RecordedRun:
         return found == self.recording.meta.get("scene_sha256")
 
 
-def _requested_coupling(used: Coupling, method: Method, step: float) -> Coupling:
-    """Returns the requested coupling that a method turns into this law's coupling, to the bit."""
-    felt = method.requested_coupling(used, step)
-
-    def made(name: str, value: float) -> float:
-        return float(getattr(method.law_coupling(replace(felt, **{name: value}), step), name))
-
-    requested = {
-        name: invert_exactly(getattr(used, name), partial(made, name), getattr(felt, name))
-        for name in ("damping", "rotational_damping")
-    }
-    return replace(felt, **requested)
+def _requested_hold(hold: float, load: float) -> float:
+    """Returns the limit that was asked for, without the tool's load, to nine decimals."""
+    return hold if hold == math.inf else round(hold - load, 9)
 
 
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:

@@ -47,8 +47,8 @@ class WhatIfRun:
     Attributes:
         name: ``recorded``, ``prescribed`` or ``closed loop``.
         report: The audit's verdict.
-        peaks: Largest force and torque on tool and device in N and N m, and largest distance of
-            handle and tool in m, by name.
+        peaks: Largest force and torque on hand and tool in N and N m, and largest distance of
+            handle and tool in m, by name. Those on the hand are left out for a prescribed motion.
         trip: Reason of the guard's stop, or empty.
         period: T in s.
         recording: Its recording; that of a changed run exists in memory only.
@@ -212,8 +212,11 @@ class _Experiment:
         )
 
     def _as_recorded(self) -> WhatIfRun:
-        recording, peaks = self._run.recording, _peaks(self._ticks)
+        recording, peaks = self._run.recording, self._peaks(self._ticks)
         return WhatIfRun(RECORDED, self._report, peaks, self._run.trip, self._period, recording)
+
+    def _peaks(self, ticks: NDArray[np.void]) -> dict[str, float]:
+        return _peaks(ticks, is_held=not self._run.info.is_prescribed)
 
     def _prescribed(self, settings: Settings) -> WhatIfRun:
         run, ticks, period = self._run, self._ticks, self._period
@@ -244,7 +247,7 @@ class _Experiment:
             self._concerns |= dict.fromkeys(repetition.warned)
         recording = read_recording(path)
         report = audit(path, strict=self._strict)
-        return WhatIfRun(name, report, _peaks(recording.ticks), trip, period, recording)
+        return WhatIfRun(name, report, self._peaks(recording.ticks), trip, period, recording)
 
     @property
     def _path(self) -> Path:
@@ -287,18 +290,20 @@ def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
         )
 
 
-def _peaks(ticks: NDArray[np.void]) -> dict[str, float]:
-    """Returns the largest forces, torques and stretch of a run; zero without ticks."""
+def _peaks(ticks: NDArray[np.void], *, is_held: bool) -> dict[str, float]:
+    """Returns the largest forces, torques and stretch of a run; zero without ticks.
+
+    ``is_held`` is False for a recorded motion that was prescribed: no hand feels a force.
+    """
 
     def largest(vectors: NDArray[np.float64]) -> float:
         return float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
 
-    tool, device = ticks["wrench_on_tool"], ticks["wrench_on_device"]
-    return {
+    tool, hand = ticks["wrench_on_tool"], ticks["wrench_on_device"]
+    on_hand = {"force on hand": largest(hand[:, :3]), "torque on hand": largest(hand[:, 3:])}
+    return (on_hand if is_held else {}) | {
         "force on tool": largest(tool[:, :3]),
         "torque on tool": largest(tool[:, 3:]),
-        "force on device": largest(device[:, :3]),
-        "torque on device": largest(device[:, 3:]),
         "stretch": largest(ticks["handle_position"] - ticks["tool_position"]),
     }
 

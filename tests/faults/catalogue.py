@@ -52,8 +52,8 @@ class Fault:
         name: In a few words.
         do: Does it to a rig.
         ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
-            ``re-anchors`` (it begins again from zero), ``stops`` (the run ends with zero force),
-            ``lowers`` (the watch lowers the force or takes it away) or ``goes on``.
+            ``slips`` (the handle slips for what late samples gave), ``stops`` (the run ends with
+            zero force), ``lowers`` (the watch lowers the force or takes it away) or ``goes on``.
         says: What the audit of its recording must name; empty where the run is an ordinary one.
         without: What of the guard is switched off on the other side.
         cause: The tick at which it can be seen.
@@ -549,10 +549,10 @@ FAULTS = (
     Fault("half a turn in a tick", added("quaternion", -1, 0, 1, 0), "trip", "jumped", NO_TRIPS),
     Fault("quaternion of the other sign", corrupting(_other_sign), "goes on"),
     Fault("no news for 0.3 s", _frozen, "fades", "", {"stale_ticks": 0}, within=32),
-    Fault("half the sample rate", corrupting(lambda k, _s: STALE * (k % 2)), "goes on"),
-    Fault("20 % of samples lost", _every(0.2), "goes on"),
-    Fault("50 % of samples lost", _every(0.5), "goes on"),
-    Fault("stall of 0.2 s, 20 mm deeper", _stall, "re-anchors", "", {"longest_stall": np.inf}),
+    Fault("half the sample rate", corrupting(lambda k, _s: STALE * (k % 2)), "slips"),
+    Fault("20 % of samples lost", _every(0.2), "slips"),
+    Fault("50 % of samples lost", _every(0.5), "slips"),
+    Fault("stall of 0.2 s, 20 mm deeper", _stall, "slips"),
     Fault(
         "time runs backwards",
         at_the_cause(lambda rig: rig.clock.set_back(0.5)),
@@ -560,16 +560,16 @@ FAULTS = (
         "time ran backwards",
     ),
     Fault("read fails", at_the_cause(_read_fails), "trip", "fault of its own"),
-    Fault("read blocks for 1 s", _read_blocks, "re-anchors", "", {"longest_stall": np.inf}),
+    Fault("read blocks for 1 s", _read_blocks, "slips"),
     Fault("write fails", _write_fails, "trip", "is gone"),
-    Fault("write blocks for 1 s", _write_blocks, "re-anchors", "", {"longest_stall": np.inf}),
+    Fault("write blocks for 1 s", _write_blocks, "slips"),
     Fault("write is cut short", _write_is_cut, "trip", "16 of 48 bytes"),
     Fault("MuJoCo warns: bad velocity", filled("qvel", 2e10), "trip", "diverged"),
     Fault("MuJoCo warns: bad acceleration", filled("qfrc_applied", 1e11), "trip", "diverged"),
     Fault("scene diverges", filled("qvel", np.nan), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=PUSHED),
-    Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
-    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
+    Fault("10 x too stiff, free", stiff(10, None), "lowers", "", UNGUARDED, within=0),
+    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "lowers", within=0),
     Fault("edge of the workspace", _edge, "fades", within=150),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
     Fault("encoder steps of 4 mm", corrupting(_coarse), "goes on"),

@@ -239,13 +239,13 @@ class Outcome:
         recording = read_recording(path)
         flags = recording.ticks["flags"]
         found = np.flatnonzero(flags & int(WATCHED))
-        felt = np.flatnonzero(given > FELT)
+        felt = np.flatnonzero(np.append(given > FELT, True))
         return cls(
             largest_force=float(np.max(forces)),
             is_finite=bool(np.isfinite(wrenches).all()),
             energy=float(given.max()),
             zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
-            found_after=max(int(found[0]) - int(felt[0]), 0) if found.size and felt.size else None,
+            found_after=max(int(found[0]) - int(felt[0]), 0) if found.size else None,
             last_is_zero=not wrenches[-1].any(),
             error=error,
             ticks=ticks,
@@ -259,5 +259,4 @@ class Outcome:
         )
 
     def has_flag(self, flag: TickFlag) -> bool:
-        """Tells whether a flag is up after the start, whose ramp anchors the handle."""
-        return bool((self.flags[CAUSE // 2 :] & int(flag)).any())
+        return bool((self.flags & int(flag)).any())

@@ -14,8 +14,8 @@ import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast, sway
 
-from faults.catalogue import FAULTS, PUSHED, RING_FULL, Fault, passing
-from faults.rig import CAUSE, PERIOD, PRESS, Outcome, Rig
+from faults.catalogue import FAULTS, PUSHED, RING_FULL, UNSEEN, Fault, passing
+from faults.rig import CAUSE, PERIOD, PRESS, Rig
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SafetyTrip
@@ -31,10 +31,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*Nan, Inf or huge value")
 
 def ids(fault: Fault) -> str:
     return fault.name.replace(" ", "_")
-
-
-def at_cause(outcome: Outcome) -> float:
-    return float(outcome.forces[CAUSE])
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=ids)
@@ -64,40 +60,34 @@ def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path:
         assert not outcome.error
         assert outcome.found_after is not None
         assert outcome.found_after <= fault.within
-    elif fault.ends in ("fades", "re-anchors", "goes on"):
+    elif fault.ends in ("fades", "slips", "goes on"):
         assert not outcome.error
-        assert outcome.has_flag(TickFlag.REANCHORED) == (fault.ends != "goes on")
-    if fault.ends == "re-anchors":
-        assert at_cause(outcome) < 0.1 * LIMIT
+        has_slipped = (outcome.flags[CAUSE:] & int(TickFlag.REANCHORED)).any()
+        assert has_slipped == (fault.ends != "goes on")
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.without], ids=ids)
 def test_without_its_guard_the_fault_does_harm(fault: Fault, tmp_path: Path) -> None:
     outcome = fault.run(tmp_path, is_guarded=False)
-    if fault.ends == "re-anchors":
-        assert at_cause(outcome) > 0.5 * LIMIT
-    elif "turn" in fault.name:
+    if "turn" in fault.name:
         torques = outcome.torques
         assert torques[CAUSE : CAUSE + 5].max() > 0.3
     else:
-        assert outcome.energy > fault.energy
+        assert outcome.energy > (fault.energy if fault in UNSEEN else 0.6 * MAX_ENERGY)
 
 
 @pytest.mark.parametrize("energy", [USUAL_ENERGY, 0.046])
-def test_a_motors_push_is_cut_off_one_tick_after_the_energy_limit(
+def test_a_motors_push_is_cut_off_before_it_passes_the_energy_limit(
     tmp_path: Path, energy: float
 ) -> None:
-    """The hand's own meter says when; a limit that is a little higher ends it later."""
     fault = next(fault for fault in FAULTS if fault.cause == PUSHED)
     rig = Rig(tmp_path)
     fault.do(rig)
     rig.guard = {"energy": energy}
-    rig.run(fault.cause)
-    seen = int(np.argmax(np.array(rig.device.to_the_hand) > energy)) - 1
-    assert (seen == PUSHED) == (energy == USUAL_ENERGY)
-    pushes = [tick for tick, wrench in rig.device.writes if wrench.any()]
-    assert pushes[-1] == seen
-    assert rig.device.writes[-1][0] == seen + 1
+    outcome = rig.run(fault.cause)
+    assert 0.8 * energy < outcome.energy <= energy
+    assert "more energy" in outcome.error
+    assert outcome.last_is_zero
 
 
 def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None:
@@ -182,19 +172,21 @@ Case = tuple[tuple[tuple[float, float], ...], float]
 
 
 # While a machine stands still nothing in this program can act; the device holds its last force. So
-# the claim is about what comes after: with the guard nothing is added, without it energy that no
-# hand had put in.
+# the claim is about what comes after: nothing is added.
 
 
 def given(folder: Path, case: Case, *, is_guarded: bool) -> tuple[float, float, bool]:
-    """Returns what the hand was given in the stall, what after it, in J, and whether it tripped."""
+    """Returns what the hand was given in the stall, what after it, in J, and whether it tripped.
+
+    ``is_guarded`` is False without an energy limit.
+    """
     rig, has_tripped = Rig(folder), False
     rig.points, stall = case
     rig.device.corrupt = passing(rig, CAUSE, stall)
     limits = Limits(force=10.0, torque=0.5, ramp=0.2)
     bridge = Bridge("virtual_wall", rig.device, clock=rig.clock, limits=limits)
     if not is_guarded:
-        guard = replace(bridge.setup.guard, longest_stall=math.inf, energy=math.inf)
+        guard = replace(bridge.setup.guard, energy=math.inf)
         bridge.setup = replace(bridge.setup, guard=guard)
     with bridge:
         try:
@@ -215,15 +207,12 @@ def test_a_hand_that_leaves_in_a_stall_is_given_all_of_it_before_the_loop_wakes(
     assert has_tripped
     same, more, _ = given(tmp_path, AWAY, is_guarded=False)
     assert same == during
-    assert more > 0.01
+    assert more <= 1e-6
 
 
 def test_a_hand_that_enters_a_wall_in_a_stall_is_not_given_what_it_never_put_in(
     tmp_path: Path,
 ) -> None:
-    during, after, has_tripped = given(tmp_path, INTO, is_guarded=True)
+    during, after, _ = given(tmp_path, INTO, is_guarded=False)
     assert during < 0.0
-    assert after < 2e-3  # of its own: it goes on by a millimetre, and comes back
-    assert not has_tripped
-    _, more, _ = given(tmp_path, INTO, is_guarded=False)
-    assert more > 0.03
+    assert after < -during  # of its own: it comes back

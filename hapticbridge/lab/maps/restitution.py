@@ -6,6 +6,7 @@ MuJoCo's integrator and contact setting alone.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -165,10 +166,15 @@ def drop(setting: str, angle: float, friction: float, slide: float) -> Rebound:
     return Rebound(velocity, kinetic - start, first_gain, step)
 
 
-@lru_cache
+_rods = threading.local()
+"""The rod of each thread, because an executor may compute several points at a time."""
+
+
 def _rod() -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = mujoco.MjModel.from_xml_string(ROD)
-    return model, mujoco.MjData(model)
+    if not hasattr(_rods, "model"):
+        _rods.model = mujoco.MjModel.from_xml_string(ROD)
+        _rods.data = mujoco.MjData(_rods.model)
+    return _rods.model, _rods.data
 
 
 SLIDE = 0.8

@@ -1,0 +1,93 @@
+"""Second computation of a run's times and of the energy that its delays may have given.
+
+It is ``kernel.timing`` over whole blocks, from recorded times and poses alone. With τ the time
+between two samples, t_d the time from the last sample to its force, d the handle's motion with the
+device and N = K T/2 + B', the energy of each kind of axis is
+
+    A_k = max(0, A_{k−1} + 3 (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
+
+p is what the device's damping burned beyond N, less what it paid for late samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.motion import Array
+from hapticbridge.audit.wrench_limits import AuditedBlock
+from hapticbridge.kernel.parameters import RunParameters
+
+_DELAY_PRICE = 3.0  # damping in (K T/2)²/N that a delay of a period needs
+
+
+def _no_energy() -> Array:
+    return np.zeros(2)
+
+
+@dataclass(slots=True)
+class TimingTally:
+    """Times of a recording and the energy of its delays, collected block by block.
+
+    Attributes:
+        parameters: Run parameters.
+        ticks: Number of records so far.
+        due: Number of deadlines so far.
+        delays: Sum of the times from sample to force in s.
+        most_uncovered: Largest energy in J that delays may have given to the hand.
+        lent: Energies in J that late samples cost and b has not burned yet, by kind of axis.
+        uncovered: Energies A in J by kind of axis.
+        last_square: Squared motions of the last tick, by kind of axis.
+    """
+
+    parameters: RunParameters
+    ticks: int = 0
+    due: int = 0
+    delays: float = 0.0
+    most_uncovered: float = 0.0
+    lent: Array = field(default_factory=_no_energy)
+    uncovered: Array = field(default_factory=_no_energy)
+    last_square: Array = field(default_factory=_no_energy)
+
+    def add(self, block: AuditedBlock, events: RunEvents) -> None:
+        """Adds consecutive records, at least one."""
+        ticks, parameters = block.ticks, self.parameters
+        self.ticks += len(ticks)
+        self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
+        rows = np.concatenate([block.state.row, ticks])
+        delay = 1e-9 * (rows["write_ns"] - rows["read_ns"])
+        self.delays += float(np.sum(delay[1:]))
+        if not parameters.has_law:
+            return
+        elapsed = np.maximum(1e-9 * np.diff(rows["read_ns"]), parameters.period)
+        scale, force_scale = parameters.scale, parameters.force_scale
+        linear, angular = parameters.device_damping, parameters.device_rotational_damping
+        motion, total = block.motion, np.zeros(len(ticks))
+        for kind, steps, b in (
+            (0, motion.handle_step, (linear or 0.0) / (force_scale * scale)),
+            (1, motion.handle_turn, (angular or 0.0) * scale / force_scale),
+        ):
+            gains = events.gains(ticks["tick"])[:, 2 * kind : 2 * kind + 2]
+            square = np.where(block.is_first, 0.0, np.sum(steps**2, axis=1))
+            needed = 0.5 * gains[:, 0] + gains[:, 1] / parameters.period
+            late = (needed - np.maximum(b, needed * parameters.period) / block.interval) * square
+            lent = np.concatenate([self.lent[kind : kind + 1], _drained(late, self.lent[kind])])
+            half = 0.5 * gains[:, 0]
+            price = np.divide(half**2, needed, out=np.zeros_like(half), where=needed > 0)
+            last = np.concatenate([self.last_square[kind : kind + 1], square[:-1]])
+            cost = _DELAY_PRICE * price * delay[:-1] / elapsed * np.maximum(square, last)
+            cost = np.where(block.is_first, 0.0, cost)
+            energy = _drained(cost + np.minimum(lent[:-1] + late, 0.0), self.uncovered[kind])
+            total += energy
+            self.lent[kind], self.uncovered[kind] = lent[-1], energy[-1]
+            self.last_square[kind] = square[-1]
+        most = force_scale / scale * float(np.max(total))
+        self.most_uncovered = max(self.most_uncovered, most)
+
+
+def _drained(steps: Array, start: float) -> Array:
+    """Returns the running sums max(0, sum + step) from a start >= 0, (n,)."""
+    sums = start + np.cumsum(steps)
+    return np.asarray(sums - np.minimum(np.minimum.accumulate(sums), 0.0))

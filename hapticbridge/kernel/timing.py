@@ -1,0 +1,94 @@
+"""Energy that a force sent late may have given to the hand, tick by tick.
+
+The condition b >= N, N = K T/2 + B', takes it that ticks come each T and that a force acts from the
+moment of its sample. A tick comes τ after the one before, and its force is sent t_d after its
+sample: until then the old force acts on. With f on the tool, d the device's motion between two
+samples and η its part before the new force was sent, the hand gets
+
+    (f_{k−1} − f_{k−2})·η_k
+
+beyond the account of a hold. The tool gets f at once, so the delay is on the device's side alone.
+For any motion within the tick, any hand and any strict environment, the damping needed then is
+
+    b_k = N τ_k/T + 3 κ t_d/T,    κ = (K T/2)²/N
+
+With B' = 0 this is K (τ/2 + 3 t_d/2): K t_d as for a wall, and half as much again for a tool that
+moves and a hand that moves just while the old force acts. It is exact there. With B' > 0 it is an
+upper bound, found by comparison with the largest value of a quadratic form at all frequencies
+(``tests/test_timekeeping.py``). With β = t_d/T the form is, for δe = d − δx,
+
+    −Re f_{−1}*d + Re (f_{−1} − f_{−2})*η + Re f*δx − (b/T) (|d|² + |η − β d|²/(β (1 − β)))
+
+Its last term is what b burns at least, if η is not the even share β d. It must never be positive.
+
+The first term of b_k beyond N is paid by ``law.charge_lateness``: after a late sample the handle
+slips. The second is not, so it is summed here, for translation and rotation each, as
+
+    A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
+
+d is the handle's motion with the device, D the larger one of this tick and the last. Damping that
+pays for a late sample pays nothing here: ``lent`` is the sum of what late samples cost, and is paid
+first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.law import lateness
+
+TIMING_DTYPE = np.dtype(
+    [
+        ("delay", "<f8"),  # t_d of the last tick in s
+        ("delays", "<f8"),  # sum of all t_d in s
+        ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
+        ("uncovered", "<f8", 2),  # A
+        ("last_square", "<f8", 2),  # d² of the last tick in m² and rad²
+        ("most_uncovered", "<f8"),  # largest sum of A so far, in J at the hand
+    ]
+)
+"""Sub-record ``timing``, written by this module alone."""
+
+DELAY_PRICE = 3.0
+"""Damping in κ that a delay of a whole period needs."""
+
+
+@compiled
+def note_delay(s: State, read_ns: int, write_ns: int) -> None:
+    """Notes the time from the tick's sample to its force."""
+    s.timing.delay = 1e-9 * (write_ns - read_ns)
+    s.timing.delays += s.timing.delay
+
+
+@compiled
+def meter_delay(s: State, elapsed: float, interval: float) -> None:
+    """Adds the energy that the last tick's delay may have given.
+
+    Args:
+        s: The bound state, with the handle's new step.
+        elapsed: Time since the last sample in s, at least T.
+        interval: Time since the last sample that was new, in s.
+    """
+    t, total = s.timing, 0.0
+    for kind in range(2):
+        stiffness, needed, lacking, square = lateness(s, kind, interval)
+        late = lacking * square
+        paying = min(t.lent[kind] + late, 0.0)
+        t.lent[kind] = max(t.lent[kind] + late, 0.0)
+        cost = 0.0
+        if stiffness > 0.0:
+            half = 0.5 * stiffness
+            cost = DELAY_PRICE * half * half / needed * t.delay / elapsed
+        cost *= max(square, t.last_square[kind])
+        t.uncovered[kind] = max(t.uncovered[kind] + cost + paying, 0.0)
+        t.last_square[kind] = square
+        total += t.uncovered[kind]
+    t.most_uncovered = max(t.most_uncovered, s.run.force_scale / s.run.scale * total)
+
+
+@compiled
+def skip_delay(s: State) -> None:
+    """Begins anew with the first tick after a start: the device's motion took an unknown time."""
+    s.timing.last_square[0] = s.timing.last_square[1] = 0.0

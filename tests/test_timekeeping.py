@@ -1,0 +1,289 @@
+"""Time is part of the verdict: what a run that was late, or sent its force late, is called."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from audit_cases import ScriptedDevice, SlowClock, recorded
+from cli_cases import Called
+from numpy.typing import NDArray
+
+from hapticbridge import timekeeping
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import default_coupling, is_certified
+from hapticbridge.check.cost import Cost, Growth, TimingStats
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.timing import DELAY_PRICE
+from hapticbridge.summary import Summary
+from hapticbridge.timekeeping import INSTANT
+
+T = 1e-3
+B = 2.0
+"""Damping of the device of ``ScriptedDevice`` in N s/m, as that of the default simulated one."""
+
+# The damping that a delay needs
+
+
+def damping_for_delay(stiffness: float, damping: float, share: float) -> float:
+    """Returns the least b of the form in ``kernel.timing``, for T = 1 and a delay of this share."""
+    most = 0.0
+    for theta in np.geomspace(1e-3, np.pi, 200):
+        back = np.exp(-1j * theta)
+        law = stiffness / (1 - back) + damping
+        force, moved, uneven, tool = (
+            np.array(row, dtype=complex)
+            for row in ([law, 0, -law], [1, 0, 0], [0, 1, 0], [0, 0, 1])
+        )
+        early = share * moved + uneven
+        form = _product(force, tool) - _product(force * back, moved - early)
+        form -= _product(force * back * back, early)
+        kept, weights = [0, 1, 2], [1.0, 1.0]
+        if share in (0, 1):  # the motion cannot be uneven
+            kept, weights = [0, 2], [1.0]
+        else:
+            weights = [1.0, 1 / (share * (1 - share))]
+        form = form[np.ix_(kept, kept)]
+        rest = form[:-1, :-1] - form[:-1, -1:] @ form[-1:, :-1] / form[-1, -1]
+        rest = rest / np.sqrt(np.outer(weights, weights))
+        most = max(most, float(np.linalg.eigvalsh(rest)[-1]))
+    return most
+
+
+def _product(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    return 0.5 * (np.outer(a.conj(), b) + np.outer(b.conj(), a))
+
+
+@pytest.mark.parametrize("share", [0, 0.02, 0.1, 0.3, 0.5, 0.8, 1])
+@pytest.mark.parametrize("damping", [0.0, 0.1, 0.42, 1.0, 5.0, 50.0])
+def test_no_hand_and_no_scene_needs_more_for_a_delay_than_is_charged(
+    damping: float, share: float
+) -> None:
+    needed = 1.0 + damping
+    charged = needed + DELAY_PRICE / needed * share
+    found = damping_for_delay(2.0, damping, share)
+    assert found <= charged * (1 + 1e-6)
+    if damping == 0.0:
+        assert found == pytest.approx(charged, rel=1e-3)
+        if share > 0:
+            assert found > needed + 2 / needed * share  # the price of a wall alone is too low
+
+
+# Runs
+
+
+@dataclass(frozen=True)
+class Case:
+    """Times of a run.
+
+    Attributes:
+        stalls: Deadlines skipped before a tick.
+        late: Shares of a period by which ticks begin late.
+        sends: Share of a period from sample to force, by tick.
+        coupling: Coupling; None for the default.
+        seconds: Duration of the run.
+    """
+
+    stalls: Mapping[int, int]
+    late: Mapping[int, float]
+    sends: Callable[[int], float]
+    coupling: Coupling | None = None
+    seconds: float = 1.0
+
+
+def at_once(_tick: int) -> float:
+    return 0.0
+
+
+def stroke(tick: int) -> tuple[float, ...]:
+    """A hand that swings by 10 mm, at most at 0.2 m/s."""
+    return (0.01 * np.sin(0.02 * tick), 0, 0, 1, 0, 0, 0)
+
+
+STIFF = Coupling(3900.0, 1.95, 2.4, 1.7e-3)
+"""K = 3900 N/m with B' = 0: it needs 1.95 of the device's 2 N s/m."""
+
+IN_TIME = {
+    "simulated": Case({}, {}, at_once),
+    "one missed deadline": Case({200: 1}, {}, at_once),
+    "one force half a period late": Case({}, {}, lambda tick: 0.5 * (tick == 200)),
+    "force 5 % of a period after the sample": Case({}, {}, lambda _: 0.05),
+    "5 % late in turn": Case({}, dict.fromkeys(range(0, 1000, 2), 0.05), at_once, STIFF),
+}
+NOT_IN_TIME = {
+    "82 % of the deadlines missed": Case(
+        dict.fromkeys(range(0, 180), 4) | dict.fromkeys(range(0, 180, 5), 7), {}, at_once
+    ),
+    "force 80 % of a period after the sample": Case({}, {}, lambda _: 0.8),
+    "force late in a tenth of the run": Case({}, {}, lambda tick: 0.8 * (280 < tick < 360)),
+    "force 5 % of a period late at the bound": Case({}, {}, lambda _: 0.05, STIFF),
+}
+
+
+def felt(path: Path, case: Case) -> tuple[Summary, AuditReport]:
+    clock = SlowClock(case.stalls, case.late)
+    device = ScriptedDevice(stroke, on_write=lambda sent: clock.spend(case.sends(sent - 1)))
+    coupling = case.coupling or default_coupling(device.info, T)
+    summary = recorded(path, "virtual_wall", device, coupling, clock=clock, duration=case.seconds)
+    return summary, audit(path)
+
+
+@pytest.mark.parametrize("name", [*IN_TIME, *NOT_IN_TIME])
+def test_a_run_is_certified_only_for_the_time_that_it_kept(tmp_path: Path, name: str) -> None:
+    case = (IN_TIME | NOT_IN_TIME)[name]
+    summary, report = felt(tmp_path / "run.mcap", case)
+    kept, again = summary.timekeeping, report.timekeeping
+    assert again is not None
+    assert report.resimulation == "bit for bit"
+    assert summary.is_certified is report.certified is kept.is_kept is (name in IN_TIME)
+    assert report.exit_code == (name not in IN_TIME)
+    # the second opinion agrees in every number
+    assert again.delay_energy == pytest.approx(kept.delay_energy, rel=1e-6, abs=1e-15)
+    assert again.mean_delay == pytest.approx(kept.mean_delay)
+    assert (again.share, again.rate) == pytest.approx((kept.share, kept.rate))
+    # without the time that the run really had, all of them would be certified
+    assert summary.fault is None
+    assert all(sentence.count(">=") == 1 for sentence in summary.conditions)
+    if name in NOT_IN_TIME:
+        assert timekeeping.NOT_KEPT in report.reason
+        assert "--realtime" in kept.fault
+
+
+def test_a_missed_deadline_is_said_with_the_share_of_the_time(tmp_path: Path) -> None:
+    summary, report = felt(tmp_path / "run.mcap", IN_TIME["one missed deadline"])
+    assert summary.timekeeping.clause == " while the run kept its time (99.9 % of it)"
+    assert summary.timekeeping.words == "999 Hz, 99.9 % of the deadlines kept"
+    assert "--realtime" in summary.timekeeping.hint
+    facts = json.loads(report.to_json())["timekeeping"]
+    assert facts["share"] == pytest.approx(0.999)
+    assert facts["rate"] == pytest.approx(999.0)
+    summary, _ = felt(tmp_path / "again.mcap", IN_TIME["simulated"])
+    assert summary.timekeeping.clause == summary.timekeeping.hint == ""
+
+
+def test_a_run_at_a_fifth_of_its_rate_names_what_it_needed(tmp_path: Path) -> None:
+    summary, _ = felt(tmp_path / "run.mcap", NOT_IN_TIME["82 % of the deadlines missed"])
+    kept = summary.timekeeping
+    assert kept.share == pytest.approx(0.18, abs=0.01)
+    assert kept.rate == pytest.approx(1000 * kept.share)
+    assert kept.conditions[0].needed == pytest.approx(1.7 / kept.share, rel=1e-3)
+    assert is_certified(kept.conditions) is False
+    assert kept.fault.startswith(f"the run did not keep its time: at {kept.rate:.4g} Hz")
+
+
+def test_short_delays_are_judged_by_what_they_gave(tmp_path: Path) -> None:
+    summary, _ = felt(tmp_path / "run.mcap", NOT_IN_TIME["force late in a tenth of the run"])
+    kept = summary.timekeeping
+    assert is_certified(kept.conditions) is True  # on average the condition held
+    assert kept.delay_energy > INSTANT
+    assert "may have given the hand" in kept.fault
+    clock = SlowClock({})
+    case = NOT_IN_TIME["force late in a tenth of the run"]
+    still = ScriptedDevice(
+        lambda _: (0, 0, 0, 1, 0, 0, 0), on_write=lambda sent: clock.spend(case.sends(sent - 1))
+    )
+    summary = recorded(tmp_path / "still.mcap", "virtual_wall", still, clock=clock, duration=1.0)
+    assert summary.is_certified is True  # a hand at rest was given nothing
+    assert summary.timekeeping.delay_energy == 0.0
+
+
+def test_damping_that_pays_for_a_late_sample_does_not_pay_for_a_late_force(tmp_path: Path) -> None:
+    def sends(tick: int) -> float:
+        return 0.3 * (100 < tick < 130)
+
+    prompt, _ = felt(tmp_path / "prompt.mcap", Case({}, {}, sends))
+    stalled, report = felt(tmp_path / "stalled.mcap", Case({100: 8}, {}, sends))
+    assert report.timekeeping is not None
+    assert stalled.timekeeping.delay_energy > prompt.timekeeping.delay_energy > 0
+
+
+def test_times_without_a_condition_are_told_and_not_judged(tmp_path: Path) -> None:
+    device = ScriptedDevice(stroke, damping=None, rotational_damping=None)
+    stalls = dict.fromkeys(range(100), 4)
+    with Bridge("point_mass", device, Coupling(500.0, 0.5), clock=SlowClock(stalls)) as bridge:
+        summary = bridge.run(0.5)
+    assert summary.timekeeping.share == pytest.approx(0.2)
+    assert summary.timekeeping.is_kept is None
+    assert summary.is_certified is None
+
+
+def test_a_device_that_never_bears_it_is_not_blamed_on_time(tmp_path: Path) -> None:
+    weak = ScriptedDevice(stroke, damping=0.5)
+    clock = SlowClock({200: 9})
+    coupling = Coupling(2400.0, 0.5, 2.4, 5e-4)
+    summary = recorded(
+        tmp_path / "run.mcap", "point_mass", weak, coupling, clock=clock, duration=0.5
+    )
+    assert summary.is_certified is False
+    assert summary.timekeeping.is_kept is None
+    assert summary.timekeeping.fault == ""
+
+
+# Command line
+
+
+def test_run_and_audit_say_so_and_fail(
+    call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    stalls = dict.fromkeys(range(100), 4)
+    arguments = ("run", "point_mass", "--fast", "--duration", 0.5, "--record", path)
+    monkeypatch.setattr("hapticbridge.cli.run.SimulatedClock", lambda: SlowClock(stalls))
+    code, out, _ = call(*arguments)
+    assert code == 1
+    assert "device not certified: the run did not keep its time: at 200 Hz" in out
+    assert "device certified" not in out
+    assert "--realtime" in out
+    page = tmp_path / "run.html"
+    code, out, _ = call("audit", path, "--report", page)
+    assert code == 1
+    assert "device not certified: the run did not keep its time" in out
+    assert "200 Hz, 20.0 % of the deadlines kept" in out
+    assert "device certified" not in out
+    text = page.read_text(encoding="utf-8")
+    assert "the run did not keep its time" in text
+    assert "bears this coupling" not in text
+    code, out, _ = call("audit", path, "--json")
+    facts = json.loads(out)[0]
+    assert (code, facts["certified"], facts["timekeeping"]["is_kept"]) == (1, False, False)
+    assert call("audit", tmp_path)[0] == 1
+
+    monkeypatch.setattr("hapticbridge.cli.run.SimulatedClock", lambda: SlowClock({50: 2}))
+    code, out, _ = call(*arguments, "--overwrite")
+    assert code == 0
+    assert "device certified while the run kept its time (99.6 % of it): b >=" in out
+    assert "deadlines were missed: --realtime" in out
+    code, out, _ = call("audit", path, "--report", page)
+    assert code == 0
+    assert "device certified while the run kept its time (99.6 % of it)" in out
+    assert "while the run kept its time (99.6 % of it)" in page.read_text(encoding="utf-8")
+
+    monkeypatch.setattr("hapticbridge.cli.run.SimulatedClock", SimulatedClock)
+    code, out, _ = call(*arguments, "--overwrite")
+    assert code == 0
+    assert "device certified: b >=" in out
+    assert "--realtime" not in out
+
+
+def test_check_finds_a_rate_that_this_machine_cannot_hold(
+    call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(seconds: float) -> Cost:
+        stats, growth = TimingStats(100, seconds, seconds), Growth((), None, None)
+        return Cost(stats, stats, stats, {}, 0.5 / seconds, growth, growth)
+
+    monkeypatch.setattr("hapticbridge.cli.check.measure_cost", lambda *_a, **_k: slow(2e-3))
+    code, out, _ = call("check", "virtual_wall")
+    assert code == 1
+    assert "cannot hold 1000 Hz here" in out
+    assert "--rate 250" in out
+    monkeypatch.setattr("hapticbridge.cli.check.measure_cost", lambda *_a, **_k: slow(1e-5))
+    code, out, _ = call("check", "virtual_wall")
+    assert code == 0
+    assert "cannot hold" not in out
