@@ -347,6 +347,10 @@ IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
 """Force in N and torque in N m, beyond the tool's weight, to which the coupling relaxes while the
 hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
 
+SWING_ENERGY, RUNAWAY_SPEED = 8e-3, 0.1
+"""Energy in J per span, and speed in m/s, of the watch for a late or reversed force
+(``kernel.swing_watch`` has the reasons)."""
+
 JUMP_MARGIN = 2.0
 """Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
 shows up to two periods of motion in one."""
@@ -434,4 +438,6 @@ def guard_parameters_for(
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
         energy=limits.energy,
+        swing_energy=SWING_ENERGY,
+        runaway_speed=RUNAWAY_SPEED,
     )

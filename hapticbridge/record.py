@@ -31,6 +31,10 @@ class TickFlag(IntFlag):
         REANCHORED: The handle slipped, or followed the device in part: its pose belongs to the
             device's present pose from this tick on.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
+        SWINGING: The device's force comes late and swings; the force was lowered before this tick
+            and stays lower.
+        RUNS_AWAY: The device gained speed against its force, as with a reversed axis; the force was
+            taken away before this tick.
     """
 
     OVERRUN = 1
@@ -44,6 +48,8 @@ class TickFlag(IntFlag):
     TRIP = 512
     MIDPOINT = 1024
     REANCHORED = 2048
+    SWINGING = 4096
+    RUNS_AWAY = 8192
 
 
 TICK_DTYPE = np.dtype(

@@ -53,6 +53,25 @@ def was_never_lossless(count: int, flags: int) -> bool:
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
 
 
+def watch_sentence(flags: int) -> str:
+    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
+
+    Args:
+        flags: Combined flags of a run's records; without the watch's own the text is empty.
+    """
+    if flags & int(TickFlag.RUNS_AWAY):
+        return (
+            "the force was taken away because the device gained speed against it: an axis is "
+            "reversed (check the axes and signs of the device) or the force comes very late"
+        )
+    if flags & int(TickFlag.SWINGING):
+        return (
+            "the force was lowered because it swung as that of a late device does: lower "
+            "--stiffness, and measure the device's delay ('hapticbridge identify')"
+        )
+    return ""
+
+
 # Energies metered by the kernel, and the environment's verdict
 
 Environment = Literal["strict", "within slack", "active"]
@@ -202,6 +221,7 @@ class Summary:
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
+        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
     """
 
     ticks: int
@@ -227,6 +247,7 @@ class Summary:
     stopped_by: str
     recording: Path | None
     reach: float | None
+    watch: str
 
     @property
     def verdict(self) -> str:
@@ -283,4 +304,5 @@ class Summary:
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
+            watch=watch_sentence(int(state["watch"]["flags"][0])),
         )

@@ -198,6 +198,7 @@ WRITERS = {
     "loop": "tick",
     "energy": "ledger",
     "guard": "tick_guard",
+    "watch": "swing_watch",
     "observer": "passivity_controller",
     "lossless": "lossless",
     "springs": "springs",

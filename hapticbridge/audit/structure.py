@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -242,6 +243,8 @@ def _flag_faults(
         (TickFlag.CLUTCH, is_released, is_released),
         (TickFlag.RAMPING, is_partial, is_partial),
         (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
+        (TickFlag.SWINGING, none, every & math.isfinite(guarding.swing_energy)),
+        (TickFlag.RUNS_AWAY, none, every & math.isfinite(guarding.runaway_speed)),
     ):
         has = has_flag(ticks, flag)
         name = (flag.name or "").lower()

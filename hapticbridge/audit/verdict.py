@@ -36,7 +36,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
-from hapticbridge.summary import Environment, was_never_lossless
+from hapticbridge.summary import Environment, was_never_lossless, watch_sentence
 from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
@@ -241,9 +241,10 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        kept = facts.get("timekeeping")
+        kept, watched = facts.get("timekeeping"), watch_sentence(recording.flags)
         not_kept = "" if kept is None else kept.fault
-        notes = (found["reason"], not_kept, unusual_end(recording.events), facts["unchecked"])
+        ending = unusual_end(recording.events)
+        notes = (found["reason"], not_kept, watched, ending, facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 

@@ -145,6 +145,8 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     since = f", from tick {tick} on" if port else ""
     words = f"[bold]{summary.verdict}[/bold] ({port or summary.environment})"
     out.print(f"{words}{since}{used}")
+    if summary.watch:
+        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     _print_coupling(summary.coupling)

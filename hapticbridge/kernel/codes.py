@@ -109,6 +109,8 @@ STALE_SAMPLE = int(TickFlag.STALE_SAMPLE)
 TRIP = int(TickFlag.TRIP)
 REANCHORED = int(TickFlag.REANCHORED)
 LOSSLESS_TICK = int(TickFlag.MIDPOINT)
+SWINGING = int(TickFlag.SWINGING)
+RUNS_AWAY = int(TickFlag.RUNS_AWAY)
 """Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 
 FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41

@@ -27,7 +27,15 @@ MAX_BUTTONS = 32
 ALL_MOTORS = 63
 """Mask of six axes with a motor."""
 
-_POSITIVE = ("reach", "hold_force", "hold_torque", "idle_force", "idle_torque")
+_POSITIVE = (
+    "reach",
+    "hold_force",
+    "hold_torque",
+    "idle_force",
+    "idle_torque",
+    "swing_energy",
+    "runaway_speed",
+)
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
     "assumed_damping",
@@ -75,6 +83,9 @@ class GuardParameters:
         hold_torque: Largest torque in N m about axes without motor.
         idle_force: Force in N to which the coupling relaxes while the hand is let go.
         idle_torque: Torque in N m to which it relaxes then.
+        swing_energy: Energy in J that a late force would give in a span of 0.1 s above which the
+            span counts as swinging (``kernel.swing_watch``).
+        runaway_speed: Speed in m/s gained against the force above which the force is taken away.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -102,6 +113,8 @@ class GuardParameters:
     hold_torque: float = math.inf
     idle_force: float = math.inf
     idle_torque: float = math.inf
+    swing_energy: float = math.inf
+    runaway_speed: float = math.inf
 
     def __post_init__(self) -> None:
         if self.controller not in (OFF, DAMPER, ENVIRONMENT):

@@ -15,6 +15,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
 | guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
+| watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
 | timing      | delay of the force, energy that it may have given | timing                        |
@@ -56,6 +57,7 @@ from hapticbridge.kernel.passivity_controller import (
     observe_reset,
 )
 from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
+from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
 from hapticbridge.kernel.tick_guard import (
     GUARD_DTYPE,
@@ -120,6 +122,7 @@ STATE_DTYPE = np.dtype(
         ("energy", ENERGY_DTYPE),
         ("guard", GUARD_DTYPE),
         ("observer", OBSERVER_DTYPE),
+        ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
         ("springs", SPRINGS_DTYPE),
         ("timing", TIMING_DTYPE),
@@ -277,6 +280,7 @@ class BoundKernel:
         )
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
+        bind_watch(s["watch"], parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record

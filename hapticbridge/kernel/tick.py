@@ -83,6 +83,7 @@ from hapticbridge.kernel.mujoco_c import (
 )
 from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
 from hapticbridge.kernel.springs import restore_springs
+from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
     DEVICE_BUTTONS,
     advance_share,
@@ -177,6 +178,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
+    watch_device(s, moved, turned)
     move_device(pose, position, quaternion)
 
     buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
@@ -396,6 +398,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
+    loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
         loop.flags |= CONTACT
     row[0].solver_iterations = _solver_iterations(s)

@@ -136,7 +136,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
 
 @compiled
 def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> None:
-    """Advances r by one tick: it falls to 0 while the hand is let go, else it rises to 1.
+    """Advances r by one tick: to 0 while the hand is let go, else to 1 or the watch's cap.
 
     The hand is let go while a clutch is held (by a button or by command), while a dead-man button
     is not held, while the device is beyond ``reach``, at the edge of its workspace, after
@@ -165,8 +165,10 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
         guard.share = max(guard.share - 1.0 / guard.fade_ticks, 0.0)
         if guard.share == 0.0:
             guard.rise_ticks = guard.fade_ticks
-    elif guard.share < 1.0:
-        guard.share = min(guard.share + 1.0 / (guard.rise_ticks + 1.0), 1.0)
+    elif guard.share > s.watch.max_share:
+        guard.share = max(guard.share - 1.0 / guard.fade_ticks, s.watch.max_share)
+    elif guard.share < s.watch.max_share:
+        guard.share = min(guard.share + 1.0 / (guard.rise_ticks + 1.0), s.watch.max_share)
     if guard.share < 1.0:
         guard.flags |= RAMPING
 

@@ -84,6 +84,8 @@ _GUARD = {
     "hold_torque": "N m",
     "idle_force": "N",
     "idle_torque": "N m",
+    "swing_energy": "J",
+    "runaway_speed": "m/s",
     "motors": "(mask of axes)",
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",

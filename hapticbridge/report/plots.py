@@ -187,6 +187,8 @@ FLAGS = (
     (TickFlag.CONTACT, "contact"),
     (TickFlag.STALE_SAMPLE, "old sample"),
     (TickFlag.OVERRUN, "late tick"),
+    (TickFlag.SWINGING, "lowered: it swings"),
+    (TickFlag.RUNS_AWAY, "taken away: wrong sign"),
 )
 """Flags shown over time, and their labels."""
 

@@ -26,6 +26,7 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
+from hapticbridge.summary import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
@@ -61,6 +62,7 @@ class LiveRun:
         parameters: Parameters of the run.
         hand_reference: Largest force on the hand in N so far, or ``MIN_REFERENCE``.
         tool_reference: Largest force on the tool in N so far, or ``MIN_REFERENCE``.
+        flags: Combined flags of the records so far.
         trace: The curves so far.
     """
 
@@ -73,6 +75,7 @@ class LiveRun:
         self._is_held = is_held(run.meta)
         self.trace = Trace(TRACE, is_held=self._is_held)
         self.hand_reference = self.tool_reference = MIN_REFERENCE
+        self.flags = 0
 
     def look(self) -> Sight | None:
         """Returns the newest instant; None if it was returned before."""
@@ -98,6 +101,7 @@ class LiveRun:
         number, rows = self._ring.since(self._gathered)
         self._gathered = number + len(rows)
         if rows.size:
+            self.flags |= int(np.bitwise_or.reduce(rows["flags"]))
             self.trace.add(rows, slack)
 
 
@@ -166,7 +170,10 @@ def _follow(
             page.hand_reference = live.hand_reference
             page.tool_reference = live.tool_reference
             page.show(sight)
-            page.status.content = f"**{sight.time:.1f} s**, {page.forces(sight)}"
+            watched = watch_sentence(live.flags)
+            page.status.content = f"**{sight.time:.1f} s**, {page.forces(sight)}" + (
+                f"; **{watched}**" if watched else ""
+            )
         now = time.monotonic()
         if now - plotted >= REPLOT and len(live.trace) > 1:
             plotted = now

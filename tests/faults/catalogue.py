@@ -53,11 +53,12 @@ class Fault:
         do: Does it to a rig.
         ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
             ``slips`` (the handle slips for what late samples gave), ``stops`` (the run ends with
-            zero force) or ``goes on``.
+            zero force), ``lowers`` (the watch lowers the force or takes it away) or ``goes on``.
         says: What the audit of its recording must name; empty where the run is an ordinary one.
         without: What of the guard is switched off on the other side.
         cause: The tick at which it can be seen.
-        within: Ticks from there to zero force.
+        within: Ticks from there to zero force; from the first 10 mJ to the watch for ``lowers``.
+        energy: Largest energy to the hand in J.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Fault:
     without: dict[str, Any] | None = None
     cause: int = CAUSE
     within: int = 2
+    energy: float = 0.05
 
     def run(self, folder: Path, *, is_guarded: bool = True) -> Outcome:
         rig = Rig(folder)
@@ -405,12 +407,133 @@ def _edge(rig: Rig) -> None:
     rig.points = (*PRESS[:2], (0.9, 0.02), (1.5, 0.02), (1.6, 0.0804), (1.9, 0.0), (9.0, 0.0))
 
 
+FINGERS = Hand(mass=0.06, damping=3.5, stiffness=39.0)
+"""Two fingers: they take up more energy from a swing than an arm, and move faster."""
+
+PRESSES = {DEFAULT_HAND: 0.0804, FINGERS: 0.181}
+"""Where a hand wants to be in m: it presses on the wall with 9.5 N, fingers with 6.7 N."""
+
+Change = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+
+
+def forced(change: Callable[[], Change], hand: Hand) -> Callable[[Rig], None]:
+    """Returns a fault of a device whose motors do not do what they are told, from its start on.
+
+    Args:
+        change: Makes a function of tick and written wrench that returns the wrench of the motors.
+        hand: Who holds it and presses on the wall.
+    """
+
+    def do(rig: Rig) -> None:
+        rig.parameters = {"hand": hand}
+        rig.points = ((0.0, 0.0), (0.2, 0.0), (0.9, PRESSES[hand]), (9.0, PRESSES[hand]))
+        act = change()
+
+        def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+            wrench[:] = act(tick, wrench.copy())
+
+        rig.device.refuse = refuse
+
+    return do
+
+
+def late(ticks_of: Callable[[int], int]) -> Callable[[], Change]:
+    """Returns a delay of so many ticks."""
+
+    def change() -> Change:
+        past: list[NDArray[np.float64]] = []
+
+        def act(tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+            past.append(wrench)
+            ticks = ticks_of(tick)
+            return past[-1 - ticks] if len(past) > ticks else np.zeros(6)
+
+        return act
+
+    return change
+
+
+def lagging(seconds: float) -> Callable[[], Change]:
+    """Returns motors that follow with a time constant."""
+
+    def change() -> Change:
+        held = np.zeros(6)
+
+        def act(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+            held[:] += PERIOD / (seconds + PERIOD) * (wrench - held)
+            return held.copy()
+
+        return act
+
+    return change
+
+
+def holding(ticks: int) -> Callable[[], Change]:
+    """Returns motors that take a new force only once in so many ticks."""
+
+    def change() -> Change:
+        held = np.zeros(6)
+
+        def act(tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+            if tick % ticks == 0:
+                held[:] = wrench
+            return held.copy()
+
+        return act
+
+    return change
+
+
+def turning(speed: float) -> Callable[[], Change]:
+    """Returns motors whose frame turns about z, in rad/s; at π rad the axes are reversed."""
+
+    def act(tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+        c, s = np.cos(speed * PERIOD * tick), np.sin(speed * PERIOD * tick)
+        wrench[:2] = c * wrench[0] - s * wrench[1], s * wrench[0] + c * wrench[1]
+        return wrench
+
+    return lambda: act
+
+
+def _reversed_x(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    wrench[0] = -wrench[0]
+    return wrench
+
+
+def _coarse(_since: int, sample: NDArray[np.void]) -> None:
+    sample["position"] = 4e-3 * np.round(sample["position"] / 4e-3)
+
+
 NO_TRIPS = dict.fromkeys(("speed", "turn_speed", "stretch", "angle", "energy"), np.inf)
 
-UNGUARDED = {"controller": 0, **NO_TRIPS}
+UNWATCHED = {"swing_energy": np.inf, "runaway_speed": np.inf}
+
+UNGUARDED = {"controller": 0, **NO_TRIPS, **UNWATCHED}
 
 RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
 """The one that loses records, after its cause; they are counted."""
+
+
+def unseen(name: str, change: Callable[[], Change], hand: Hand, says: str = "lowered") -> Fault:
+    """Returns a fault that no energy account sees, because the samples show another one."""
+    return Fault(name, forced(change, hand), "lowers", says, UNWATCHED, within=500, energy=0.3)
+
+
+UNSEEN = (
+    unseen("force 3 ms late", late(lambda _: 3), FINGERS),
+    unseen("force 5 ms late", late(lambda _: 5), FINGERS),
+    unseen("force 10 ms late", late(lambda _: 10), FINGERS, "taken away"),
+    unseen("force 20 ms late", late(lambda _: 20), DEFAULT_HAND),
+    unseen("force 20 ms late, two fingers", late(lambda _: 20), FINGERS, "taken away"),
+    unseen("force later and later", late(lambda k: k // 50), FINGERS, "taken away"),
+    unseen("force lags by 5 ms", lagging(5e-3), FINGERS),
+    unseen("motor holds for 10 ms", holding(10), FINGERS),
+    unseen("reversed axis", lambda: _reversed_x, DEFAULT_HAND, "taken away"),
+    unseen("reversed axis, two fingers", lambda: _reversed_x, FINGERS, "taken away"),
+    unseen("frame that rotates by 1 rad/s", turning(1.0), DEFAULT_HAND),
+    unseen("frame that rotates by 1 rad/s, fingers", turning(1.0), FINGERS),
+)
+"""Faults that only the watch finds (``kernel.swing_watch``)."""
 
 DISK_FULL = Fault("disk full", _full_tmpfs, "stops", "the disk is full", within=600)
 
@@ -445,10 +568,12 @@ FAULTS = (
     Fault("MuJoCo warns: bad acceleration", filled("qfrc_applied", 1e11), "trip", "diverged"),
     Fault("scene diverges", filled("qvel", np.nan), "trip", "diverged"),
     Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=PUSHED),
-    Fault("10 x too stiff, free", stiff(10, None), "goes on", "", UNGUARDED),
-    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "goes on"),
+    Fault("10 x too stiff, free", stiff(10, None), "lowers", "", UNGUARDED, within=0),
+    Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "lowers", within=0),
     Fault("edge of the workspace", _edge, "fades", within=150),
     Fault("encoder steps of 50 µm", _quantised, "goes on"),
+    Fault("encoder steps of 4 mm", corrupting(_coarse), "goes on"),
+    *UNSEEN,
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
     Fault("recorder killed", acting(_kill_recorder), "stops", "recorder died", within=101),
     Fault("recording may not grow", _fill_disk, "stops", "recorder died", within=600),

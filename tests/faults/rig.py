@@ -28,6 +28,11 @@ CAUSE = 1500
 
 STALE = int(TickFlag.STALE_SAMPLE)
 
+WATCHED = TickFlag.SWINGING | TickFlag.RUNS_AWAY
+
+FELT = 0.01
+"""Energy in J given to the hand from which on a late force must be found."""
+
 PRESS = ((0.0, 0.0), (0.2, 0.0), (0.9, 0.0804), (9.0, 0.0804))
 """Time in s and where the hand wants to be along x in m: the wall is at 10 mm, and 135 N/m over the
 rest of the way are 9 N."""
@@ -196,6 +201,8 @@ class Outcome:
         is_finite: Whether all of it was.
         energy: Largest energy given to the hand beyond what it had put in, in J.
         zero_after: Ticks from the cause to the first zero wrench; None where none came.
+        found_after: Ticks from ``FELT`` to the tick in which the watch lowers the force; None where
+            it does not.
         last_is_zero: Whether the last write was zero.
         error: What was raised, or nothing.
         ticks: Ticks that were done, and ``rows`` records of them in the file.
@@ -209,6 +216,7 @@ class Outcome:
     is_finite: bool
     energy: float
     zero_after: int | None
+    found_after: int | None
     last_is_zero: bool
     error: str
     ticks: int
@@ -229,11 +237,15 @@ class Outcome:
         zero = ticks_of[(ticks_of >= cause - 1) & (wrenches == 0).all(axis=1)]
         given = np.array(device.to_the_hand)
         recording = read_recording(path)
+        flags = recording.ticks["flags"]
+        found = np.flatnonzero(flags & int(WATCHED))
+        felt = np.flatnonzero(np.append(given > FELT, True))
         return cls(
             largest_force=float(np.max(forces)),
             is_finite=bool(np.isfinite(wrenches).all()),
             energy=float(given.max()),
             zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
+            found_after=max(int(found[0]) - int(felt[0]), 0) if found.size else None,
             last_is_zero=not wrenches[-1].any(),
             error=error,
             ticks=ticks,
@@ -241,7 +253,7 @@ class Outcome:
             report=audit(path),
             events=[str(event["event"]) for event in recording.events],
             dropped=sum(int(str(event.get("dropped", 0))) for event in recording.events),
-            flags=recording.ticks["flags"],
+            flags=flags,
             forces=forces,
             torques=np.linalg.norm(wrenches[:, 3:], axis=1),
         )
