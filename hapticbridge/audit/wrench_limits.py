@@ -171,14 +171,14 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     yield _wrench_deviation(block, parameters)
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
     guarding = parameters.guarding
-    for name, most in (
+    for name, limit in (
         ("injected_damping", guarding.max_damping),
         ("injected_rotational_damping", guarding.max_rotational_damping),
     ):
         damping, unit = ticks[name], UNITS[name]
         yield Deviation(name, np.where(is_active, 0.0, np.abs(damping)), 0.0, unit, "flags")
-        beyond = np.maximum(damping - most, -damping)
-        yield Deviation(name, beyond, TOLERANCE * (1 + most), unit, "the controller's limits")
+        beyond = np.maximum(damping - limit, -damping)
+        yield Deviation(name, beyond, TOLERANCE * (1 + limit), unit, "the controller's limits")
 
 
 def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviation]:

@@ -345,6 +345,19 @@ def advance(state: NDArray[np.void]) -> None:
 
 
 @compiled
+def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns force and torque on the tool, and its motion and turn, after a step of MuJoCo."""
+    if s.run.scheme == Scheme.IMPLICIT:
+        return limited_wrench_after_step(s, is_last)
+    if s.run.scheme == Scheme.MIDPOINT:
+        return lossless_wrench(s)
+    force, torque, moved, turned = compared_wrench(s, is_last)
+    if s.run.has_law:
+        force, torque = limited_wrench(s, force, torque)
+    return force, torque, moved, turned
+
+
+@compiled
 def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
     """Computes the wrench of the step that just ended; after the last substep also the device's.
 
@@ -362,14 +375,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     is_last = substep + 1 == s.run.substeps
     if count == 1 and not is_last:
         return OK
-    if scheme == Scheme.IMPLICIT:
-        force, torque, moved, turned = limited_wrench_after_step(s, is_last)
-    elif scheme == Scheme.MIDPOINT:
-        force, torque, moved, turned = lossless_wrench(s)
-    else:
-        force, torque, moved, turned = compared_wrench(s, is_last)
-        if s.run.has_law:
-            force, torque = limited_wrench(s, force, torque)
+    force, torque, moved, turned = _evaluate(s, is_last)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
