@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
+import mujoco
+import numpy as np
 import pytest
 from adversary import UNPAID, Attack
+from numpy.typing import NDArray
 
+import hapticbridge as hb
+from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import OK
 
 ATTACKS = 300
@@ -39,3 +46,109 @@ def test_a_limit_on_the_device_alone_is_seen_to_fail() -> None:
         for seed, scene, ticks in ((52, "point_mass", 8000), (68, "peg_in_hole", 2000))
     )
     assert worst > 0.05
+
+
+WRENCH = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option cone="elliptic"/>
+  <worldbody>
+    <body>
+      <joint name="nut" type="hinge" axis="0 0 1" frictionloss="0.6" armature="1e-4"
+             solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"/>
+      <geom type="box" size="0.08 0.01 0.004" pos="0.08 0 0" mass="0.15" contype="0"
+            conaffinity="0"/>
+      <site name="grip" pos="0.15 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""A wrench of 0.15 m on a nut with 0.6 N m of friction: 4 N at the grip."""
+
+
+class Circling:
+    """A device that turns the wrench by 1.2 rad in 2.4 s, and has no motors for rotation."""
+
+    info = hb.DeviceInfo(
+        name="circling", axes=("x", "y", "z"), force_limit=20.0, damping=2.0, is_real=False
+    )
+
+    def __init__(self) -> None:
+        self.forces: list[float] = []
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.time, self.period = 0.0, period
+        sample = np.zeros(1, hb.SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        angle = min(0.5 * self.time, 1.2)
+        sample["position"][0] = 0.15 * (math.cos(angle) - 1.0), 0.15 * math.sin(angle), 0.0
+        self.time += self.period
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.forces.append(float(np.linalg.norm(wrench[:3])))
+
+    def close(self) -> None:
+        pass
+
+
+def turned_by(device: Circling, **limits: float) -> float:
+    """Returns the median force in N on the hand while the nut turns."""
+    chosen = hb.Limits(force=20.0, torque=0.5, **limits)
+    scene = hb.load_scene(mujoco.MjSpec.from_string(WRENCH))
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), limits=chosen) as bridge:
+        bridge.run(2.2)
+    return float(np.median(device.forces[500:]))
+
+
+def test_a_handle_that_cannot_turn_leaves_the_wrench_its_four_newtons() -> None:
+    assert turned_by(Circling()) == pytest.approx(4.0, rel=0.1)
+
+
+def test_without_slip_the_coupling_that_holds_the_orientation_adds_its_torque() -> None:
+    assert turned_by(Circling(), hold_torque=10.0) > 6.0
+
+
+HANGING = """
+<mujoco>
+  <worldbody>
+    <body><freejoint/><geom type="sphere" size="0.02" mass="0.2"/><site name="grip"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def test_the_first_tick_carries_the_weight_of_the_tool() -> None:
+    weight = 0.2 * 9.81
+    scene = hb.load_scene(mujoco.MjSpec.from_string(HANGING))
+    with hb.Bridge(scene, Still(), clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(0.5)
+        forces = bridge.latest_records(500)["wrench_on_tool"][:, 2]
+    assert forces == pytest.approx(weight, rel=1e-3)
+    assert summary.peak_force == pytest.approx(weight, rel=1e-3)
+
+
+class Still(Circling):
+    """A device that does not move."""
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        return 0
+
+
+def test_a_device_far_from_its_workspace_is_refused_before_force() -> None:
+    device = Still()
+    begin = device.start
+
+    def astray(period: float) -> NDArray[np.void]:
+        sample = begin(period)
+        sample["position"][0] = 5.0, 0.0, 0.0
+        return sample
+
+    device.start = astray  # type: ignore[method-assign]
+    with (
+        pytest.raises(DeviceError, match=r"5 m from the middle of its workspace; it reaches 2 m"),
+        hb.Bridge("point_mass", device, clock=hb.SimulatedClock()),
+    ):
+        pass
+    assert not device.forces or max(device.forces) == 0.0

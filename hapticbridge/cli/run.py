@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -21,7 +21,7 @@ from hapticbridge.certificate import default_coupling, device_conditions, run_co
 from hapticbridge.cli.terminal import err, notify, out
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Device, DeviceInfo, device_for
+from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import (
     USUAL_ENERGY,
@@ -79,6 +79,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
             f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
             "at this stiffness and rate; lower the stiffness or raise the rate"
         )
+    for sentence in _without_motor(setup):
+        err.print(f"  {sentence}")
     reach = setup.guard.reach
     if reach < math.inf:
         err.print(
@@ -94,6 +96,19 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     for condition in conditions:
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
+
+
+def _without_motor(setup: RunSetup) -> Iterator[str]:
+    """Yields a sentence for translation and for rotation if the device lacks axes of the kind."""
+    for kind, part, limit in (
+        ("place", AXES[:3], format_si(setup.limits.hold_force, "N")),
+        ("orientation", AXES[3:], f"{format_si(setup.limits.hold_torque, 'N m')} (--hold-torque)"),
+    ):
+        if lacking := [axis for axis in part if axis not in setup.info.axes]:
+            yield (
+                f"the device has no motor for {', '.join(lacking)}: the tool keeps its {kind} up "
+                f"to {limit} beyond its weight, then slips"
+            )
 
 
 def announce_measured(bridge: Bridge) -> None:
