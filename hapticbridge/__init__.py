@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from hapticbridge.device import open_device as open_device
     from hapticbridge.errors import CouplingError as CouplingError
     from hapticbridge.errors import DeviceError as DeviceError
+    from hapticbridge.errors import DeviceLost as DeviceLost
     from hapticbridge.errors import HapticBridgeError as HapticBridgeError
     from hapticbridge.errors import RecordingError as RecordingError
     from hapticbridge.errors import SafetyTrip as SafetyTrip
@@ -59,6 +60,7 @@ else:
             "open_device": "hapticbridge.device",
             "CouplingError": "hapticbridge.errors",
             "DeviceError": "hapticbridge.errors",
+            "DeviceLost": "hapticbridge.errors",
             "HapticBridgeError": "hapticbridge.errors",
             "RecordingError": "hapticbridge.errors",
             "SafetyTrip": "hapticbridge.errors",

@@ -278,7 +278,7 @@ class Bridge:
         """Changes inputs of the scene from the next tick on; recorded, so the run can be repeated.
 
         Move mocap bodies slowly. MuJoCo damps their welds and contacts against rest, so a fast
-        move can generate energy, and the environment is then called active.
+        move can create energy, and the environment is then called active.
 
         Args:
             ctrl: Controls by actuator of the scene.

@@ -210,7 +210,7 @@ class Stage:
     @property
     def hand_force(self) -> NDArray[np.float64]:
         """Force of the device on the hand at the tick shown."""
-        return force_on_hand(self.row, self.parameters.axes)[0] * self._is_held
+        return np.asarray(force_on_hand(self.row, self.parameters.axes)[0] * self._is_held)
 
     def contacts(self) -> NDArray[np.float64]:
         """Returns the contacts of the tick shown that carry a force; see ``contacts_of``."""

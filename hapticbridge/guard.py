@@ -398,9 +398,9 @@ def guard_parameters_for(
             dissipation, so its energy account stays balanced and the controller idle.
         scale: Handle motion per device motion.
         controller: One of ``CONTROLLERS``. None selects ``damper`` for a device with less damping
-            than the coupling needs, else ``environment``. With enough damping the device port needs
-            no controller. A spring turned far beyond the torque limit returns more than the credit
-            covers, and an account of both ports would then blame a passive run.
+            than the coupling needs, else ``environment``. For a device with enough damping only the
+            environment is watched: the combined account could trigger when a spring, wound beyond
+            the torque limit, unwinds.
     """
     common = GuardParameters(
         fade_ticks=max(round(FADE / period), 1),

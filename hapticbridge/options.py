@@ -118,7 +118,7 @@ class BridgeOptions:
         limits: Limits of the wrench and of the run; None takes the device's own.
         controller: Passivity controller. ``damper`` acts when the device was given more than its
             damping dissipates and the scene released. ``environment`` acts when the scene
-            generated more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
+            created more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
             the device condition does not hold, else ``environment``.
         clutch: Number of the device's button, from 0, that lets it move without the handle.
         dead_man: Number of the button, from 0, that must be held for any force.
@@ -127,7 +127,7 @@ class BridgeOptions:
             reported once, with the command that grants it. None requests it for a real device.
         pipelined: True computes ahead, after the wrench was sent, what needs no new sample
             (``kernel.tick.can_split``). The numbers are equal to the bit, the wrench is sent
-            sooner, and the whole tick takes 5 % longer. Between two ticks ``scene.data`` then holds
+            sooner, and the whole tick takes 5 % longer. Between two ticks ``Scene.data`` then holds
             the contacts of the new positions, without forces. None does so on a real clock.
         live: True shows the state of the run on standard error, from the recorder's process.
 
@@ -278,7 +278,7 @@ class RunSetup:
             info: The device's data sheet.
             coupling: Requested K and B. None selects the stiffest safe coupling for the device's
                 damping: 80 % of the bound, with a quarter of b as damping, less where substeps need
-                it. A device of unknown damping counts as the default simulated one.
+                it. Unknown damping is replaced by ``certificate.assumed_damping``.
             options: The user's options.
             clock: Clock of the run.
             is_recorded: True if the run is recorded.
@@ -377,7 +377,8 @@ class RunSetup:
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
-        is_absolute, handle_origin, guard = self.workspace.absolute, IDENTITY_POSE, self.guard
+        is_absolute, guard = self.workspace.absolute, self.guard
+        handle_origin: tuple[float, ...] = IDENTITY_POSE
         if self.method.has_law:
             load = static_load(self.scene)
             force, torque = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))

@@ -94,8 +94,16 @@ the wrench that was sent, and of the device's motion to the next sample that the
 LATER_FIELDS = ("share",)
 """Fields that recordings of earlier versions lack; such a recording is read without them.
 
-A new field needs an entry here, in ``TICK_DTYPE`` and in ``UNITS``, a line in ``kernel.tick`` that
-writes it, and a check in the audit.
+To add a field:
+
+1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; its name in
+   ``LATER_FIELDS``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
+2. in ``kernel.tick``: a line of ``_record`` that writes it, after the module that computes it has
+   put it into the tick's state (``kernel.state`` has the table of writers);
+3. in the audit: a second computation from other fields, in ``audit.energy`` or
+   ``audit.wrench_limits``. The re-simulation compares every field by itself, to the bit.
+
+Ring, recording, export and comparison take the field from ``TICK_DTYPE``.
 """
 
 

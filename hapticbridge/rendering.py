@@ -308,6 +308,11 @@ def default_method(substeps: int = 1) -> Method:
     contact it is at least ten times as accurate as ``implicit``; in contact it equals ``implicit``
     with the same B', and so suits the same device.
 
+    Springs and dampers of the tool's joints and tendons are taken at the midpoint as well. A mass
+    of 1 kg on 500 N/m errs by 0.011 % at 1 ms, by 0.10 % with a held force, by 1.3 % with
+    ``implicit``. A spring with slack or yield stays MuJoCo's own, and ``lossless`` is of first
+    order: 0.49 % for 1 kg on a tendon with slack, where ``implicit`` errs by 2.5 %.
+
     ``implicit`` dissipates some energy on the way to a contact and ``lossless`` does not, so energy
     created by contacts uses more slack: at most 7.2 % instead of 7.0 % when tapping on a wall, and
     equal shares with jamming pegs (``scripts/bench_methods --same device``). Near contact

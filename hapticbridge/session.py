@@ -266,6 +266,7 @@ class Session:
         self.parameters = setup.parameters(sample, effective)
         start = start_state(scene.model, scene.data).tobytes()
         bound = BoundKernel(scene.model, scene.data, self.parameters)
+        resources.callback(bound.release)
         self.kernel.bind(bound, setup)
         refuse_stretched_start(bound.state, sample, setup.limits)
         if self.stream.is_read:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
-from hapticbridge.kernel.lossless import tree_of_tool
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
+from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling
@@ -32,6 +32,15 @@ def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
     """
     own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
     return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
+
+
+def coarse_spring(model: mujoco.MjModel, grip: str, method: Method) -> str:
+    """Returns the spring that makes a lossless coupling first order; empty if none does."""
+    if method.scheme != Scheme.MIDPOINT:
+        return ""
+    own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
+    tree = tree_of_tool(model, int(model.site(grip).bodyid[0]), own)
+    return "" if tree.is_never_free else spring_at_the_end(model, tree)
 
 
 def was_always_implicit(ticks: NDArray[np.void]) -> bool:
@@ -74,7 +83,7 @@ class Ledger:
 
     E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
     energy than it received while Σ E_k <= 0, eq. (14) of Brown & Colgate (1997). The device stays
-    safe while Σ E_k stays below the slack, Σ ½ (K + B/T) ‖δx_k‖² and its rotational counterpart.
+    safe while Σ E_k stays below the slack, Σ ½ (K + B'/T) ‖δx_k‖² and its rotational counterpart.
 
     Attributes:
         kinetic: Present kinetic energy.

@@ -133,8 +133,8 @@ class Timekeeping:
         """Sentence on the time that was not kept, with the remedy; empty if it was."""
         if self.is_kept is not False:
             return ""
-        delay = format_si(self.mean_delay, "s")
-        at_times = f"at {self.rate:.4g} Hz and {delay} from sample to force it needs"
+        late = f" and {format_si(self.mean_delay, 's')} from sample to force"
+        at_times = f"at {self.rate:.4g} Hz{late if self.mean_delay else ''} it needs"
         failed = [each for each in self.conditions if each.holds is False]
         if failed:
             unit = "N s/m" if failed[0].axis == "translation" else "N m s/rad"

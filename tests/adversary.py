@@ -236,7 +236,8 @@ class Attack:
         strongest = self._coupling(rng, b / gain, b_r / gain_r, 1.0)
         limits = 10 ** rng.uniform(-0.5, 1.2), 10 ** rng.uniform(-2.0, -0.3)
         mass = 10 ** rng.uniform(-1.5, 0.0)
-        scene = load_scene(self.scene, **dict.fromkeys(["mass"] * (self.scene in HEAVY), mass))
+        values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
+        scene = load_scene(self.scene, **values)
         prepare(scene, strongest, period, 1, method, warns=False)
         start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         parameters = RunParameters(

@@ -86,7 +86,7 @@ def test_the_balance_is_the_identity_behind_the_bound() -> None:
     ],
 )
 def test_a_spring_that_is_limited_stores_force_times_length_beyond_the_limit(
-    changed: dict[str, float], spring: float
+    changed: dict[str, Any], spring: float
 ) -> None:
     stretch = np.array([[0.0, 0.0, 0.0], [2e-3, 0.0, 0.0]])
     assert held(replace(RUN, **changed), stretch) == pytest.approx([0.0, spring])

@@ -135,7 +135,7 @@ def test_written_scene_says_what_was_changed_and_runs(written: Path, capsys: Cap
     assert "Taken: primitives (" in text
     assert "What it models: a square peg" in text  # the scene's own comment
     assert main(["run", str(written), "--fast", "--duration", "0.3"]) == 0
-    assert "environment passive" in capsys.readouterr().out
+    assert "passive (strict)" in capsys.readouterr().out
 
 
 TOOL = """<body name="tool"><freejoint name="tool"/>

@@ -102,8 +102,8 @@ def listed(problem: str | None, serial: str = "") -> FoundDevice:
 @pytest.mark.parametrize(
     ("plugged", "words"),
     [
-        ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid\n"),
-        ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A\n"),
+        ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid --force-limit 2\n"),
+        ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A --force-limit 2\n"),
         (
             [listed(permission_problem("/dev/hidraw0"))],
             "local users of the machine\nnext: hapticbridge devices",

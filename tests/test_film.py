@@ -144,19 +144,15 @@ def test_coupling_is_drawn_from_tool_to_handle_in_the_colour_of_its_force(sway: 
     stage.show(250)
     scene = mujoco.MjvScene(stage.model, maxgeom=10)
     stage.add_coupling(scene)
-    ghost, spring, arrow = scene.geoms[: scene.ngeom]
+    # no hand feels a prescribed motion, so no arrow is drawn
+    ghost, spring = scene.geoms[: scene.ngeom]
     row = stage.row[0]
-    force = row["wrench_on_device"][:3]
     np.testing.assert_allclose(ghost.pos, row["handle_position"], atol=1e-7)
     middle = 0.5 * (row["handle_position"] + row["tool_position"])
     np.testing.assert_allclose(spring.pos, middle, atol=1e-7)
     pull = float(np.linalg.norm(row["wrench_on_tool"][:3]))
     colour = force_colour(pull, stage.tool_reference)
     np.testing.assert_allclose(spring.rgba[:3], np.asarray(colour, float), atol=1e-6)
-    # mjv_connector turns a geom's z axis from one end to the other
-    strength = float(np.linalg.norm(force))
-    assert strength > 0
-    assert arrow.mat[:, 2] @ force == pytest.approx(strength, rel=1e-5)
 
 
 def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:

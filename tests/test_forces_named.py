@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from audit_cases import recorded
+from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.film_process import Stage
@@ -34,8 +35,8 @@ def scaled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Summary]:
     return path, summary
 
 
-def norms(recording: Recording, field: str) -> np.ndarray:
-    return np.linalg.norm(recording.ticks[field][:, :3], axis=1)
+def norms(recording: Recording, field: str) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(recording.ticks[field][:, :3], axis=1))
 
 
 def test_peaks_of_a_run_are_those_of_the_hand_and_those_of_the_tool(

@@ -262,11 +262,11 @@ def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either
     for burnt in (1.0, 2.0, 3.0):
         state["energy"]["environment_energy"] = -burnt
         observe_energy(state[0], nothing, nothing, T)
-    assert observer["generated_energy"][0] == -0.05
+    assert observer["created_energy"][0] == -0.05
     state["energy"]["environment_energy"] += 0.06
     state["energy"]["slack"] += 0.002
     observe_energy(state[0], nothing, nothing, T)
-    assert observer["generated_energy"][0] == pytest.approx(0.008)
+    assert observer["created_energy"][0] == pytest.approx(0.008)
 
 
 def test_a_recording_from_before_the_guard_is_judged_as_it_was(tmp_path: Path) -> None:

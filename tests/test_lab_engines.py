@@ -37,7 +37,7 @@ from hapticbridge.lab.engines.base import (
     composed,
 )
 from hapticbridge.pose import quaternion_exp
-from hapticbridge.theory.rigid_body import CoupledScheme, drive_mass, integrate_rotation
+from hapticbridge.theory.rigid_body import CoupledStepRule, drive_mass, integrate_rotation
 
 NOTHING = (0.0, 0.0, 0.0)
 FRAME = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
@@ -71,7 +71,7 @@ def test_a_tool_falls_as_half_g_t_squared_to_first_order(engine: Engine) -> None
 
 def test_a_driven_mass_follows_its_scheme_and_the_closed_form(engine: Engine) -> None:
     handle = driven_mass(1e-3)[1]
-    scheme: CoupledScheme = "implicit" if engine.name in SPRINGS else "held"
+    scheme: CoupledStepRule = "implicit" if engine.name in SPRINGS else "held"
     expected = drive_mass(COUPLING, MASS, handle, 1e-3, scheme).position
     # PhysX solves its spring in parts of a step, so it lies between the two schemes
     apart = {"physx": 1e-5, "physx_spring": 0.05}.get(engine.name, 1e-12)

@@ -59,7 +59,14 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
 
 
 SQUARES = StabilityMap(
-    "squares", "Map ``squares``: numbers squared.", 6, points, square, summarize, draw, sentences
+    name="squares",
+    doc="Map ``squares``: numbers squared.",
+    default_points=6,
+    points=points,
+    evaluate=square,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
 )
 
 

@@ -201,6 +201,7 @@ WRITERS = {
     "watch": "swing_watch",
     "observer": "passivity_controller",
     "lossless": "lossless",
+    "springs": "springs",
     "timing": "timing",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""

@@ -287,3 +287,12 @@ def test_a_scene_is_passive_in_its_own_hand_at_random(name: str) -> None:
         assert outcome.ticks == 5000
         assert outcome.fault is None, f"seed {seed}: {outcome}"
         assert outcome.environment in {"strict", "within slack"}
+
+
+@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.filterwarnings("ignore:.*stiffer than any:UserWarning")  # these rates are not its own
+def test_the_start_of_every_scene_creates_no_energy_at_any_rate(name: str) -> None:
+    for rate in (250.0, 500.0, 1000.0):
+        with hb.Bridge(name, "simulated", clock=hb.SimulatedClock(), rate=rate) as bridge:
+            summary = bridge.run(duration=0.5)
+        assert (rate, summary.environment, summary.slack_share) == (rate, "strict", 0.0)

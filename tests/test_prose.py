@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import re
 import tokenize
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -48,6 +50,50 @@ def test_no_docstring_comment_or_message_speaks_of_nobody() -> None:
                 for token in tokenize.generate_tokens(file.readline)
                 if token.type in TEXTS and NOBODIES.search(token.string)
             ]
+    assert not offences
+
+
+POINTER = re.compile(r"``([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?``")
+"""Dotted name in a docstring, such as ``law.slack_gains``."""
+
+NOT_OURS = {"mujoco.introspect", "hapticbridge.meta", "hapticbridge.events", "hapticbridge.digest"}
+"""Dotted names that begin like a module here: a module of MuJoCo, and names in a recording."""
+
+MODULES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for path in SOURCES
+]
+
+
+def starts(pointer: str) -> Iterator[tuple[object, list[str]]]:
+    """Yields each module or class that a dotted name may begin with, and the rest of the name."""
+    parts = pointer.split(".")
+    for count in range(len(parts), 0, -1):
+        head = "." + ".".join(parts[:count])
+        yield from (
+            (import_module(name), parts[count:]) for name in MODULES if f".{name}".endswith(head)
+        )
+
+
+def exists(start: object, names: list[str]) -> bool:
+    """Returns True if a module or class has an attribute, which has the next one, and so on."""
+    for name in names:
+        if not hasattr(start, name) and name in getattr(start, "__annotations__", {}):
+            return True  # a field without default
+        start = getattr(start, name, None)
+    return start is not None
+
+
+def test_a_dotted_name_that_begins_with_a_module_exists() -> None:
+    offences = []
+    for path in SOURCES:
+        for line, text in docstrings(ast.parse(path.read_text(encoding="utf-8"))):
+            for pointer in POINTER.findall(text):
+                if pointer in NOT_OURS or pointer.endswith(".md"):
+                    continue
+                found = list(starts(pointer))
+                if found and not any(exists(*start) for start in found):
+                    offences.append(f"{path.relative_to(ROOT)}:{line}: {pointer}")
     assert not offences
 
 

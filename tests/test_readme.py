@@ -73,6 +73,16 @@ def test_shell_commands_are_valid(workplace: Path) -> None:
             assert script.stat().st_mode & 0o111
 
 
+def test_commands_for_a_device_are_valid(workplace: Path) -> None:
+    """Run on a simulated device that no hand holds; what needs the administrator is left out."""
+    for line in "".join(blocks("bash")).splitlines():
+        command = line.replace("NAME", "simulated:hand=none").partition("|")[0]
+        words = shlex.split(command, comments=True)
+        assert words[0] == "hapticbridge"
+        hasty = ["--fast", "--duration", "0.2"] if words[1] == "run" else []
+        assert main(words[1:] + hasty) == 0, line
+
+
 def test_links_and_pictures_exist() -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", README):
         assert (ROOT / target).is_file(), target

@@ -170,6 +170,7 @@ def test_live_line_in_a_file_is_plain_text(ring: Ring, capfd: pytest.CaptureFixt
     recorder.wait_until_ready()
     rows = numbered(0, 101)
     rows["wrench_on_tool"][-1] = (3.0, 0.0, -4.0, 9.0, 9.0, 9.0)
+    rows["wrench_on_device"][-1] = (-0.9, 0.0, 1.2, 0.0, 0.0, 0.0)
     rows["environment_energy"] = -3.4e-3
     rows["device_energy"] = -1.04e-3
     rows["flags"][[5, 9]] = TickFlag.OVERRUN | TickFlag.CONTACT
@@ -177,7 +178,8 @@ def test_live_line_in_a_file_is_plain_text(ring: Ring, capfd: pytest.CaptureFixt
     recorder.close()
     assert capfd.readouterr() == (
         "",
-        "0.1 s  5.0 N  environment -3.4 mJ  device -1.0 mJ  2 overruns\n",
+        "0.1 s  1.5 N on the hand; 5 N on the tool  environment -3.4 mJ  device -1.04 mJ  "
+        "2 overruns\n",
     )
 
 
@@ -209,5 +211,5 @@ def test_live_line_on_a_terminal_is_redrawn_and_may_break() -> None:
         line.update(numbered(0, 2001))
         line.close()
     text = stream.getvalue()
-    assert "2.0 s  0.0 N  environment 0.0 mJ  device 0.0 mJ  0 overruns" in text
+    assert "2.0 s  0 N on the hand  environment 0 J  device 0 J  0 overruns" in text
     assert text.count("\n") <= 2

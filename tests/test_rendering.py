@@ -603,7 +603,8 @@ def test_weld_kicks_a_device_that_bears_the_coupling_asked_for(
     scene.write_text(FREE_MASS.format(mass=1.0).replace("0.01", "0.03"))
     coupling = Coupling(2e4, 0.5, 1.0, 5e-4)
     options: dict[str, Any] = {"limits": FREE, "is_guarded": False}
-    summary = recorded(path, scene, Rotor(), coupling, duration=0.3, method=method, **options)
+    # later the torque passes the limit, which a weld knows nothing of
+    summary = recorded(path, scene, Rotor(), coupling, duration=0.016, method=method, **options)
     report = audit(path)
     assert (summary.verdict, report.verdict) == (verdict, verdict)
     assert report.resimulation == "bit for bit"

@@ -1,4 +1,4 @@
-"""Point mass and rotation: energy, momentum and accuracy of each scheme."""
+"""Point mass and rotation: energy, momentum and accuracy of each rule."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from scipy.integrate import solve_ivp
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
 from hapticbridge.theory.rigid_body import (
-    CoupledScheme,
-    Scheme,
+    CoupledStepRule,
+    StepRule,
     drive_mass,
     exact_mass_response,
     integrate_particle,
@@ -26,7 +26,7 @@ from hapticbridge.theory.rigid_body import (
 
 T = 1e-3
 COUPLING = Coupling(1000, 5, 0, 0)
-ALL: tuple[Scheme, ...] = ("explicit", "semi_implicit", "implicit", "midpoint")
+ALL: tuple[StepRule, ...] = ("explicit", "semi_implicit", "implicit", "midpoint")
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -42,17 +42,17 @@ def size(*terms: NDArray[np.float64]) -> float:
 @given(seeds, st.floats(0.01, 10), st.floats(1e-4, 1e-2), st.floats(-1, 1))
 def test_energy_gain_is_closed(seed: int, mass: float, period: float, velocity: float) -> None:
     force = random_force(seed, 50)
-    for scheme in ALL:
-        motion = integrate_particle(mass, force, period, scheme, velocity=velocity)
+    for rule in ALL:
+        motion = integrate_particle(mass, force, period, rule, velocity=velocity)
         v, gain, kinetic = motion.velocity, motion.energy_gain, motion.kinetic_energy
         rounding = size(kinetic, force * period * np.abs(v).max())
-        if scheme == "implicit":
+        if rule == "implicit":
             expected = -0.5 * mass * np.diff(v) ** 2
             by_force = -(period**2) * force[1:] ** 2 / (2 * mass)
             assert gain == pytest.approx(by_force, rel=1e-9, abs=rounding)
-        elif scheme == "midpoint":
+        elif rule == "midpoint":
             expected = np.zeros(49)
-        elif scheme == "explicit":
+        elif rule == "explicit":
             gain = gain[:-1]  # the last sample's v_{k+1} is not computed
             expected = 0.5 * mass * (v[1:-1] + v[:-2]) ** 2 - mass * v[:-2] * (v[:-2] + v[2:])
         else:
@@ -61,15 +61,15 @@ def test_energy_gain_is_closed(seed: int, mass: float, period: float, velocity: 
         assert gain == pytest.approx(expected, rel=1e-9, abs=rounding)
 
 
-@pytest.mark.parametrize("scheme", ALL)
-def test_map_of_every_scheme_is_the_recursion_it_documents(scheme: Scheme) -> None:
+@pytest.mark.parametrize("rule", ALL)
+def test_map_of_every_rule_is_the_recursion_it_documents(rule: StepRule) -> None:
     force, mass = random_force(1, 20), 0.3
-    motion = integrate_particle(mass, force, T, scheme, position=0.2, velocity=-0.1)
+    motion = integrate_particle(mass, force, T, rule, position=0.2, velocity=-0.1)
     x, v = 0.2, -0.1
     for k in range(1, 20):
         old = v
-        v += T / mass * force[k if scheme in {"implicit", "midpoint"} else k - 1]
-        x += T * {"explicit": old, "midpoint": (old + v) / 2}.get(scheme, v)
+        v += T / mass * force[k if rule in {"implicit", "midpoint"} else k - 1]
+        x += T * {"explicit": old, "midpoint": (old + v) / 2}.get(rule, v)
         assert motion.velocity[k] == pytest.approx(v, rel=1e-12)
         assert motion.position[k] == pytest.approx(x, rel=1e-12)
 
@@ -86,23 +86,23 @@ def test_many_masses_move_at_once_as_they_move_alone() -> None:
     assert driven.position[:, 1, 1] == pytest.approx(single.position, rel=1e-12)
 
 
-def steady_response(scheme: CoupledScheme, mass: float, period: float, hertz: float) -> complex:
-    """X/H of a scheme from its transfer function, without any recursion."""
+def steady_response(rule: CoupledStepRule, mass: float, period: float, hertz: float) -> complex:
+    """X/H of a rule from its transfer function, without any recursion."""
     d = 1 - np.exp(-2j * np.pi * hertz * period)  # 1 − z⁻¹
     k, b = COUPLING.stiffness, COUPLING.damping
     inertial = mass * d**2 / period**2
-    if scheme == "compensated":
+    if rule == "compensated":
         b = max(b - k * period, 0)
     force = k + b / period * d
-    if scheme == "held":
+    if rule == "held":
         inertial /= 1 - d
-    if scheme == "midpoint":
+    if rule == "midpoint":
         inertial *= 2 / (2 - d)
         force -= k * d / 2
     return complex(force / (force + inertial))
 
 
-ERRORS: dict[CoupledScheme, tuple[float, ...]] = {
+ERRORS: dict[CoupledStepRule, tuple[float, ...]] = {
     "held": (0.54, 0.25, 0.12, 0.060, 0.030),
     "implicit": (3.9, 2.4, 1.33, 0.71, 0.37),
     "compensated": (0.41, 0.22, 0.114, 0.058, 0.029),
@@ -111,23 +111,23 @@ ERRORS: dict[CoupledScheme, tuple[float, ...]] = {
 """RMS error over the amplitude in % at T = 4, 2, 1, 0.5, 0.25 ms, by an independent program."""
 
 
-@pytest.mark.parametrize("scheme", ERRORS)
-def test_driven_mass_follows_the_transfer_function_of_its_scheme(scheme: CoupledScheme) -> None:
+@pytest.mark.parametrize("rule", ERRORS)
+def test_driven_mass_follows_the_transfer_function_of_its_rule(rule: CoupledStepRule) -> None:
     mass, hertz = 1.0, 2.0
     time = np.arange(8001) * T
-    motion = drive_mass(COUPLING, mass, np.sin(2 * np.pi * hertz * time), T, scheme)
-    response = steady_response(scheme, mass, T, hertz)
+    motion = drive_mass(COUPLING, mass, np.sin(2 * np.pi * hertz * time), T, rule)
+    response = steady_response(rule, mass, T, hertz)
     expected = np.imag(response * np.exp(2j * np.pi * hertz * time))
     # the transient decays with B/2m = 2.5 per second
     assert motion.position[-500:] == pytest.approx(expected[-500:], abs=1e-6)
 
 
-@pytest.mark.parametrize("scheme", ERRORS)
-def test_accuracy_behind_the_coupling_is_as_the_theory_prints(scheme: CoupledScheme) -> None:
+@pytest.mark.parametrize("rule", ERRORS)
+def test_accuracy_behind_the_coupling_is_as_the_theory_prints(rule: CoupledStepRule) -> None:
     """From rest, 2 s of a 2 Hz sine of amplitude 1, against the closed form with its transient."""
-    for period, percent in zip((4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4), ERRORS[scheme], strict=True):
+    for period, percent in zip((4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4), ERRORS[rule], strict=True):
         time = np.arange(round(2 / period) + 1) * period
-        motion = drive_mass(COUPLING, 1.0, np.sin(4 * np.pi * time), period, scheme)
+        motion = drive_mass(COUPLING, 1.0, np.sin(4 * np.pi * time), period, rule)
         exact = swing_from_rest(time, COUPLING, 1.0)
         error = 100 * np.sqrt(np.mean((motion.position - exact) ** 2))
         # printed to one or two digits: half a unit of the last one
@@ -142,12 +142,12 @@ def last_digit(value: float) -> float:
 def test_only_held_forces_create(seed: int, mass: float, stiffness: float, damping: float) -> None:
     handle = np.cumsum(random_force(seed, 100) * 1e-4)
     coupling = Coupling(stiffness, damping, 0, 0)
-    for scheme in ("implicit", "compensated", "midpoint"):
-        motion = drive_mass(coupling, mass, handle, T, scheme)
+    for rule in ("implicit", "compensated", "midpoint"):
+        motion = drive_mass(coupling, mass, handle, T, rule)
         work = motion.force[1:] * np.diff(motion.position)
         rounding = size(mass * motion.velocity**2, work) + 1e-15
         gain = motion.energy_gain
-        if scheme == "midpoint":
+        if rule == "midpoint":
             assert np.abs(gain).max() <= rounding
         else:
             lost = -0.5 * mass * np.diff(motion.velocity) ** 2
@@ -188,13 +188,13 @@ def test_midpoint_keeps_energy_and_momentum_over_ten_seconds_of_tumbling() -> No
     assert drift <= 1e-9 * np.linalg.norm(momentum[0])
 
 
-@pytest.mark.parametrize(("scheme", "order"), [("midpoint", 2), *((s, 1) for s in ALL[:3])])
-def test_error_against_dop853_falls_with_order_of_scheme(scheme: Scheme, order: int) -> None:
+@pytest.mark.parametrize(("rule", "order"), [("midpoint", 2), *((s, 1) for s in ALL[:3])])
+def test_error_against_dop853_falls_with_order_of_rule(rule: StepRule, order: int) -> None:
     omega = np.array([3.0, 8.0, -4.0])
     expected_rate, expected_turn = reference(INERTIA, omega, 1.0)
     errors = []
     for steps in (4000, 8000):
-        motion = integrate_rotation(INERTIA, omega, 1 / steps, steps, scheme)
+        motion = integrate_rotation(INERTIA, omega, 1 / steps, steps, rule)
         turn = matrix(motion.orientation[-1])
         rate_error = np.linalg.norm(motion.angular_velocity[-1] - expected_rate)
         errors.append((rate_error, np.linalg.norm(turn - expected_turn)))
@@ -211,14 +211,14 @@ def test_error_against_dop853_falls_with_order_of_scheme(scheme: Scheme, order: 
 def test_balance_is_closed(inertia: tuple[float, ...], omega: tuple[float, ...], seed: int) -> None:
     period, steps = 1e-3, 20
     torque = np.random.default_rng(seed).normal(0, 5, (steps + 1, 3)) * min(inertia)
-    for scheme in ALL:
-        motion = integrate_rotation(inertia, omega, period, steps, scheme, torque=torque)
+    for rule in ALL:
+        motion = integrate_rotation(inertia, omega, period, steps, rule, torque=torque)
         w = motion.angular_velocity
-        acting = torque[1:] if scheme in {"implicit", "midpoint"} else torque[:-1]
+        acting = torque[1:] if rule in {"implicit", "midpoint"} else torque[:-1]
         mover = {"explicit": w[:-1], "semi_implicit": w[:-1], "implicit": w[1:]}
-        work = period * np.sum(acting * mover.get(scheme, (w[1:] + w[:-1]) / 2), axis=1)
+        work = period * np.sum(acting * mover.get(rule, (w[1:] + w[:-1]) / 2), axis=1)
         second_order = 0.5 * np.sum(motion.inertia * np.diff(w, axis=0) ** 2, axis=1)
-        sign = {"implicit": -1, "midpoint": 0}.get(scheme, 1)
+        sign = {"implicit": -1, "midpoint": 0}.get(rule, 1)
         gain = np.diff(motion.kinetic_energy) - work
         rounding = 1e-12 * (motion.kinetic_energy.max() + np.abs(work).max())
         assert gain == pytest.approx(sign * second_order, rel=1e-9, abs=rounding)
@@ -226,13 +226,13 @@ def test_balance_is_closed(inertia: tuple[float, ...], omega: tuple[float, ...],
 
 def test_torque_about_a_principal_axis_spins_up_at_a_constant_rate() -> None:
     torque = np.tile([0, 0, 2e-3], (1001, 1))
-    for scheme in ALL:
-        motion = integrate_rotation(INERTIA, [0, 0, 1], 1e-3, 1000, scheme, torque=torque)
+    for rule in ALL:
+        motion = integrate_rotation(INERTIA, [0, 0, 1], 1e-3, 1000, rule, torque=torque)
         assert motion.angular_velocity[-1, 2] == pytest.approx(1 + 2e-3 / INERTIA[2], rel=1e-12)
         angle = 2 * np.arctan2(motion.orientation[-1, 3], motion.orientation[-1, 0])
-        # first-order schemes are off by half a step of the change in rate: T/2 · 0.44 rad/s
+        # first-order rules are off by half a step of the change in rate: T/2 · 0.44 rad/s
         exact = 1 + 1e-3 / INERTIA[2]
-        assert angle == pytest.approx(exact, abs=1e-6 if scheme == "midpoint" else 3e-4)
+        assert angle == pytest.approx(exact, abs=1e-6 if rule == "midpoint" else 3e-4)
 
 
 def test_many_bodies_turn_at_once_as_they_turn_alone() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE
-from view_cases import FLOOR, pressed
+from view_cases import AT_ONCE, FLOOR, pressed
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -84,6 +84,7 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
         on_tick=look,
         observer=watcher,
         pipelined=pipelined,
+        limits=AT_ONCE,
     )
     assert len(sights) == 28  # of 900 ticks, one in 33
     assert summary.dropped == 0  # it frees no record

@@ -7,6 +7,8 @@ from pathlib import Path
 from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE
 
+from hapticbridge.guard import Limits
+
 FLOOR = """<mujoco model="floor">
   <option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>
   <statistic center="0 0 0" extent="0.2"/>
@@ -22,6 +24,10 @@ FLOOR = """<mujoco model="floor">
 </mujoco>"""
 
 
+AT_ONCE = Limits(force=10.0, torque=0.5, ramp=0.0)
+"""No rise at the start, in which the handle would follow only a part of the motion."""
+
+
 def pressed(tick: int) -> tuple[float, ...]:
     """A hand that moves aside and down."""
     return (min(1e-4 * tick, 0.04), 0, max(-1e-4 * tick, -0.012), 1, 0, 0, 0)
@@ -31,5 +37,5 @@ def pressed_floor(folder: Path) -> Path:
     """Records a ball that is moved aside and pressed onto a floor, and held there."""
     scene, path = folder / "floor.xml", folder / "floor.mcap"
     scene.write_text(FLOOR)
-    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5)
+    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5, limits=AT_ONCE)
     return path

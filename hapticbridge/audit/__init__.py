@@ -3,9 +3,9 @@
 Read ``verdict`` first; its function decide() alone calls a run passive, active or invalid. The
 audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
 (``energy``), checks the wrench against the coupling law (``motion``) and the guard's limits
-(``wrench_limits``), and simulates the scene again (``replay``). ``state`` is carried from block to
-block, ``events`` reads external actions during the run, ``report`` holds the result, ``batch``
-audits folders. ``ask`` is the public entry point.
+(``wrench_limits``), the time that the run kept (``timing``), and simulates the scene again
+(``replay``). ``state`` is carried from block to block, ``events`` reads external actions during the
+run, ``report`` holds the result, ``batch`` audits folders. ``ask`` is the public entry point.
 """
 
 from typing import TYPE_CHECKING

@@ -60,7 +60,7 @@ def released_by_coupling(parameters: RunParameters, gains: Array, motion: Motion
 
         E_d + (s/scale) [Σ w_k + V(e_k)] <= 0
 
-    for every hand and tool if b >= K T/2 + B: the identity behind (6), with V(e) at the end on the
+    for every hand and tool if b >= K T/2 + B': the identity behind (6), with V(e) at the end on the
     left. V is the energy of a spring whose force stops growing at the force level. It holds at any
     share r, because the handle moves by r times the device's motion where the device gets r times
     the force. An excess above zero is the fault of the port ``device``.
@@ -89,7 +89,7 @@ class EnergyBalance:
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
-        slack: Σ ½ (K + B/T) ‖δx‖² + ½ (K_r + B_r/T) ‖δφ‖², (n,) in J.
+        slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖², (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation and the energy
             released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
             per tick. With a coupling law, energy created by the environment is not included; it
@@ -126,19 +126,10 @@ class EnergyBalance:
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
         totals |= _device_energies(block, events, delay)
-        released, lost = coupling_work, created  # without a law all energy in the scene counts
-        if parameters.has_law:
-            # with a delay the device is elsewhere, and only the energy given so far counts
-            if not delay:
-                released = coupling_work + released_by_coupling(parameters, gains, motion)
-            # energy that the environment created belongs to the other port
-            lost = np.minimum(created, 0.0)
-        excess = np.zeros(len(ticks))
-        if parameters.device_damping is not None and (
-            not parameters.has_law or parameters.law_evaluations == 1
-        ):
-            excess = totals["delayed_device_energy"] - totals["device_dissipation"]
-            excess = excess + parameters.force_scale / parameters.scale * (lost + released)
+        in_springs: Array | float = 0.0  # with a delay the device is elsewhere
+        if parameters.has_law and not delay:
+            in_springs = released_by_coupling(parameters, gains, motion)
+        excess = _device_excess(parameters, totals, created, in_springs)
         return cls(
             coupling_work=coupling_work,
             throughput=totals["throughput"],
@@ -149,6 +140,19 @@ class EnergyBalance:
             excess_device_energy=excess,
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
+
+
+def _device_excess(
+    parameters: RunParameters, totals: dict[str, Array], created: Array, in_springs: Array | float
+) -> Array:
+    """Returns ``EnergyBalance.excess_device_energy``, (n,) in J."""
+    if parameters.device_damping is None or (parameters.has_law and parameters.law_evaluations > 1):
+        return np.zeros(len(created))
+    # with a law, energy that the environment created belongs to the other port
+    lost = np.minimum(created, 0.0) if parameters.has_law else created
+    released = totals["coupling_work"] + in_springs
+    excess = totals["delayed_device_energy"] - totals["device_dissipation"]
+    return np.asarray(excess + parameters.force_scale / parameters.scale * (lost + released))
 
 
 def _summed(values: Array, before: float) -> Array:
@@ -198,9 +202,9 @@ def _device_motion(rows: NDArray[np.void], first: int, count: int) -> tuple[Arra
 
 
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
-    """Returns K + B/T and K_r + B_r/T of the coupling, (n,) each.
+    """Returns K + B'/T and K_r + B'_r/T of the law, (n,) each.
 
-    With n laws per tick only half of K/n + B/T counts; without a coupling law both are 0.
+    With n laws per tick only half of K/n + B'/T counts; without a coupling law both are 0.
     """
     if not parameters.has_law:
         return np.zeros(len(gains)), np.zeros(len(gains))

@@ -132,7 +132,7 @@ class Resimulator:
         data: Its state after the last simulated tick.
         binding: The kernel's state bound to both.
         done: Number of simulated ticks.
-        is_over: True after a sample or result that is not finite; nothing follows.
+        is_over: True after a tick that was refused; nothing follows.
 
     Raises:
         RecordingError: The attachments contradict the metadata, so the file was changed.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
-from hapticbridge.summary import was_never_lossless, watch_sentence
+from hapticbridge.summary import Environment, was_never_lossless, watch_sentence
 from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
@@ -136,9 +136,22 @@ def _first(
 # Decision
 
 
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Verdict and its reason; the fields are those of ``AuditReport``."""
+
+    verdict: Literal["passive", "active", "invalid"]
+    environment: Environment | None
+    reason: str
+    tick: int | None = None
+    port: str = ""
+    joules: float = 0.0
+    slack_share: float = 0.0
+
+
 def decide(
     fault: Fault | None, energies: PassivityTally | None, *, gap: Fault | None, strict: bool
-) -> dict[str, Any]:
+) -> Decision:
     """Decides between ``passive``, ``active`` and ``invalid``.
 
     Args:
@@ -146,64 +159,38 @@ def decide(
         energies: Energies of a recording without a fault.
         gap: Missing check without which a recording is not called passive, or None.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
-
-    Returns:
-        The fields of ``AuditReport`` that hold the verdict and its reason.
     """
     if fault is None and energies is not None and energies.is_passive(strict=strict):
         fault = gap
     if fault is not None or energies is None:
         fault = fault or Fault("the recording holds no tick")
-        return {
-            "verdict": "invalid",
-            "environment": None,
-            "reason": fault.reason,
-            "tick": fault.tick,
-            "port": fault.port,
-            "joules": fault.joules,
-        }
+        return Decision("invalid", None, fault.reason, fault.tick, fault.port, fault.joules)
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
     if excess is not None and not (active is not None and active[0] <= excess[0]):
         tick, joules = excess
-        return {
-            "verdict": "active",
-            "environment": "within slack" if unstrict else "strict",
-            "reason": f"from tick {tick} the device received {format_energy(joules)} more than its "
-            "damping dissipated and scene and coupling released",
-            "tick": tick,
-            "port": "device",
-            "joules": joules,
-            "slack_share": energies.slack_share,
-        }
+        reason = (
+            f"from tick {tick} the device received {format_energy(joules)} more than its damping "
+            "dissipated and scene and coupling released"
+        )
+        other: Environment = "within slack" if unstrict else "strict"
+        return Decision("active", other, reason, tick, "device", joules, energies.slack_share)
     if unstrict is None:
-        # rounding may leave it above zero; + 0.0 removes the sign of zero
+        # rounding may leave it above zero
         lost = format_energy(max(-energies.energies["environment_energy"], 0.0))
-        return {
-            "verdict": "passive",
-            "environment": "strict",
-            "reason": f"the environment never gave out more than it got ({lost} dissipated)",
-        }
+        reason = f"the environment never gave out more than it got ({lost} dissipated)"
+        return Decision("passive", "strict", reason)
+    share = energies.slack_share
     if active is None and not strict:
-        return {
-            "verdict": "passive",
-            "environment": "within slack",
-            "reason": "energy was created at times, within the slack that the coupling leaves "
-            f"({energies.slack_share:.0%} of it used)",
-            "slack_share": energies.slack_share,
-        }
-    (tick, joules), limit = (
-        active or unstrict,
-        "its slack" if active else "zero, the strict limit,",
-    )
-    return {
-        "verdict": "active",
-        "environment": "active" if active else "within slack",
-        "reason": f"from tick {tick} the environment exceeds {limit} by {format_energy(joules)}",
-        "tick": tick,
-        "port": "environment",
-        "joules": joules,
-        "slack_share": energies.slack_share,
-    }
+        reason = (
+            "energy was created at times, within the slack that the coupling leaves "
+            f"({share:.0%} of it used)"
+        )
+        return Decision("passive", "within slack", reason, slack_share=share)
+    tick, joules = active or unstrict
+    limit = "its slack" if active else "zero, the strict limit,"
+    reason = f"from tick {tick} the environment exceeds {limit} by {format_energy(joules)}"
+    state: Environment = "active" if active else "within slack"
+    return Decision("active", state, reason, tick, "environment", joules, share)
 
 
 # Audit of one file
@@ -250,7 +237,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     # without a simulation again, some methods leave a wrench that no other computation covers
     is_checked = outcome.has_run or not facts.get("unchecked")
     gap = None if is_checked else Fault(outcome.agreement)
-    found = decide(fault, energies, gap=gap, strict=strict)
+    found = asdict(decide(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY

@@ -171,14 +171,14 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     yield _wrench_deviation(block, parameters)
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)
     guarding = parameters.guarding
-    for name, most in (
+    for name, limit in (
         ("injected_damping", guarding.max_damping),
         ("injected_rotational_damping", guarding.max_rotational_damping),
     ):
         damping, unit = ticks[name], UNITS[name]
         yield Deviation(name, np.where(is_active, 0.0, np.abs(damping)), 0.0, unit, "flags")
-        beyond = np.maximum(damping - most, -damping)
-        yield Deviation(name, beyond, TOLERANCE * (1 + most), unit, "the controller's limits")
+        beyond = np.maximum(damping - limit, -damping)
+        yield Deviation(name, beyond, TOLERANCE * (1 + limit), unit, "the controller's limits")
 
 
 def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviation]:
@@ -216,7 +216,10 @@ def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviati
     """Compares the wrench on the device with the share of the wrench on the tool."""
     ticks = block.ticks
     axes = np.array(parameters.axes).reshape(3, 3)
-    wrench = -parameters.force_scale * ticks["share"][:, None] * ticks["wrench_on_tool"]
+    on_tool = ticks["wrench_on_tool"].copy()
+    for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
+        on_tool[:, part] = _shortened(on_tool[:, part], limit)  # on the tool too with a law
+    wrench = -parameters.force_scale * ticks["share"][:, None] * on_tool
     expected = np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )

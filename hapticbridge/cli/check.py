@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_HEADINGS = ("alone", "cost", "JND", "force, RMS", "peak", "torque, RMS", "tool off by")
+_HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RMS", "tool off by")
 """Headings of the table of trials. JND is the felt error in just noticeable differences."""
 
 _ROUNDING = 1e-9  # N and N m; what is below is how the computer adds

@@ -43,7 +43,7 @@ class Devices:
         out.print("[bold]supported[/bold]")
         for driver in all_drivers():
             out.print(f"{driver.name}: {plain(driver.about)}")
-            out.print(f"  axes {driver.axes}; force {driver.force}; rate {driver.rate}")
+            out.print(f"  axes {driver.axes}; force on the hand {driver.force}; rate {driver.rate}")
             if driver.on_stall:
                 out.print(f"  if this machine stands still: {plain(driver.on_stall)}")
             if driver.medium is not None:
@@ -65,7 +65,9 @@ class Devices:
             )
         elif usable:
             specification = _specification(usable[0], plugged)
-            out.print(f"next: hapticbridge run peg_in_hole --device {specification}")
+            out.print(
+                f"next: hapticbridge run peg_in_hole --device {specification} --force-limit 2"
+            )
         return 0
 
 

@@ -34,7 +34,7 @@ from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, load_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.summary import Summary, is_always_implicit
+from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
 
 if TYPE_CHECKING:
@@ -53,6 +53,12 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
         err.print(f"  {sentence}")
+    coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
+    if coarse:
+        err.print(
+            f"  the tool has {coarse}: its springs are followed to first order in T only; without "
+            "it, or at a higher --rate, the error falls"
+        )
     usual = default_method()
     if is_method_chosen and method != usual:
         err.print(f"  {method.name}: {escape(method.about)}")
@@ -109,14 +115,6 @@ def announce_measured(bridge: Bridge) -> None:
 _WELD = "the weld in its stiffest directions at the start"
 
 
-def _print_faults(summary: Summary) -> None:
-    if summary.watch:
-        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
-    if summary.fault is not None:
-        tick, port = summary.fault
-        out.print(f"from tick {tick} on, at port {port}")
-
-
 def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = True) -> None:
     """Prints what a run was, whether the device bears it, and what to do next.
 
@@ -142,9 +140,13 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
         if joules:  # exactly 0 without motors or springs
             table.add_row(name.replace("_", " "), format_energy(joules))
     out.print(table)
+    tick, port = summary.fault or (0, "")
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
-    out.print(f"environment [bold]{summary.verdict}[/bold] ({summary.environment}{used})")
-    _print_faults(summary)
+    since = f", from tick {tick} on" if port else ""
+    words = f"[bold]{summary.verdict}[/bold] ({port or summary.environment})"
+    out.print(f"{words}{since}{used}")
+    if summary.watch:
+        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     _print_coupling(summary.coupling)
@@ -182,7 +184,8 @@ def _print_certificate(summary: Summary, law_evaluations: int, *, has_hand: bool
         and law_evaluations == 1
     ):
         judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
-        out.print(f"the device's port is not proven, nor metered while it runs: {judge} it")
+        out.print("no verdict is given on the device's port during the run; only the energy limit")
+        out.print(f"watches it; {judge} it")
 
 
 def _print_coupling(coupling: RunCoupling) -> None:
@@ -198,7 +201,8 @@ def _print_coupling(coupling: RunCoupling) -> None:
 class Run:
     """Put a scene behind a haptic device and feel it.
 
-    Ctrl-C stops cleanly: zero force first, then the recording is closed.
+    Ctrl-C ends the run in order: zero force first, then the recording is closed. The exit code is
+    then 0, or 1 after an active run or on a device that is not certified.
 
     Example:
         hapticbridge run peg_in_hole --duration 8 --record run.mcap
@@ -208,9 +212,10 @@ class Run:
         "scene",
         "settings",
         "device",
+        "force_limit",
+        "dead_man",
         "duration",
         "record",
-        "overwrite",
         "fast",
         "stiffness",
         "damping",
@@ -231,8 +236,8 @@ class Run:
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
     duration: float | None = None
-    """Duration in s; missed deadlines count, so that each makes the ticks one less. By default the
-    run ends with the device's motion, or with Ctrl-C."""
+    """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
+    default the run ends with the device's motion, or with Ctrl-C."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False

@@ -233,8 +233,14 @@ class Device(Protocol):
     """Source of the handle's motion and sink of the wrench.
 
     The loop calls ``start`` once, then ``read`` and later ``write`` in each tick, and finally
-    ``close``. The sample of tick k is the state at time k · period. A wrench written in tick k acts
-    until the next write.
+    ``close``. The sample of tick k is the device's state at the time k · period, so the first
+    ``read`` returns the pose of ``start`` if the device has not moved. A wrench written in tick k
+    acts until the next write. No call may block the loop for longer than a fraction of the period:
+    a slow transport reads in a thread of its own, and ``read`` returns its newest sample.
+
+    An object with these calls can be given to a ``Bridge``. To select it by a name, write a module
+    with a ``driver.Driver`` and add it to ``registry.DRIVERS``; ``tests/test_device_contract.py``
+    then tests it.
 
     A whole device, a handle on a rail in a hand that swings it::
 
@@ -249,16 +255,20 @@ class Device(Protocol):
             )
 
             def start(self, period):
-                self.period, self.time, self.velocity, self.force = period, 0.0, 0.0, 0.0
+                self.period, self.tick = period, 0
+                self.position = self.velocity = self.force = 0.0
                 sample = np.zeros(1, hb.SAMPLE_DTYPE)
                 sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
                 return sample
 
             def read(self, sample):
-                self.time += self.period
-                pull = 0.3 * math.cos(6.0 * self.time) + self.force
-                self.velocity += self.period * (pull - 2.0 * self.velocity) / 0.6
-                sample["position"][0, 0] += self.period * self.velocity
+                if self.tick > 0:  # the first sample is the state at the start
+                    pull = 0.3 * math.cos(6.0 * self.tick * self.period) + self.force
+                    self.velocity += self.period * (pull - 2.0 * self.velocity) / 0.6
+                    self.position += self.period * self.velocity
+                self.tick += 1
+                sample["position"][0] = self.position, 0.0, 0.0
+                sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
                 return 0
 
             def write(self, wrench):
@@ -290,16 +300,17 @@ class Device(Protocol):
         """
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Writes the newest sample.
+        """Writes the newest sample, without waiting for one.
 
         Args:
-            sample: Output, shape (1,), ``SAMPLE_DTYPE``.
+            sample: Output, shape (1,), ``SAMPLE_DTYPE``. It belongs to the loop: write every field,
+                do not read it, and keep no reference.
 
         Returns:
             0 for a new sample; ``TickFlag.STALE_SAMPLE`` if the sample repeats the last one.
 
         Raises:
-            DeviceLost: The device is gone, or silent for too long.
+            DeviceLost: The device is gone, or silent for too long (``hapticbridge.DeviceLost``).
         """
 
     def write(self, wrench: NDArray[np.float64]) -> None:

@@ -1,4 +1,4 @@
-"""Records of supported and connected devices."""
+"""Descriptions of supported and connected devices."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ The wall holds one axis at its position x_0 at the start of the trial,
     F_k = −K (x_k − x_0) − (B/T)(x_k − x_{k−1}),
 
 and a short push sets it swinging. If the swing decays, the device bears the wall. If it grows, or
-stays as a limit cycle, device and wall together generate energy. K rises until that happens and is
+stays as a limit cycle, device and wall together create energy. K rises until that happens and is
 then bisected.
 """
 

@@ -92,8 +92,9 @@ _PROPERTIES = {
 
 
 OK, BAD_SAMPLE, BAD_RESULT, HALF_DONE, RING_FULL = 0, 1, 2, 3, 4
-"""Results of the tick's stages: success; a sample that is not finite; a simulation result that is
-not finite; success with only the second half of MuJoCo's step left to do; no room in the ring."""
+"""Results of the tick's stages: success; a sample that is not a pose; a simulation result that is
+not finite or of which MuJoCo warned; success with only the second half of MuJoCo's step left to do;
+no room in the ring."""
 
 JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 """Reasons of the guard to refuse a tick: the device's pose jumped; time ran backwards; the coupling

@@ -12,9 +12,7 @@ Massless: the tool is placed at the handle and pushed back by one frictionless s
 with p the penetration in m, n the contact's normal, K_c the contact stiffness in N/m. The tool has
 no mass, so the hand's wrench on it is minus the sum of the contacts' wrenches.
 
-A method with a scheme that exists is registered in ``hapticbridge.lab.methods`` alone. A new scheme
-needs a number and its properties in ``codes``, and here its branch in ``drive_compared`` and
-``compared_wrench``; all else is in its ``rendering.Method``.
+``lab.methods`` has the recipe for another method.
 """
 
 from __future__ import annotations

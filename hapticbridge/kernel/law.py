@@ -6,7 +6,8 @@ With e = h − x and φ the rotation vector from tool to handle, the wrench on t
 
 K in N/m, B' in N s/m, K_r in N m/rad, B'_r in N m s/rad; h and x are the positions of handle and
 tool in m, δ their steps within the time T in s. The six actuators of the scene evaluate this law
-inside MuJoCo's step; the functions here evaluate it afterwards, at the poses that resulted.
+inside MuJoCo's step; ``law_wrench`` evaluates it afterwards, at the poses that resulted. The two
+agree because the actuators are implicit: MuJoCo solves them at the end of the step.
 
 A change of the gains during a run, and an axis without motor, move the handle's end of the spring
 without the device: it slips. With gains that change from tick to tick, the identity behind Brown &
@@ -66,9 +67,9 @@ GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
 time step in s."""
 
 SLACK_SHARE = 0.5
-"""Share of ½ (K + nB/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick; no
-unit. A larger share needs more device damping (infinite at 1 and B = 0); with a smaller share an
-environment counts as active sooner."""
+"""Share of ½ (K + nB'/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick;
+no unit. With substeps only half of the slack may be used, because the whole would require infinite
+device damping at B' = 0. With a smaller share an environment counts as active sooner."""
 
 TUNED = (
     "stiffness",
@@ -115,12 +116,12 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
 
     δx_k and δφ_k are the tool's motion in tick k, in m and rad. Without a coupling law (a weld, a
     tool without mass) both gains are 0, because the proof of a slack needs a law. With one
-    evaluation of the law per tick g = K + B/T.
+    evaluation of the law per tick g = K + B'/T.
 
-    With n > 1 evaluations g = ½ (K/n + B/T). The whole slack ½ (K + nB/T) ‖δx_i‖² of each
-    evaluation i would require infinite device damping at B = 0; half of it does not
-    (``certificate.required_damping``). A record holds only δx_k, the sum of all δx_i. For a given
-    sum the slack is least if all δx_i are equal, so that g bounds it from below.
+    With n > 1 evaluations g = ½ (K/n + B'/T), which is the ``SLACK_SHARE`` of each evaluation's
+    slack ½ (K + nB'/T) ‖δx_i‖² (``certificate.required_damping``). A record holds only δx_k, the
+    sum of all δx_i. For a given sum the slack is least if all δx_i are equal, so that g bounds it
+    from below.
     """
     if not parameters.has_law:
         return 0.0, 0.0

@@ -6,6 +6,23 @@ S is the energy that the scene stores, f and τ the coupling's wrench on the too
 tool's motion in tick k; energies and works in J, wrenches in N and N m, motions in m and rad.
 Σ E_k <= 0 means that the simulation created no energy. It is eq. (14) of Brown & Colgate (1997),
 in short (14).
+
+The accounts of energy, all in J; q = force_scale / scale:
+
+| account                       | formula                                | used by         |
+|-------------------------------|----------------------------------------|-----------------|
+| ``environment_energy``        | Σ E_k                                  | verdict         |
+| ``slack``                     | Σ ½ g ‖δx‖² + ½ g_r ‖δφ‖²              | verdict         |
+| ``device_energy``             | Σ w·δp, given to the device            | summary         |
+| device without a law          | Σ w·δp − b ‖δp‖²/t + q (S − S_0 − W)   | verdict         |
+| observer, ``observed_energy`` | as above, with its credit capped       | ``damper``      |
+| observer, ``created_energy``  | Σ E_k − slack, with its credit capped  | ``environment`` |
+| observer, ``guarded_energy``  | Σ w·δp − b ‖δp‖²/t + q min(S − S_0, 0) | energy limit    |
+| audit, device port            | ``audit.energy.released_by_coupling``  | its verdict     |
+
+``damper`` and ``environment`` are the passivity controllers. w is the wrench on the device, δp
+its motion, b its damping, t the time between two new samples, W the work of the scene's actuators
+and of external forces.
 """
 
 from __future__ import annotations
@@ -148,13 +165,11 @@ def mocap_work(s: State) -> float:
 
     λ_i is the force of constraint row i in the step that follows the move, δr_i the change of its
     residual by the move: an equality's error, a tendon's length or a contact's distance. Rows
-    without a residual (friction, also in contacts) take no work from the move. MuJoCo gives a mocap
-    body no velocity, so it drags nothing along.
+    without a residual (friction, also in contacts) take no work from the move.
 
-    For that reason the damper of such a row acts against rest, not against the mocap body. Slow
-    moves are exact (a lift costs m g h). A fast move through a weld or a contact lags, and energy
-    that the row supplies beyond λ δr counts as generated. The verdict may then be active, which is
-    right: MuJoCo's constraint is active.
+    Slow moves are exact (a lift costs m g h). MuJoCo treats a moved mocap body as standing still,
+    so its constraint dampers resist the motion and may supply energy. That energy counts as created
+    by the simulation.
     """
     mj = s.mj
     force = floats(pointer_at(mj.efc_force), ints(mj.nefc, 1)[0])
@@ -354,9 +369,9 @@ def meter_ports(s: State) -> None:
 # Storage, the ports of coupling and device, and the verdict
 
 ENERGY_TOLERANCE = 1e-9
-"""Energy in J, and share of Σ|f·δx|, that an environment may generate and still count as strict.
-It covers the rounding of a sum of many small works. A larger value hides real generation, a smaller
-one reports rounding."""
+"""Energy in J, and share of Σ|f·δx|, that an environment may create and still count as strict. It
+covers the rounding of a sum of many small works. A larger value hides energy that was created, a
+smaller one reports rounding."""
 
 
 @compiled
@@ -432,8 +447,8 @@ def close_balance(s: State) -> bool:
 
         slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
 
-    g in N/m and g_r in N m/rad are those of ``coupling.slack_gains``: K + B/T and K_r + B_r/T
-    with one evaluation of the law per tick.
+    g in N/m and g_r in N m/rad are those of ``law.slack_gains``: K + B'/T and K_r + B'_r/T with
+    one evaluation of the law per tick.
 
     Returns:
         True if the balance is finite.

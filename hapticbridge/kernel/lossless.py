@@ -15,11 +15,14 @@ storage in J. The next step applies
 so that the bias acts at v where MuJoCo evaluates it at u. Forces that the user applies enter as the
 mean of their present and previous values.
 
-In contact, half a wrench that is one step late would generate energy. The tool therefore changes to
+In contact, half a wrench that is one step late would create energy. The tool therefore changes to
 the implicit form before it touches, and back after it has been free for ``HOLDOFF`` ticks. Both
-changes keep S. B' is equal on both sides, so one device condition covers both. With a larger B' in
-contact, a device that bears only the smaller one would be thrown off forever
+changes keep S. B' is equal on both sides, so one device condition covers both. If B' were larger in
+contact, a device with just enough damping for free motion would bounce off the wall again and again
 (``theory.compensation``).
+
+Springs and dampers of the tool's joints and tendons are taken at the midpoint too
+(``kernel.springs``).
 
 Kinematic trees other than the tool's belong to MuJoCo alone: for them v = u.
 """
@@ -54,10 +57,20 @@ from hapticbridge.kernel.mujoco_c import (
     mj_com_vel,
     mj_factor_m,
     mj_mul_m,
-    mj_passive,
     mj_rne,
     mj_solve_m,
     pointer_at,
+)
+from hapticbridge.kernel.springs import (
+    add_rest,
+    begin_springs,
+    bind_springs,
+    carry_springs,
+    evaluate_passive,
+    note_rest,
+    note_solved,
+    restore_springs,
+    share_springs,
 )
 from hapticbridge.pose import (
     Quaternion,
@@ -116,7 +129,7 @@ LOSSLESS_DTYPE = np.dtype(
 
 Addresses of vectors over the degrees of freedom come first. ``is_midpoint`` and ``was_midpoint``
 are the form of the next and of the last step; ``holdoff`` counts the ticks until the tool may be
-lossless again; ``energy_debt`` in J is generated energy that is still to be taken back; ``twist``
+lossless again; ``energy_debt`` in J is created energy that is still to be taken back; ``twist``
 in rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
 
 # The velocity v at which a lossless step's energy is balanced, and the force carried over
@@ -188,6 +201,7 @@ def write_half_step(s: State) -> None:
         impulse[i] = 2.0 * carried[i] - bias[i] + external[i]
         if lossless.has_passive:
             impulse[i] += passive[i]
+    add_rest(s, impulse)
     mj_solve_m(mj.model, mj.data, lossless.half_step, lossless.work_buffer, np.int32(1))
     in_tree = ints(lossless.dof_in_tree, mj.nv)
     for i in range(mj.nv):
@@ -204,6 +218,7 @@ def keep_carried(s: State) -> None:
     in_tree = ints(lossless.dof_in_tree, mj.nv)
     for i in range(mj.nv):
         own[i] = in_tree[i] * (carried[i] + at_u[i] - at_v[i])
+    carry_springs(s, own, in_tree)
 
 
 @compiled
@@ -213,7 +228,8 @@ def balance_midpoint(s: State) -> None:
     write_bias(s, mj.qvel, lossless.bias_at_u)
     write_external(s, lossless.external)
     if lossless.has_passive:
-        mj_passive(mj.model, mj.data)
+        evaluate_passive(s)
+        note_rest(s)
     write_half_step(s)
     v, u, half = (
         floats(lossless.velocity, mj.nv),
@@ -228,7 +244,7 @@ def balance_midpoint(s: State) -> None:
 
 @compiled
 def balance(s: State) -> None:
-    """Takes the kinetic energy at v, and takes generated energy back from the tool's motion."""
+    """Takes the kinetic energy at v, and takes created energy back from the tool's motion."""
     lossless = s.lossless
     mj = s.mj
     v = floats(lossless.velocity, mj.nv)
@@ -245,7 +261,7 @@ def balance(s: State) -> None:
 
 @compiled
 def _take_back(s: State, kinetic: float, own: float) -> float:
-    """Slows the tool by the energy that the lossless form generated, so that (14) holds.
+    """Slows the tool by the energy that the lossless form created, so that (14) holds.
 
     If inertia and Jacobian turn, the form keeps S to third order only: 1e-10 J per tick at the
     speed of a hand. That is 1e-7 of the tool's kinetic energy, and leaves the order unchanged.
@@ -348,7 +364,7 @@ def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
         Force, torque, and the tool's motion and rotation vector in the step.
     """
     lossless = s.lossless
-    lossless.is_near = is_near(s)
+    lossless.is_near = scan_contacts(s)
     lossless.was_midpoint = lossless.is_midpoint
     lossless.ticks += lossless.was_midpoint
     if not lossless.is_midpoint:
@@ -356,6 +372,7 @@ def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
         if s.level.share[0] < 1.0 or s.level.share[1] < 1.0 or s.level.flags:
             lossless.is_near = True
         return force, torque, moved, turned
+    note_solved(s)
     handle_frame = quaternion_of(s.pose.handle_quaternion)
     half = applied_wrench(s, 0.5)
     half_force, half_torque = rotated(handle_frame, half[0]), rotated(handle_frame, half[1])
@@ -391,16 +408,17 @@ sooner and longer.
 A change only when the next step would have a contact force, predicted from distance and approach
 speed, errs less: tapping on a wall at 4 Hz 0.25 of the implicit form instead of 0.31, at 1 Hz 0.35
 instead of 0.50. It uses more slack: a peg led into its hole 1.4 % instead of 0.9 %, and 2 of 20
-hands on a planar peg (0 of another 100) 0.01 % instead of none. The strict variant was chosen after
-both had been seen."""
+hands on a planar peg (0 of another 100) 0.01 % instead of none. The fixed distance is less accurate
+but created no energy."""
 
 
 @compiled
-def is_near(s: State) -> bool:
-    """Returns True if the step saw the tool near a contact, in contact, or at a joint's limit.
+def scan_contacts(s: State) -> bool:
+    """Counts contacts with a force, and notes if a constraint force acted on the tool's tree.
 
-    Contacts within ``REACH`` exist without a force, because the geoms' gap includes them. Also
-    notes whether a constraint force acted on the tool's tree, and counts contacts with a force.
+    Returns:
+        True if the step saw the tool near a contact, in contact, or at a joint's limit. Contacts
+        within ``REACH`` exist without a force, because the geoms' gap includes them.
     """
     mj = s.mj
     lossless = s.lossless
@@ -437,33 +455,47 @@ class ToolTree:
 
     Attributes:
         dofs: True for each degree of freedom of the model in the tree.
+        bodies: True for each body in the tree.
         joints: True for each joint in the tree.
         geoms: True for each geom in the tree.
+        tendons: True for each tendon that pulls on the tree by a spring or a damper.
         is_never_free: True if joint friction, an equality constraint, a tendon with friction or an
             actuator other than the coupling's always acts on the tree.
     """
 
     dofs: NDArray[np.bool_]
+    bodies: NDArray[np.bool_]
     joints: NDArray[np.bool_]
     geoms: NDArray[np.bool_]
+    tendons: NDArray[np.bool_]
     is_never_free: bool
 
 
 def tree_of_tool(model: mujoco.MjModel, body: int, own: Container[int] = ()) -> ToolTree:
     """Returns the tree of the body that carries the grip.
 
+    Trees that a tendon's spring or damper joins to it belong to it.
+
     Args:
         model: The compiled scene.
         body: The grip's body.
         own: The coupling's actuators, by id.
     """
-    tree = model.body_treeid[body]
-    bodies = model.body_treeid == tree
-    dofs = model.dof_treeid == tree
+    trees, tendons = {int(model.body_treeid[body])}, _elastic_tendons(model)
+    for _ in tendons:
+        for tendon in tendons:
+            joined = {int(tree) for tree in model.tendon_treeid[tendon] if tree >= 0}
+            trees |= joined if joined & trees else set()
+    bodies = np.isin(model.body_treeid, list(trees))
+    dofs = np.isin(model.dof_treeid, list(trees))
+    pulls = np.zeros(model.ntendon, np.bool_)
+    pulls[[t for t in tendons if trees & set(model.tendon_treeid[t].tolist())]] = True
     return ToolTree(
         dofs=np.asarray(dofs),
+        bodies=bodies,
         joints=np.asarray(bodies[model.jnt_bodyid]),
         geoms=np.asarray(bodies[model.geom_bodyid]),
+        tendons=pulls,
         is_never_free=bool(
             np.any(model.dof_frictionloss[dofs])
             or np.any(model.tendon_frictionloss)
@@ -473,11 +505,22 @@ def tree_of_tool(model: mujoco.MjModel, body: int, own: Container[int] = ()) -> 
     )
 
 
+def _elastic_tendons(model: mujoco.MjModel) -> list[int]:
+    return [
+        tendon
+        for tendon in range(model.ntendon)
+        if np.any(model.tendon_stiffness[tendon])
+        or np.any(model.tendon_stiffnesspoly[tendon])
+        or np.any(model.tendon_damping[tendon])
+        or np.any(model.tendon_dampingpoly[tendon])
+    ]
+
+
 def _is_driven(model: mujoco.MjModel, bodies: NDArray[np.bool_], own: Container[int]) -> bool:
     """Returns True if an actuator of the scene acts on the tree; unknown transmissions count.
 
     MuJoCo applies the whole force of an actuator in a step that is due half of it, and a servo's
-    force implicitly. Beside a lossless coupling that generates energy: 8 mJ in 1 s as measured.
+    force implicitly. Beside a lossless coupling that creates energy: 8 mJ in 1 s as measured.
     """
     transmission = mujoco.mjtTrn
     owner = {
@@ -500,13 +543,34 @@ def has_passive_forces(model: mujoco.MjModel) -> bool:
     """Returns True if springs, dampers, gravity compensation or a fluid act on any body."""
     return bool(
         np.any(model.jnt_stiffness)
+        or np.any(model.jnt_stiffnesspoly)
         or np.any(model.dof_damping)
+        or np.any(model.dof_dampingpoly)
         or np.any(model.body_gravcomp)
         or model.ntendon
         or model.nflex
         or model.opt.density
         or model.opt.viscosity
     )
+
+
+def spring_at_the_end(model: mujoco.MjModel, tree: ToolTree) -> str:
+    """Returns a spring of the tree that cannot be taken at the midpoint; empty if all can.
+
+    A force with a corner would generate energy there: 0.3 µJ in 2 s with a tool of 50 g on 500 N/m.
+    With such a spring all springs of the tree stay MuJoCo's own, taken at the end of the step, and
+    lossless is of first order: 1 kg on a tendon with slack errs by 0.49 %, implicit by 2.5 %.
+    """
+    at_rest = model.tendon_lengthspring[tree.tendons]
+    if np.any(at_rest[:, 0] != at_rest[:, 1]):
+        return "a tendon's spring with slack (springlength of two lengths)"
+    if np.any(model.jnt_springyield[tree.joints]) or np.any(model.tendon_springyield[tree.tendons]):
+        return "a spring that yields (springyield)"
+    if np.any(model.tendon_treenum[tree.tendons] > 2):
+        return "a spring or damper on a tendon between more than two kinematic trees"
+    if np.any(tree.bodies[np.append(model.flex_vertbodyid, model.flex_nodebodyid)]):
+        return "a flex"
+    return ""
 
 
 def _touches(model: mujoco.MjModel, equality: int, bodies: NDArray[np.bool_]) -> bool:
@@ -533,12 +597,12 @@ implicit form's damping longer after a contact: tapping on a wall errs by 33 µm
 
 
 def bind_lossless(
-    lossless: Part, model: mujoco.MjModel, data: mujoco.MjData, grip: int, first_actuator: int
+    s: State, model: mujoco.MjModel, data: mujoco.MjData, grip: int, first_actuator: int
 ) -> dict[str, NDArray[np.generic]]:
-    """Fills in addresses and facts about the tool's tree.
+    """Fills in addresses and facts about the tool's tree, its springs and dampers.
 
     Args:
-        lossless: The sub-record.
+        s: The state to bind.
         model: The prepared scene.
         data: Its data; ``qfrc_applied`` holds the user's forces.
         grip: Body that carries the grip.
@@ -548,7 +612,7 @@ def bind_lossless(
         Arrays that must outlive the state. ``user_forces`` replaces ``qfrc_applied`` as the place
         of the user's forces, because the method writes its own forces to the latter.
     """
-    nv = max(model.nv, 1)
+    nv, lossless = max(model.nv, 1), s["lossless"]
     own = range(first_actuator, first_actuator + len(COUPLING_ACTUATORS))
     tree = tree_of_tool(model, grip, own)
     owned: dict[str, NDArray[np.generic]] = {
@@ -565,6 +629,9 @@ def bind_lossless(
     lossless["qfrc_passive"] = data.qfrc_passive.ctypes.data
     lossless["is_never_free"] = tree.is_never_free
     lossless["has_passive"] = has_passive_forces(model)
+    if not spring_at_the_end(model, tree):
+        chosen = {"jnt": tree.joints, "dof": tree.dofs, "tendon": tree.tendons}
+        owned |= bind_springs(s["springs"], model, data, chosen)
     return owned | {"user_forces": owned["last_written"].copy()}
 
 
@@ -572,6 +639,7 @@ def bind_lossless(
 def restart_lossless(s: State) -> None:
     """Starts in the implicit form again after the scene was reset; nothing is carried over."""
     mj, lossless = s.mj, s.lossless
+    restore_springs(s)
     lossless.is_midpoint = 0
     lossless.is_near = 0
     lossless.holdoff = 0
@@ -591,7 +659,7 @@ def apply_carried(s: State) -> None:
     The user writes to the array that this method also writes to; a value that differs from the
     method's last one is the user's. If the user's force changes from p to p', a lossless step takes
     ½ (p + p'). Then v gains T M⁻¹ p', and the work h p'·u of the external port is exact. With all
-    of p', a varying force would generate energy.
+    of p', a varying force would create energy.
     """
     mj, lossless = s.mj, s.lossless
     applied, users = floats(lossless.qfrc_written, mj.nv), floats(mj.qfrc_applied, mj.nv)
@@ -606,6 +674,7 @@ def apply_carried(s: State) -> None:
         in_tree = ints(lossless.dof_in_tree, mj.nv)
         for i in range(mj.nv):
             applied[i] += 0.5 * in_tree[i] * (before[i] - after[i])
+        share_springs(s)
     for i in range(mj.nv):
         last[i] = applied[i]
 
@@ -642,7 +711,8 @@ def _enter(s: State, force: Vector, torque: Vector) -> None:
         v[i] = u[i]
     write_external(s, lossless.external)
     if lossless.has_passive:
-        mj_passive(mj.model, mj.data)
+        evaluate_passive(s)
+        begin_springs(s)
     for _ in range(2):
         write_bias(s, mj.qvel, lossless.bias_at_u)
         write_half_step(s)
@@ -655,10 +725,13 @@ def _enter(s: State, force: Vector, torque: Vector) -> None:
 
 
 @compiled
-def finish_lossless(s: State) -> None:
+def finish_lossless(s: State) -> bool:
     """Ends a step: balances its energy at v, carries half of the wrench over, changes the form.
 
     Needs the poses and energies after the step, and the notes of ``lossless_wrench``.
+
+    Returns:
+        True if the form changed and the model's springs with it.
     """
     mj = s.mj
     lossless, wrench = s.lossless, s.loop.wrench_on_tool
@@ -681,3 +754,4 @@ def finish_lossless(s: State) -> None:
     elif not lossless.was_midpoint and lossless.holdoff == 0:
         _enter(s, force, torque)
     note_twist(s)
+    return bool(s.springs.count > 0 and lossless.is_midpoint != lossless.was_midpoint)

@@ -43,9 +43,9 @@ OBSERVER_DTYPE = np.dtype(
         ("energy_credit_limit", "<f8"),
         ("observed_energy", "<f8"),
         ("net_device_energy", "<f8"),
-        ("excess_device_energy", "<f8"),
-        ("generated_energy", "<f8"),
-        ("previous_generated", "<f8"),
+        ("guarded_energy", "<f8"),
+        ("created_energy", "<f8"),
+        ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
         ("injected_damping", "<f8"),
         ("injected_rotational_damping", "<f8"),
@@ -84,10 +84,10 @@ def observe_reset(s: State, stored_before: float) -> None:
 
 
 @compiled
-def excess_device_energy(s: State) -> float:
-    """Returns the energy in J that the device received beyond the hand's, up to the last tick.
+def guarded_energy(s: State) -> float:
+    """Returns the energy in J that the guard limits: what the device got beyond the hand's work.
 
-        G + r min(S − S_0, 0),    r = force_scale / scale
+        G + q min(S − S_0, 0),    q = force_scale / scale
 
     G is the sum of w·δp − b ‖δp‖²/t in J; S_0 is the scene's storage at the start. Storage that the
     scene has given up since then has paid for as much.
@@ -98,34 +98,34 @@ def excess_device_energy(s: State) -> float:
 
 @compiled
 def foreseen_excess(s: State) -> float:
-    """Returns ``excess_device_energy`` after the next tick, at the speed of the last one."""
+    """Returns ``guarded_energy`` after the next tick, at the speed of the last one."""
     observer, w = s.observer, s.loop.wrench_on_device
     work = 0.0
     for i in range(6):
         u = observer.device_velocity[i]
         b = observer.assumed_damping if i < 3 else observer.assumed_rotational_damping
         work += (w[i] - b * u) * u
-    return float(observer.excess_device_energy + s.run.period * work)
+    return float(observer.guarded_energy + s.run.period * work)
 
 
 @compiled
 def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Updates the passivity observer with the previous tick's energy flow.
 
-        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + r (ΔS − W), −A_max)
+        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + q (ΔS − W), −A_max)
 
     A > 0 means that device and scene together have delivered more energy than they received.
 
     Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the
     previous tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new
-    sample (s); r = force_scale / scale; ΔS change of the stored energy (J); W work of the scene's
+    sample (s); q = force_scale / scale; ΔS change of the stored energy (J); W work of the scene's
     motors and of user forces (J). A_max (J) caps the credit, so that long dissipation cannot hide a
     short active phase.
 
     Also updated, each in J:
-        ``generated_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
-        ``excess_device_energy``: result of the function of that name. Work of the scene's motors
-        does not reduce it.
+        ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
+        ``guarded_energy``: result of the function of that name. If a motor in the scene
+        pushes the hand, that energy counts as excess.
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -142,9 +142,9 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     limit = observer.energy_credit_limit
     stored = energy.kinetic + energy.potential - energy.start_energy
     over = energy.environment_energy - energy.slack
-    generated = observer.generated_energy + (over - observer.previous_generated)
-    observer.generated_energy = max(generated, -limit)
-    observer.previous_generated = over
+    created = observer.created_energy + (over - observer.previous_created)
+    observer.created_energy = max(created, -limit)
+    observer.previous_created = over
     net = stored - energy.actuator_work - energy.external_work
     change = net - observer.previous_net_storage
     gained = (s.run.force_scale / s.run.scale) * change
@@ -162,7 +162,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         delivered += linear + angular
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
     observer.net_device_energy += delivered
-    observer.excess_device_energy = excess_device_energy(s)
+    observer.guarded_energy = guarded_energy(s)
     for i in range(6):
         u = rate * (moved[i] if i < 3 else turned[i - 3])
         has_reversed = 1 if u * observer.device_velocity[i] < 0.0 else 0
@@ -227,9 +227,9 @@ def control(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     stiffness until the device's damper bears it.
 
     Controller ``DAMPER`` takes ``observed_energy`` as the debt, ``ENVIRONMENT`` the previous tick's
-    ``generated_energy``. Up to the slack a device that bears its coupling stays passive; beyond it
+    ``created_energy``. Up to the slack a device that bears its coupling stays passive; beyond it
     each axis is damped until it has dissipated or returned its energy. A damper on the tool would
-    be nearer to the cause, but contacts then generate more.
+    be nearer to the cause, but contacts then create more.
 
     Behind the damper, a tank scales the wrench to the work that its level allows in the next tick,
     at the velocity of the last one. It covers the debt that the clipped α cannot. It does not act
@@ -245,7 +245,7 @@ def control(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     if observer.controller == DAMPER or (is_environment and s.run.has_law):
         debt = observer.observed_energy - THRESHOLD
         if is_environment:
-            debt = observer.generated_energy - THRESHOLD
+            debt = observer.created_energy - THRESHOLD
         if debt > 0.0:
             b, b_r = observer.max_damping, observer.max_rotational_damping
             x, on_x = _damped(s, 0, force[0], b, debt)

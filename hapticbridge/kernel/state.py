@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: eleven sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: twelve sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -17,11 +17,13 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | observer    | energy at the device, added damping               | passivity_controller          |
 | watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
+| springs     | springs and dampers of the tool's tree            | springs                       |
 | timing      | delay of the force, energy that it may have given | timing                        |
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import cast
 
 import mujoco
@@ -54,6 +56,7 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     observe_reset,
 )
+from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
 from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
 from hapticbridge.kernel.tick_guard import (
@@ -121,6 +124,7 @@ STATE_DTYPE = np.dtype(
         ("observer", OBSERVER_DTYPE),
         ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
+        ("springs", SPRINGS_DTYPE),
         ("timing", TIMING_DTYPE),
     ]
 )
@@ -148,6 +152,7 @@ class BoundKernel:
         self.row = np.zeros(1, TICK_DTYPE)
         self._model, self._data = model, data  # the addresses in the state point into them
         self._owned: dict[str, NDArray[np.generic]] = {}
+        self._restore_springs: Callable[[State], None] | None = None
         self._bind_model(parameters)
         self._bind_run(parameters)
         self._start(parameters)
@@ -169,7 +174,7 @@ class BoundKernel:
 
     @property
     def slack(self) -> float:
-        """Energy in J that the environment may have generated so far."""
+        """Energy in J that the environment may have created so far."""
         return float(self.state["energy"]["slack"][0])
 
     def resume(self) -> None:
@@ -191,6 +196,11 @@ class BoundKernel:
     def command(self, bits: int) -> None:
         """Sets the commands in force from the next tick on, ``FORCE_OFF`` and ``CLUTCHED``."""
         set_commanded(self._record["guard"], bits)
+
+    def release(self) -> None:
+        """Puts back what a step that was broken off left in the model, at the end of a run."""
+        if self._restore_springs is not None:
+            self._restore_springs(self._record)
 
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
@@ -235,7 +245,7 @@ class BoundKernel:
             mj["tool_map_size"] = self._owned["tool_map"].size
         if parameters.scheme == Scheme.MIDPOINT:
             body = int(model.site_bodyid[grip])
-            arrays = bind_lossless(self._record["lossless"], model, data, body, first)
+            arrays = bind_lossless(self._record, model, data, body, first)
             self._owned |= arrays
             mj["qfrc_applied"] = arrays["user_forces"].ctypes.data
 
@@ -284,7 +294,8 @@ class BoundKernel:
         start_energies(s["energy"])
         if parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
-            direct(restart_lossless, s)
+            direct(restart_lossless, s)  # loads its code ahead of a command; not run here
+            self._restore_springs = direct(restore_springs, s)
 
     def _take_tool_pose(self) -> None:
         """Takes the present poses of the tool and of the scene's mocap bodies."""

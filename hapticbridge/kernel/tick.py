@@ -1,8 +1,14 @@
 """The arithmetic of a tick before and after MuJoCo's step, and the end of a tick.
 
-The live loop calls ``before_step``, MuJoCo through its Python bindings, ``answer_step``, and once
-the wrench is sent ``finish_tick``. ``simulate`` runs whole ticks in compiled code, with MuJoCo by
-its C symbol (``advance``); both inline the same functions and agree to the bit.
+    live loop (``Bridge``)                whole_tick (re-simulation, sweeps)
+    1. the device is read                 1. the sample is given
+    2. before_step                        2. before_step
+    3. MuJoCo by its Python bindings      3. advance: MuJoCo by its C symbol
+    4. answer_step                        4. after_step: answer_step,
+    5. the wrench is sent                 5.   no device,
+    6. finish_tick: close_tick, publish   6.   close_tick
+
+2 to 4 are repeated for each substep. Both inline the same functions and agree to the bit.
 """
 
 from __future__ import annotations
@@ -76,6 +82,7 @@ from hapticbridge.kernel.mujoco_c import (
     release_fence,
 )
 from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
+from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
     DEVICE_BUTTONS,
@@ -229,12 +236,12 @@ def before_step(
         sample: One device sample.
         row: The bound record.
         substep: Number of the substep in this tick; the sample is read in substep 0.
-        elapsed: Time since the previous sample in s. Less than T counts as T, so that an uneven
-            time stamp does not raise the damping that the device is credited with.
+        elapsed: Time since the previous sample in s. Values below T are raised to T; a short
+            interval would overstate the energy that the damper dissipates, b ‖δp‖²/t.
 
     Returns:
         ``OK``; ``HALF_DONE`` if only the second half of MuJoCo's step is left to do; ``BAD_SAMPLE``
-        or a result of ``guard.refusal``, and then nothing was changed.
+        or a result of ``tick_guard.refusal``, and then nothing was changed.
     """
     s = state[0]
     if substep == 0:
@@ -338,6 +345,19 @@ def advance(state: NDArray[np.void]) -> None:
 
 
 @compiled
+def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns force and torque on the tool, and its motion and turn, after a step of MuJoCo."""
+    if s.run.scheme == Scheme.IMPLICIT:
+        return limited_wrench_after_step(s, is_last)
+    if s.run.scheme == Scheme.MIDPOINT:
+        return lossless_wrench(s)
+    force, torque, moved, turned = compared_wrench(s, is_last)
+    if s.run.has_law:
+        force, torque = limited_wrench(s, force, torque)
+    return force, torque, moved, turned
+
+
+@compiled
 def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
     """Computes the wrench of the step that just ended; after the last substep also the device's.
 
@@ -345,7 +365,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     uniformly within a tick, so the mean does the same work on it as the single wrenches.
 
     Returns:
-        ``OK`` or ``BAD_RESULT``; with the latter the wrench on the device is zero.
+        ``OK``; ``BAD_RESULT``, or ``GAVE_ENERGY`` if the wrench would pass the energy limit in the
+        next tick. Unless it is ``OK``, the wrench on the device is zero.
     """
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
@@ -354,13 +375,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     is_last = substep + 1 == s.run.substeps
     if count == 1 and not is_last:
         return OK
-    if scheme == Scheme.IMPLICIT:
-        force, torque, moved, turned = limited_wrench_after_step(s, is_last)
-    elif scheme == Scheme.MIDPOINT:
-        force, torque, moved, turned = lossless_wrench(s)
-    else:
-        force, torque, moved, turned = compared_wrench(s, is_last)
-        force, torque = limited_wrench(s, force, torque)
+    force, torque, moved, turned = _evaluate(s, is_last)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
@@ -403,6 +418,8 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
     In this order: scale, share of the lever, and of the passivity controller's damping what fits.
     """
     run = s.run
+    if not run.has_law:  # nothing limits the wrench on the tool, so the device alone is spared
+        force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
     share = s.guard.share
@@ -428,10 +445,11 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     s = state[0]
     loop = s.loop
     loop.has_positions = has_positions
+    restore_springs(s)
     if s.run.scheme != Scheme.MASSLESS:
         refresh_energies(s)
-    if s.run.scheme == Scheme.MIDPOINT:
-        finish_lossless(s)
+    if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
+        loop.has_positions = 0  # it was computed with the springs of the other form
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
         return _refuse(s)
@@ -489,7 +507,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
     """Runs ``answer_step``, and after the last substep ``close_tick``.
 
     Returns:
-        ``OK`` or ``BAD_RESULT``; with the latter the wrench on the device is zero.
+        The first result that is not ``OK``, and then the wrench on the device is zero; else ``OK``.
     """
     code = answer_step(state, row, substep)
     if code != OK or substep + 1 != state[0].run.substeps:
@@ -639,7 +657,7 @@ def publish_positions(
 def whole_tick(
     state: NDArray[np.void], sample: NDArray[np.void], row: NDArray[np.void], elapsed: float
 ) -> bool:
-    """Runs one tick; returns True if sample and result were finite."""
+    """Runs one tick; returns False if the sample was refused or the result is not usable."""
     for substep in range(state[0].run.substeps):
         if before_step(state, sample, row, substep, elapsed) != OK:
             return False
@@ -665,7 +683,7 @@ def simulate(
         rows: Receives the records; as long as ``samples``.
 
     Returns:
-        Count of completed ticks; less than ``samples.size`` if a sample or a result was not finite.
+        Count of completed ticks; less than ``samples.size`` if ``whole_tick`` refused one.
     """
     for k in range(samples.size):
         if not whole_tick(state, samples[k : k + 1], row, state[0].run.period):

@@ -131,7 +131,7 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     tool, handle = quaternion_of(pose.tool_quaternion), quaternion_of(pose.handle_quaternion)
     if norm(rotation_between(tool, handle)) > guard.max_angle:
         return TWISTED
-    return GAVE_ENERGY if s.observer.excess_device_energy > guard.max_energy else 0
+    return GAVE_ENERGY if s.observer.guarded_energy > guard.max_energy else 0
 
 
 @compiled

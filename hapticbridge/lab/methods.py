@@ -1,4 +1,13 @@
-"""Rendering methods that exist only to be compared; importing this module registers them."""
+"""Rendering methods that exist only to be compared; importing this module registers them.
+
+To add a method, up to three files change:
+
+1. here, a ``rendering.Method`` in ``_COMPARED``; with a free tool whose theory is known, also an
+   entry in ``THEORIES``, which the maps ``coupling`` and ``tool_mass`` show;
+2. for a new path of the wrench, a number of ``kernel.codes.Scheme`` with its ``SchemeProperties``;
+3. for such a path, its branches in ``drive_compared`` and ``compared_wrench`` of
+   ``kernel.compared_methods``.
+"""
 
 from __future__ import annotations
 

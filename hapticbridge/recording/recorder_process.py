@@ -31,6 +31,7 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter
+from hapticbridge.units import format_energy, format_forces
 
 # Live status line of a run
 
@@ -42,9 +43,13 @@ REPRINT = 2.0
 
 
 class RunState:
-    """State of a run for the status line, collected from records."""
+    """State of a run for the status line, collected from records.
 
-    def __init__(self) -> None:
+    ``is_held`` is True if a hand feels the force of the device.
+    """
+
+    def __init__(self, *, is_held: bool = True) -> None:
+        self._is_held = is_held
         self._last: NDArray[np.void] | None = None
         self._overruns = 0
         self._dropped = 0
@@ -62,16 +67,23 @@ class RunState:
         if self._last is None:
             return "waiting for the first tick"
         row = self._last
+        hand, tool = (
+            float(np.linalg.norm(row[name][:3])) for name in ("wrench_on_device", "wrench_on_tool")
+        )
         parts = [
             f"{row['deadline_ns'] * 1e-9:.1f} s",
-            f"{np.linalg.norm(row['wrench_on_tool'][:3]):.1f} N",
-            f"environment {_millijoule(float(row['environment_energy']))}",
-            f"device {_millijoule(float(row['device_energy']))}",
+            format_forces(hand if self._is_held else None, tool),
+            f"environment {format_energy(float(row['environment_energy']))}",
+            f"device {format_energy(float(row['device_energy']))}",
             f"{self._overruns} overruns",
         ]
         if self._dropped:
             parts.append(f"{self._dropped} records dropped")
         return "  ".join(parts)
+
+
+def _is_held(metadata: dict[str, str]) -> bool:
+    return not json.loads(metadata.get("device", "{}")).get("is_prescribed", False)
 
 
 class _Console(Console):
@@ -87,8 +99,8 @@ class LiveLine:
     After an error the stream is no longer used, and the recording continues.
     """
 
-    def __init__(self, stream: TextIO) -> None:
-        self._state = RunState()
+    def __init__(self, stream: TextIO, *, is_held: bool = True) -> None:
+        self._state = RunState(is_held=is_held)
         self._stream: TextIO | None = stream
         self._drawn = time.monotonic()
         self._is_fresh = False
@@ -141,10 +153,6 @@ class LiveLine:
         return Text(str(self._state), no_wrap=True, overflow="ellipsis")
 
 
-def _millijoule(energy: float) -> str:
-    return f"{energy * 1e3:.1f} mJ"
-
-
 POLL = 0.005
 """Pause in s between reads of the ring: five records at 1 kHz."""
 
@@ -170,7 +178,7 @@ class _Session:
         if configuration["live"]:
             # imported here, so that a run without a live line starts without it
 
-            self._live = LiveLine(sys.stderr)
+            self._live = LiveLine(sys.stderr, is_held=_is_held(configuration["metadata"]))
         self._last_time = 0
         self._last_tick = -1
         self._has_reported_full = False

@@ -3,7 +3,7 @@
 Read ``load`` first. It reads a scene, adds the handle and its coupling (``handle``), compiles it
 (``compile``) and refuses unsuitable scenes (``checks``). The result is a ``scene.Scene``, which a
 bridge steps. ``source`` keeps the files' bytes for the recording, ``parameters`` the scene's
-settable numbers, ``contacts`` a measured rule for contacts that generate energy.
+settable numbers, ``contacts`` a measured rule for contacts that create energy.
 """
 
 from hapticbridge.scene.compile import custom_numbers as custom_numbers

@@ -16,7 +16,7 @@ to matter. This is an interpretation of the measurements, not a proof:
     κ <= 4, d <= 0.91, τ >= 3.8 h         within slack for tools of 0.1 kg and more; pegs of
                                           30 g used up to 1.4 times the slack.
 
-All other settings count as active: they may generate more energy than the slack allows. This is a
+All other settings count as active: they may create more energy than the slack allows. This is a
 warning; many such runs stayed within the slack.
 
 The map ``contact`` measures the rule on a peg in its hole: 30 to 300 g, K of 1000 and 6000 N/m,
@@ -24,7 +24,7 @@ friction 0 and 0.42, recorded and random hands with up to 30 N. It uses integrat
 the elliptic cone at 1 kHz, draws the lines, and counts the differences between rule and runs.
 
 The pyramidal cone is worse the lower the friction is. With MuJoCo's defaults otherwise, pegs
-generated up to 8.1 times the slack (16 of 36 runs of the map active).
+created up to 8.1 times the slack (16 of 36 runs of the map active).
 
 A single contact is less critical: a mass on a wall stays within the slack at nearly every setting.
 Beyond the measured range (other shapes, lighter tools, stiffer couplings, other periods) the rule
@@ -51,12 +51,12 @@ from numpy.typing import NDArray
 from hapticbridge.errors import SceneError
 
 STRICT_STEPS = 60.0
-"""τ/h above which a contact of moderate stiffness generated no energy in any run of the map (its
+"""τ/h above which a contact of moderate stiffness created no energy in any run of the map (its
 row "damped": τ = 60.8 h)."""
 
 MODERATE_STIFFNESS = 0.6
 """Largest κ for which ``STRICT_STEPS`` suffices: timeconst·dampratio >= 4 h at d = 0.9. Stiffer
-contacts require τ in proportion: at κ = 2.3 the map's τ = 30 h generated energy, its 380 h none."""
+contacts require τ in proportion: at κ = 2.3 the map's τ = 30 h created energy, its 380 h none."""
 
 STIFFEST = 4.0
 """Largest κ that the rule covers; the map's rows at 2.3 agree with the rule."""
@@ -231,7 +231,7 @@ def contact_concerns(
         timestep: h in s.
         cone: Friction cone; it matters only for condim > 1 and a friction below 0.4.
         diagexact: True if MuJoCo's exact diagonal is enabled. Without it more runs of the map's
-            shipped setting generate energy.
+            shipped setting create energy.
         refsafe: As for ``contact_numbers``.
         condim: Dimension of the contact; 1 is without friction.
         friction: Coefficient of sliding.
@@ -302,7 +302,7 @@ class _GeomSetting(NamedTuple):
 
 
 def warn_of_contacts(model: mujoco.MjModel, grip: str, scene: object) -> None:
-    """Warns of contacts that are likely to generate more energy than the slack allows."""
+    """Warns of contacts that are likely to create more energy than the slack allows."""
     for concern in check_contacts(model, grip):
         warnings.warn(f"scene '{scene}': {concern}", UserWarning, stacklevel=3)
 
@@ -322,7 +322,7 @@ def check_contacts(
         model: The compiled scene with the time step of the run.
         grip: Name of the site on the tool.
         is_thorough: If true, soft contacts and the approximate diagonal are reported too; both are
-            MuJoCo's defaults. Otherwise only contacts that are likely to generate more energy than
+            MuJoCo's defaults. Otherwise only contacts that are likely to create more energy than
             the slack allows.
         only: Pairs of geoms to check; None: all that the tool can have.
     """

@@ -113,10 +113,13 @@ def minimum_damping(
     filter_time: float = 0.0,
     axis: Axis = "translation",
 ) -> float | NDArray[np.float64]:
-    """Returns the device damping above which a coupling is passive.
+    """Returns the least device damping with which a coupling is passive.
 
-        backward     b > K T/2 + B                     low-passed: K T/2 + B T/(T + 2τ)
-        tustin       b > K T/2 for B = 0, else inf     low-passed: K T/2 + B T/(2τ)
+        backward     b >= K T/2 + B'                     low-passed: K T/2 + B' T/(T + 2τ)
+        tustin       b >= K T/2 for B' = 0, else inf     low-passed: K T/2 + B' T/(2τ)
+
+    B' is the damping of the law, the ``damping`` of the coupling given here. At equality the device
+    loses nothing and gains nothing; the paper states the condition with >.
 
     Without a delay the bound is necessary. It is sufficient for any passive hand and any
     environment that is discrete-time passive (14). With a low-pass, sufficiency is shown for linear
@@ -125,19 +128,19 @@ def minimum_damping(
     With a delay of d samples the bound holds against a **wall**, that is for a tool that does not
     move:
 
-        b > (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)  for all θ;  B = 0: K (T/2 + d T)
+        b >= (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B' cos((d + 1)θ)  for all θ;  B' = 0: K (T/2 + d T)
 
     The coupling's damper may lower this bound. For a *general* environment behind a delayed
     coupling no damping suffices, so no bound exists (see ``damping_spectrum_of`` of C z⁻ᵈ).
 
     Args:
-        coupling: K, B and their rotational counterparts; a ``CouplingGrid`` evaluates many at once.
+        coupling: K, B' and their rotational counterparts; a ``CouplingGrid`` has many of them.
         period: T in s, finite and > 0: duration for which the device holds a wrench.
         discretization: Rule that takes the damper's velocity from sampled positions.
         delay: d, whole samples from position to force, 0 to 50.
         filter_time: τ in s, >= 0, of a first-order low-pass behind the damper, discretised by the
             same rule.
-        axis: Kind of axis, which selects the pair of K and B.
+        axis: Kind of axis, which selects the pair of K and B'.
 
     Returns:
         The bound on b in N s/m (rotation: N m s/rad), shaped like the coupling. It is inf for
@@ -152,9 +155,9 @@ def minimum_damping(
     law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
     stiffness, damping, period, delay, filter_time, unbounded = law
     if delay:
-        # without low-pass, Tustin's bound is finite only for B = 0, where both rules agree
-        scheme: Discretization = "backward" if unbounded else discretization
-        needed, _ = wall_supremum(stiffness, damping, period, scheme, delay, filter_time)
+        # without low-pass, Tustin's bound is finite only for B' = 0, where both rules agree
+        rule: Discretization = "backward" if unbounded else discretization
+        needed, _ = wall_supremum(stiffness, damping, period, rule, delay, filter_time)
     else:
         if unbounded:
             share = 1.0
@@ -181,10 +184,10 @@ def maximum_stiffness(
 def maximum_stiffness(
     device_damping: ArrayLike, period: ArrayLike, damping: ArrayLike = 0.0
 ) -> float | NDArray[np.float64]:
-    """Returns the largest passive stiffness, K = 2 (b − B) / T, in N/m.
+    """Returns the largest passive stiffness, K = 2 (b − B') / T, in N/m.
 
-    The stiffness of a coupling must stay below it. b in N s/m and T in s must be finite and > 0,
-    and 0 <= B < b; otherwise CouplingError is raised, because for B >= b no stiffness is passive.
+    The stiffness of a coupling must not be above it. b in N s/m and T in s must be finite and > 0,
+    and 0 <= B' < b; otherwise CouplingError is raised, because for B' >= b no stiffness is passive.
     Arrays broadcast.
 
     References:

@@ -33,7 +33,7 @@ and ¼(d_{k+1} − d_k)² <= ½(d_{k+1}² + d_k²). Summed over k, with S_0 of t
     Σ f_k d_{k+1} + Σ (b/T) d_k² >= −S_0 − ½K (e_0 + d_1)²    if b >= K T/2 + (B'_{k−1} + B'_k)/2
 
 for every k. This holds for any order of values if b >= K T/2 + max B'. Changes between unequal B'
-therefore generate no energy and cause no instability by themselves; the device must only provide
+therefore create no energy and cause no instability by themselves; the device must only provide
 damping for the larger B'. A device with damping for the smaller B' only is unstable in one form and
 comes to rest in the other, which is a limit cycle.
 """

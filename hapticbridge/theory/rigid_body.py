@@ -22,10 +22,10 @@ CHECK = Arguments(MechanicsError)
 """Argument checks of the reference mechanics."""
 
 
-# Point mass under a prescribed force, with four integrators and their generated energy
+# Point mass under a prescribed force, with four integrators and the energy they create
 
-Scheme = Literal["explicit", "semi_implicit", "implicit", "midpoint"]
-SCHEMES = ("explicit", "semi_implicit", "implicit", "midpoint")
+StepRule = Literal["explicit", "semi_implicit", "implicit", "midpoint"]
+STEP_RULES = ("explicit", "semi_implicit", "implicit", "midpoint")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class ParticleMotion:
 
             E_k = S_k − S_{k−1} − f_k (x_k − x_{k−1}),    S = ½ m v²
 
-        The mass is passive if the sum of E_i up to every k is <= 0. By scheme:
+        The mass is passive if the sum of E_i up to every k is <= 0. By rule:
 
             explicit        ½ m (v_k + v_{k−1})² − m v_{k−1} (v_{k−1} + v_{k+1})             (18)
             semi_implicit   ½ m (v_{k+1} − v_k)² with S_{k+1} − S_k in place of S_k − S_{k−1}
@@ -78,7 +78,7 @@ def integrate_particle(
     mass: ArrayLike,
     force: ArrayLike,
     period: float,
-    scheme: Scheme,
+    rule: StepRule,
     *,
     position: ArrayLike = 0.0,
     velocity: ArrayLike = 0.0,
@@ -97,7 +97,7 @@ def integrate_particle(
         mass: m in kg, finite and > 0, shape (...).
         force: f_0 … f_N in N, finite, time first: shape (N + 1, ...), N >= 1.
         period: T in s, finite and > 0.
-        scheme: One of ``SCHEMES``.
+        rule: One of ``STEP_RULES``.
         position: x_0 in m, shape (...).
         velocity: v_0 in m/s, shape (...).
 
@@ -107,7 +107,7 @@ def integrate_particle(
     References:
         Brown & Colgate 1997, eqs. (15), (17).
     """
-    CHECK.one_of("scheme", scheme, SCHEMES)
+    CHECK.one_of("rule", rule, STEP_RULES)
     mass, period = (
         CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
         CHECK.number("period", period, "s", least=0, is_open=True),
@@ -120,11 +120,11 @@ def integrate_particle(
     if force.ndim == 0 or len(force) < 2:
         raise MechanicsError(f"force has shape {force.shape}; it must be (N + 1, ...) with N >= 1")
     shape = CHECK.shape(mass=mass, force=force[0], position=position, velocity=velocity)
-    acting = force[1:] if scheme in {"implicit", "midpoint"} else force[:-1]
+    acting = force[1:] if rule in {"implicit", "midpoint"} else force[:-1]
     gained = np.cumsum(period / mass * acting, axis=0)
     v = np.empty((len(force), *shape))
     v[0], v[1:] = velocity, velocity + gained
-    mover = {"explicit": v[:-1], "midpoint": (v[:-1] + v[1:]) / 2}.get(scheme, v[1:])
+    mover = {"explicit": v[:-1], "midpoint": (v[:-1] + v[1:]) / 2}.get(rule, v[1:])
     x = np.empty_like(v)
     x[0], x[1:] = position, position + period * np.cumsum(mover, axis=0)
     return ParticleMotion(mass, np.broadcast_to(force, v.shape), x, v)
@@ -132,14 +132,14 @@ def integrate_particle(
 
 # Point mass driven by a handle through the coupling, with four integrators
 
-CoupledScheme = Literal["held", "implicit", "compensated", "midpoint"]
-COUPLED_SCHEMES = ("held", "implicit", "compensated", "midpoint")
+CoupledStepRule = Literal["held", "implicit", "compensated", "midpoint"]
+COUPLED_STEP_RULES = ("held", "implicit", "compensated", "midpoint")
 
 
 class CoupledMotion(ParticleMotion):
     """Motion of a mass behind a coupling at the samples 0 … N.
 
-    ``force`` acts on the mass; the device receives −f_k. f_0 acts only in the ``held`` scheme.
+    ``force`` acts on the mass; the device receives −f_k. f_0 acts only in the ``held`` rule.
     ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})² under ``implicit`` and
     ``compensated``.
     """
@@ -152,7 +152,7 @@ def drive_mass(
     mass: ArrayLike,
     handle: ArrayLike,
     period: float,
-    scheme: CoupledScheme,
+    rule: CoupledStepRule,
     *,
     position: ArrayLike | None = None,
     velocity: ArrayLike = 0.0,
@@ -169,8 +169,8 @@ def drive_mass(
         midpoint     f_k = K (e_k + e_{k−1})/2 + (B/T)(e_k − e_{k−1}),
                      v_k = v_{k−1} + (T/M) f_k,   x_k = x_{k−1} + T (v_{k−1} + v_k)/2
 
-    ``held`` generates energy and is stable only above a certain mass (K T²/4 without damping).
-    Below it the motion grows until it overflows to inf or nan. The other schemes are stable for
+    ``held`` creates energy and is stable only above a certain mass (K T²/4 without damping).
+    Below it the motion grows until it overflows to inf or nan. The other rules are stable for
     every mass. ``implicit`` and ``compensated`` are passive and of first order. ``midpoint`` is
     passive without numerical damping and of second order.
 
@@ -189,7 +189,7 @@ def drive_mass(
         mass: M in kg, finite and > 0, shape (...).
         handle: h_0 … h_N in m, finite, time first: shape (N + 1, ...), N >= 1.
         period: T in s, finite and > 0.
-        scheme: One of ``COUPLED_SCHEMES``.
+        rule: One of ``COUPLED_STEP_RULES``.
         position: x_0 in m, shape (...); h_0 by default.
         velocity: v_0 in m/s, shape (...).
 
@@ -200,7 +200,7 @@ def drive_mass(
         Brown & Colgate 1997, eqs. (4), (15); Kim, Lee et al. 2017, "Haptic rendering and
         interactive simulation using passive midpoint integration", Int. J. Robotics Research 36.
     """
-    CHECK.one_of("scheme", scheme, COUPLED_SCHEMES)
+    CHECK.one_of("rule", rule, COUPLED_STEP_RULES)
     mass, period = (
         CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
         CHECK.number("period", period, "s", least=0, is_open=True),
@@ -212,23 +212,23 @@ def drive_mass(
     velocity = CHECK.numbers("velocity", velocity, "m/s")
     k, b = spring_and_damper(coupling)
     shape = CHECK.shape(mass=mass, handle=h[0], position=start, velocity=velocity, coupling=k + b)
-    if scheme == "compensated":
+    if rule == "compensated":
         b = np.maximum(b - k * period, 0)
     f, x, v = (np.empty((len(h), *shape)) for _ in range(3))
     x[0], v[0] = start, velocity
     f[0] = k * (h[0] - x[0])
     # weight of the step's end in the spring's mean stretch
-    end_weight = 0.5 if scheme == "midpoint" else 1.0
+    end_weight = 0.5 if rule == "midpoint" else 1.0
     # f = idle − loss · (x_k − x_{k−1})/T, with idle the force on a mass that stays where it is
     loss = b + end_weight * k * period
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(1, len(h)):
             moved = h[i] - h[i - 1]
             idle = k * (h[i - 1] + end_weight * moved - x[i - 1]) + b / period * moved
-            if scheme == "held":
+            if rule == "held":
                 v[i] = v[i - 1] + period / mass * f[i - 1]
                 mean = v[i]
-            elif scheme == "midpoint":
+            elif rule == "midpoint":
                 mean = (2 * mass * v[i - 1] + period * idle) / (2 * mass + period * loss)
                 v[i] = 2 * mean - v[i - 1]
             else:
@@ -242,7 +242,7 @@ def drive_mass(
 def exact_mass_response(
     coupling: Coupling, mass: ArrayLike, frequency: ArrayLike
 ) -> NDArray[np.complex128]:
-    """Returns X/H of a mass behind an unsampled coupling, the reference of the four schemes.
+    """Returns X/H of a mass behind an unsampled coupling, the reference of the four rules.
 
         X/H = (K + jωB) / (K + jωB − M ω²),    ω = 2π · frequency
 
@@ -306,7 +306,7 @@ def integrate_rotation(
     angular_velocity: ArrayLike,
     period: float,
     steps: int,
-    scheme: Scheme,
+    rule: StepRule,
     *,
     torque: ArrayLike | None = None,
 ) -> Rotation:
@@ -323,7 +323,7 @@ def integrate_rotation(
     ``semi_implicit`` gain ½ T² aᵀ I a in every step, and ``implicit`` loses it. ``midpoint``
     conserves the energy, and the momentum in the world frame, up to rounding. Under torque
     ``midpoint`` gains precisely T τ_k · ω̄. Above T |ω| of about 1 rad per sample the implicit
-    schemes are inaccurate and Newton's method may fail, which raises an error.
+    rules are inaccurate and Newton's method may fail, which raises an error.
 
     Args:
         inertia: Principal moments in kg m², finite, > 0, none larger than the sum of the other two,
@@ -331,7 +331,7 @@ def integrate_rotation(
         angular_velocity: ω_0 in the body's frame in rad/s, shape (..., 3).
         period: T in s, finite and > 0.
         steps: N >= 1.
-        scheme: One of ``SCHEMES``.
+        rule: One of ``STEP_RULES``.
         torque: τ_0 … τ_N in the body's frame in N m, shape (N + 1, ..., 3); none by default.
 
     Raises:
@@ -340,9 +340,9 @@ def integrate_rotation(
 
     References:
         Simo & Wong 1991, Int. J. Numerical Methods in Engineering 31 (midpoint); the other three
-        are Brown & Colgate's schemes (15), (17) applied to Euler's equations.
+        are Brown & Colgate's rules (15), (17) applied to Euler's equations.
     """
-    CHECK.one_of("scheme", scheme, SCHEMES)
+    CHECK.one_of("rule", rule, STEP_RULES)
     inertia, period = (
         CHECK.numbers("inertia", inertia, "kg m²", least=0, is_open=True),
         CHECK.number("period", period, "s", least=0, is_open=True),
@@ -370,7 +370,7 @@ def integrate_rotation(
         np.ascontiguousarray(np.broadcast_to(inertia, shape)).reshape(-1, 3),
         np.ascontiguousarray(np.broadcast_to(tau, rates.shape)).reshape(steps + 1, -1, 3),
         period,
-        SCHEMES.index(scheme),
+        STEP_RULES.index(rule),
         rates.reshape(steps + 1, -1, 3),
         turns.reshape(steps + 1, -1, 4),
     )
@@ -378,7 +378,7 @@ def integrate_rotation(
     if not (np.abs(rates).max() <= LARGEST**3 and np.isfinite(turns).all()):
         turn = period * float(np.max(np.linalg.norm(omega, axis=-1)))
         raise MechanicsError(
-            f"the {scheme} step has no finite solution: it began with {turn:g} rad per sample; "
+            f"the {rule} step has no finite solution: it began with {turn:g} rad per sample; "
             "shorten the period"
         )
     return Rotation(inertia, rates, turns)
@@ -423,7 +423,7 @@ def _turned(q: Quaternion, turn: Quaternion) -> Quaternion:
 
 @compiled
 def _integrate(
-    inertia: Array, torque: Array, period: float, scheme: int, rates: Array, turns: Array
+    inertia: Array, torque: Array, period: float, rule: int, rates: Array, turns: Array
 ) -> None:
     """Fills rates (N + 1, n, 3) and turns (N + 1, n, 4) from their first rows."""
     for j in range(inertia.shape[0]):
@@ -431,18 +431,18 @@ def _integrate(
         omega = (rates[0, j, 0], rates[0, j, 1], rates[0, j, 2])
         q = (turns[0, j, 0], turns[0, j, 1], turns[0, j, 2], turns[0, j, 3])
         for k in range(1, rates.shape[0]):
-            i = k - 1 if scheme <= 1 else k
+            i = k - 1 if rule <= 1 else k
             tau = (torque[i, j, 0], torque[i, j, 1], torque[i, j, 2])
             old = omega
-            if scheme <= 1:
+            if rule <= 1:
                 g = _gyroscopic(moments, old)
                 omega = (
                     old[0] + period * (tau[0] - g[0]) / moments[0],
                     old[1] + period * (tau[1] - g[1]) / moments[1],
                     old[2] + period * (tau[2] - g[2]) / moments[2],
                 )
-                turn = quaternion_exp(scaled(period, old if scheme == 0 else omega))
-            elif scheme == 2:
+                turn = quaternion_exp(scaled(period, old if rule == 0 else omega))
+            elif rule == 2:
                 omega = _implicit_rate(moments, old, tau, period)
                 turn = quaternion_exp(scaled(period, omega))
             else:

@@ -9,7 +9,7 @@ y to the right, z up. A wrist with motors (sigma.7, lambda.7) adds three axes. I
 read as a matrix (``dhdGetPositionAndOrientationFrame``), because the library's angles are joint
 angles. A wrist without motors (omega.6 and omega.7) is ignored: its rotation would put energy into
 the scene without a motor to balance it. The maker's gravity compensation is on unless ``gravity=0``
-is set. It depends on the position only, so it generates no energy.
+is set. It depends on the position only, so it creates no energy.
 
 The driver has not been verified on hardware.
 """

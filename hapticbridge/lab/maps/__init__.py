@@ -2,6 +2,21 @@
 
 Read ``base`` first, then one map, such as ``coupling``: its rig, its points, the evaluation of one
 point, the reading of its table and its picture stand in one file.
+
+To add a map, write such a file, which ends with
+
+    NAME = StabilityMap(
+        name="name",
+        doc=__doc__,  # begins with "Map NAME: its subject."
+        default_points=100,
+        points=points,
+        evaluate=evaluate,
+        summarize=summarize,
+        draw=draw,
+        sentences=sentences,
+    )
+
+and add ``NAME`` to ``_IN_ORDER`` below.
 """
 
 from hapticbridge.lab.maps.base import MapFiles as MapFiles

@@ -61,7 +61,7 @@ Sentences = Iterable[tuple[str, Mapping[str, Any]]]
 """Sentences with fields in braces, and the numbers that fill them."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StabilityMap:
     """A map: its points, their evaluation, and the reading of the table.
 
@@ -238,9 +238,8 @@ def largest_stable(
         width: Relative width at which the search ends, > 0.
 
     Returns:
-        The bracket; ``Bracket(0, lower)`` if nothing was stable and ``Bracket(upper, inf)`` if
-        all
-        was.
+        The bracket; ``Bracket(0, lower)`` if nothing was stable; ``Bracket(upper, inf)`` if all
+            was.
 
     Raises:
         StudyError: An end or the width is out of range.
@@ -317,8 +316,8 @@ def limit_by_6(
 ) -> NDArray[np.float64]:
     """Returns the K in N/m at which K T/2 + B' = b, for B < b.
 
-    That is 2 (b − B)/T without a lag. With a lag of ½ or 1 it is 2b/T: there B' is 0, and below it
-    K T/2 + B' stays below b.
+    That is 2 (b − B)/T for methods that use B as requested. For methods that subtract their own
+    damping (compensated_share ½ or 1) the limit is 2b/T, because B' is 0 there.
     """
     spent = np.asarray(damping, dtype=np.float64) * (METHODS[name].compensated_share == 0.0)
     return np.asarray(maximum_stiffness(device_damping, period, spent))

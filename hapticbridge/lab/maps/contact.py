@@ -451,4 +451,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         )
 
 
-CONTACT = StabilityMap("contact", __doc__, 333, points, evaluate, summarize, draw, sentences)
+CONTACT = StabilityMap(
+    name="contact",
+    doc=__doc__,
+    default_points=333,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

@@ -34,7 +34,8 @@ rail."""
 
 WALL_MASS = 1e6
 """Mass in kg of a tool that no hand moves: a wall at a known place without MuJoCo's contact. Its
-limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9. A lighter tool drifts, which is no decay."""
+limit is (6) to within T (KT/2 + B)/(2 m) = 1e-9. A lighter tool drifts away, so the run would be
+counted as unstable although it is not."""
 
 STABLE = ("stable_on_wall", "stable_free", "stable_tapping")
 """Columns that must all be true for a stable loop; a column without measurement is left out."""
@@ -332,4 +333,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     )
 
 
-COUPLING = StabilityMap("coupling", __doc__, 6000, points, evaluate, summarize, draw, sentences)
+COUPLING = StabilityMap(
+    name="coupling",
+    doc=__doc__,
+    default_points=6000,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

@@ -502,4 +502,13 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
     )
 
 
-DEVICE = StabilityMap("device", __doc__, 400, points, evaluate, summarize, draw, sentences)
+DEVICE = StabilityMap(
+    name="device",
+    doc=__doc__,
+    default_points=400,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

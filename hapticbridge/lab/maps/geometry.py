@@ -347,4 +347,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         )
 
 
-GEOMETRY = StabilityMap("geometry", __doc__, 3600, points, evaluate, summarize, draw, sentences)
+GEOMETRY = StabilityMap(
+    name="geometry",
+    doc=__doc__,
+    default_points=3600,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

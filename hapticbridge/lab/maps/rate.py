@@ -420,4 +420,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             )
 
 
-RATE = StabilityMap("rate", __doc__, 110, points, evaluate, summarize, draw, sentences)
+RATE = StabilityMap(
+    name="rate",
+    doc=__doc__,
+    default_points=110,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

@@ -369,5 +369,12 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
 
 
 RESTITUTION = StabilityMap(
-    "restitution", __doc__, 4200, points, evaluate, summarize, draw, sentences
+    name="restitution",
+    doc=__doc__,
+    default_points=4200,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
 )

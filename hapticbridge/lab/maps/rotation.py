@@ -557,4 +557,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     )
 
 
-ROTATION = StabilityMap("rotation", __doc__, 1500, points, evaluate, summarize, draw, sentences)
+ROTATION = StabilityMap(
+    name="rotation",
+    doc=__doc__,
+    default_points=1500,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

@@ -467,4 +467,13 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             )
 
 
-TOOL_MASS = StabilityMap("tool_mass", __doc__, 1000, points, evaluate, summarize, draw, sentences)
+TOOL_MASS = StabilityMap(
+    name="tool_mass",
+    doc=__doc__,
+    default_points=1000,
+    points=points,
+    evaluate=evaluate,
+    summarize=summarize,
+    draw=draw,
+    sentences=sentences,
+)

@@ -15,7 +15,7 @@ from hapticbridge.lab.paper.section import Check, Section, Table, explained, pan
 from hapticbridge.theory.rigid_body import (
     ParticleMotion,
     Rotation,
-    Scheme,
+    StepRule,
     integrate_particle,
     integrate_rotation,
 )
@@ -29,13 +29,13 @@ PERIOD = 1e-3
 MASS = 0.05
 """Mass of the particle in kg."""
 
-NAMES: dict[Scheme, str] = {
+NAMES: dict[StepRule, str] = {
     "explicit": "explicit Euler (17), j = 2",
     "semi_implicit": "force before the step, j = 1",
     "implicit": "implicit Euler (15), j = 0",
     "midpoint": "implicit midpoint",
 }
-COLOURS: dict[Scheme, str] = {
+COLOURS: dict[StepRule, str] = {
     "explicit": "C3",
     "semi_implicit": "C1",
     "implicit": "C0",
@@ -45,18 +45,18 @@ COLOURS: dict[Scheme, str] = {
 _Array = NDArray[np.float64]
 
 
-def _swinging(scheme: Scheme) -> ParticleMotion:
+def _swinging(rule: StepRule) -> ParticleMotion:
     """Inputs of a mass that a sinusoidal force stops and turns 20 times; it starts with 0.3 m/s."""
     turn = 2 * np.pi * 20 * PERIOD
     k = np.arange(round(1 / PERIOD) + 1)
     force = -MASS * 0.3 * turn / PERIOD * np.sin(turn * k)
-    return integrate_particle(MASS, force, PERIOD, scheme, velocity=0.3)
+    return integrate_particle(MASS, force, PERIOD, rule, velocity=0.3)
 
 
-def under_random_force(scheme: Scheme) -> ParticleMotion:
-    """Moves the particle for 2 s under forces of 1 N; every scheme gets equal forces."""
+def under_random_force(rule: StepRule) -> ParticleMotion:
+    """Moves the particle for 2 s under forces of 1 N; every rule gets equal forces."""
     force = np.random.default_rng(16).normal(size=2001)
-    return integrate_particle(MASS, force, PERIOD, scheme, velocity=0.2)
+    return integrate_particle(MASS, force, PERIOD, rule, velocity=0.2)
 
 
 def _taken_out(motion: ParticleMotion) -> _Array:
@@ -76,17 +76,17 @@ def discrete_passivity_section() -> Section:
     start = 0.5 * MASS * 0.3**2
     figure, (axes,) = panels(1, height=4.0)
     time = PERIOD * np.arange(1, round(1 / PERIOD) + 1)
-    motions = {scheme: _swinging(scheme) for scheme in NAMES}
-    for scheme, motion in motions.items():
-        axes.plot(time, 1e3 * _taken_out(motion), label=NAMES[scheme], color=COLOURS[scheme], lw=1)
+    motions = {rule: _swinging(rule) for rule in NAMES}
+    for rule, motion in motions.items():
+        axes.plot(time, 1e3 * _taken_out(motion), label=NAMES[rule], color=COLOURS[rule], lw=1)
     axes.axhline(1e3 * start, color="k", ls=":", label="S_0, all there was")
     axes.set(
         xlabel="time (s)", ylabel="energy taken out, −Σ f Δx (mJ)", xlim=(0, 0.4), ylim=(-12, 14)
     )
     axes.legend(fontsize="small", loc="lower left")
 
-    def most(scheme: Scheme) -> float:
-        return float(_taken_out(motions[scheme]).max())
+    def most(rule: StepRule) -> float:
+        return float(_taken_out(motions[rule]).max())
 
     explicit = motions["explicit"]
     balance = float(explicit.kinetic_energy[-1]) - start + float(_taken_out(explicit)[-1])
@@ -176,12 +176,12 @@ def explicit_euler_section() -> Section:
     printed = 0.5 * MASS * (v[1:-1] + v[:-2]) ** 2 - MASS * v[:-2] * (v[:-2] + v[2:])
     gains = motion.energy_gain[:-1]
     turns = {
-        scheme: integrate_rotation(INERTIA, (1e-3, 10.0, 1e-3), PERIOD, 10_000, scheme)
-        for scheme in NAMES
+        rule: integrate_rotation(INERTIA, (1e-3, 10.0, 1e-3), PERIOD, 10_000, rule)
+        for rule in NAMES
     }
 
-    def drift(scheme: Scheme) -> float:
-        energy = turns[scheme].kinetic_energy
+    def drift(rule: StepRule) -> float:
+        energy = turns[rule].kinetic_energy
         return float(energy[-1] / energy[0] - 1)
 
     momentum = turns["midpoint"].angular_momentum
@@ -263,25 +263,25 @@ def explicit_euler_section() -> Section:
     )
 
 
-def _gains_of_four_rules(turns: Mapping[Scheme, Rotation]) -> Figure:
+def _gains_of_four_rules(turns: Mapping[StepRule, Rotation]) -> Figure:
     """Draws the energy that a particle and a tumbling body gain under each rule."""
     figure, (particle, body) = panels(1, height=3.8, columns=2)
-    for scheme, name in NAMES.items():
-        gain = under_random_force(scheme).energy_gain
+    for rule, name in NAMES.items():
+        gain = under_random_force(rule).energy_gain
         time = PERIOD * np.arange(1, len(gain) + 1)
-        particle.plot(time, 1e3 * np.cumsum(gain), label=name, color=COLOURS[scheme])
+        particle.plot(time, 1e3 * np.cumsum(gain), label=name, color=COLOURS[rule])
     particle.set(xlabel="time (s)", ylabel="Σ E_k under a random force (mJ)")
     particle.set_ylim(bottom=-45)
     particle.legend(fontsize="small", loc="lower left")
-    for scheme, turn in turns.items():
+    for rule, turn in turns.items():
         share = turn.kinetic_energy / turn.kinetic_energy[0] - 1
         body.plot(
             PERIOD * np.arange(len(share)),
             100 * share,
-            color=COLOURS[scheme],
-            label=NAMES[scheme],
+            color=COLOURS[rule],
+            label=NAMES[rule],
             # it lies upon the explicit one
-            ls="--" if scheme == "semi_implicit" else "-",
+            ls="--" if rule == "semi_implicit" else "-",
         )
     body.set(xlabel="time (s)", ylabel="energy of a tumbling body, change (%)")
     body.legend(fontsize="small", loc="upper left")
@@ -475,7 +475,7 @@ def min_stable_mass(coupling: Coupling, period: float, integrator: Integrator) -
 MASS_COUPLING = Coupling(1000.0, 2.0, 0.0, 0.0)
 K, B = MASS_COUPLING.stiffness, MASS_COUPLING.damping
 
-SCHEMES: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
+SHOWN: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
 KEPT: dict[float, tuple[float, float, float]] = {
     0.002: (1.5385, 6.6667, np.inf),
     0.005: (2.0, 3.3333, 2.0),
@@ -523,7 +523,7 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
     checks, rows = [], []
     for mass, kept in KEPT.items():
         cells = [f"{mass:g}"]
-        for delay, (integrator, expected) in enumerate(zip(SCHEMES, kept, strict=True)):
+        for delay, (integrator, expected) in enumerate(zip(SHOWN, kept, strict=True)):
             what = f"m = {mass:g} kg, j = {delay}: "
             closed = float(environment_minimum_damping(MASS_COUPLING, PERIOD, mass, integrator))
             loop = SampledLoop(MASS_COUPLING, PERIOD, mass=mass, integrator=integrator)
@@ -596,7 +596,7 @@ def virtual_mass_section() -> Section:
     # finer where the explicit mass is about to be unstable
     masses = np.union1d(np.geomspace(1e-3, 1, 400), np.linspace(4e-3, 4.4e-3, 100))
     figure, (axes, damper) = panels(1, height=4.4, columns=2)
-    for integrator, colour in zip(SCHEMES, ("C0", "C1", "C3"), strict=True):
+    for integrator, colour in zip(SHOWN, ("C0", "C1", "C3"), strict=True):
         needed = np.asarray(environment_minimum_damping(MASS_COUPLING, PERIOD, masses, integrator))
         shown = np.where(np.isfinite(needed), needed, np.nan)
         axes.semilogx(
@@ -608,7 +608,7 @@ def virtual_mass_section() -> Section:
         )
         min_mass = 1e3 * float(minimum_mass(MASS_COUPLING, PERIOD, integrator))
         if min_mass > 0:
-            delay = SCHEMES.index(integrator)
+            delay = SHOWN.index(integrator)
             name = f"least stable mass, j = {delay}: {min_mass:g} g"
             axes.axvline(min_mass, color=colour, ls=(":", (0, (1, 3)))[delay - 1], label=name)
     axes.axhline(K * PERIOD / 2 + B, color="k", lw=0.8, ls="-.", label="KT/2 + B, (6)")
