@@ -159,14 +159,14 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
             "wrench_on_tool", ticks["wrench_on_tool"], law, "N or N m", "coupling law and poses"
         )
     share, before, fade = ticks["share"], block.share_before, parameters.guarding.fade_ticks
-    most = np.minimum(before + 1 / (block.rise_ticks + 1), 1.0)
-    least = np.maximum(before - 1 / fade, 0.0)
-    risen, fallen = np.abs(share - most), np.abs(share - least)
+    highest = np.minimum(before + 1 / (block.rise_ticks + 1), 1.0)
+    lowest = np.maximum(before - 1 / fade, 0.0)
+    risen, fallen = np.abs(share - highest), np.abs(share - lowest)
     off = np.where(is_let_go(ticks, parameters), fallen, risen)
     off = np.where(has_flag(ticks, TickFlag.STALE_SAMPLE), np.minimum(fallen, risen), off)
     # the watch's cap lies between the two, and the re-simulation checks it
     is_capped = has_flag(ticks, TickFlag.SWINGING | TickFlag.RUNS_AWAY)
-    off = np.where(is_capped, np.maximum(np.maximum(share - most, least - share), 0.0), off)
+    off = np.where(is_capped, np.maximum(np.maximum(share - highest, lowest - share), 0.0), off)
     yield Deviation("share", off, TOLERANCE, "", "buttons, events and flags")
     yield _wrench_deviation(block, parameters)
     is_active = has_flag(ticks, TickFlag.CONTROLLER_ACTIVE)

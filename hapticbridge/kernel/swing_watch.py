@@ -8,14 +8,15 @@ w is the wrench sent (N, N m), δp the motion read (m, rad), both without what s
 Hz; b the device's damping, T the period. A span of 100 ms counts if, for one s of 2, 5, 10 and 20
 ms, E_s is at least 8 mJ and E_0 less than a quarter of it. After three such spans in a row the
 greatest ratio r of the lever between device and handle is halved, hence the stiffness quartered.
-If instead the device, against at least 6 N, gains 0.15 m/s within some 20 ms, the force pushes the
-way that it should resist, and r falls to 0.
+If instead the device gains 0.1 m/s against at least 6 N, within some 30 ms, the force pushes where
+it should resist, and r falls to 0.
 
-Reasons for the numbers: 780 random hands at up to 1.5 Hz on 13 scenes reach 2.5 mJ and 0.09 m/s, a
-hand that taps a wall at 8 Hz with 4 N reaches 4 mJ; devices that are 3 to 20 ms late pass 12 mJ and
-a reversed axis 0.2 m/s before the hand was given 0.2 J. The delays cover swings from 4 to 200 Hz: a
-delay is seen best at a quarter of the swing. A hand that hits a wall at 8 Hz with 10 N and 12 mm
-is taken for a swing, because force and motion are the same then; it loses stiffness, no more.
+Reasons for the numbers: 780 random hands at up to 1.5 Hz on 13 scenes stay below 3 mJ and reach
+0.05 m/s, a hand that taps a wall at 8 Hz with 4 N stays below 5 mJ. Devices 3 to 20 ms late pass 8
+mJ, a reversed axis 0.1 m/s, before the hand was given 0.2 J. The delays cover swings from 4 to 200
+Hz, because a delay is seen best at a quarter of the swing. A hand that hits a wall at 8 Hz with 10
+N and 12 mm is taken for a swing, since force and motion are the same then; it loses stiffness.
+Only forces are watched for their sign, not torques, and a device of less than 6 N never is.
 """
 
 from __future__ import annotations
