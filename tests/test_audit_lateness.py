@@ -57,7 +57,7 @@ def test_a_coupling_within_the_delayed_bound_stays_quiet(tmp_path: Path) -> None
 def test_a_coupling_that_forgets_the_delay_kicks_and_the_audit_says_so(tmp_path: Path) -> None:
     # K T/2 + B = 1.55 N s/m would be borne without the delay; with it 7.5 N s/m are needed
     report, swing = held_to_an_anvil(tmp_path, 3000.0)
-    assert swing > 5e-3
+    assert swing > 3e-3
     assert report.certified is False
     assert (report.verdict, report.port) == ("active", "device")
     assert report.resimulation == "bit for bit"
@@ -65,7 +65,7 @@ def test_a_coupling_that_forgets_the_delay_kicks_and_the_audit_says_so(tmp_path:
 
 def test_a_device_that_hides_its_delay_would_be_certified(tmp_path: Path) -> None:
     report, swing = held_to_an_anvil(tmp_path, 3000.0, delay=0.0)
-    assert swing > 5e-3
+    assert swing > 3e-3
     assert (report.verdict, report.certified) == ("passive", True)
 
 

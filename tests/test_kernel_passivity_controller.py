@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded, tapped, verdict_of
 from bridge_runs import fast
-from faults.catalogue import HEAVY, NO_TRIPS, stiff
+from faults.catalogue import HEAVY, NO_TRIPS, UNWATCHED, stiff
 from faults.rig import CAUSE, Outcome, Rig
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -35,7 +35,7 @@ ACTIVE = int(TickFlag.CONTROLLER_ACTIVE)
 def knocked(folder: Path, factor: float, hand: WorstHand | None, controller: str) -> Outcome:
     rig = Rig(folder)
     stiff(factor, hand, controller)(rig)
-    rig.guard |= NO_TRIPS
+    rig.guard |= NO_TRIPS | UNWATCHED
     return rig.run(CAUSE)
 
 
@@ -67,7 +67,7 @@ def twisted(folder: Path, controller: str) -> Outcome:
     rig.scene = folder / "heavy.xml"
     rig.scene.write_text(HEAVY.replace("<freejoint/>", f"<freejoint/>{inertia}"))
     rig.coupling = Coupling(400.0, 0.0, 1.5 * 2 * 2e-3 / T, 0.0)
-    rig.guard |= NO_TRIPS
+    rig.guard |= NO_TRIPS | UNWATCHED
 
     def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
         if CAUSE <= tick < CAUSE + 5:

@@ -12,9 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.device.base import (
     AXES,
-    USUAL_FORCE_LIMIT,
     USUAL_SPEED_LIMIT,
-    USUAL_TORQUE_LIMIT,
     DeviceInfo,
     checked_period,
 )
@@ -33,6 +31,10 @@ from hapticbridge.pose import (
     store_vector,
 )
 from hapticbridge.record import SAMPLE_DTYPE
+
+UNFELT_FORCE_LIMIT, UNFELT_TORQUE_LIMIT = 100.0, 10.0
+"""Default limits in N and N m of a prescribed motion, which drives no motor. The coupling's force
+level acts on the tool too, so a device's limit here would let a heavy tool drop."""
 
 # Prescribed motion: poses over time, interpolated within a tick
 
@@ -399,8 +401,9 @@ class TrajectoryDevice:
 
     Args:
         motion: Poses over time (``read_motion`` reads them from a CSV file).
-        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
-        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        force_limit: Force level in N of the data sheet, >= 0; it limits the wrench on the tool and
+            the recorded one.
+        torque_limit: Torque level in N m of the data sheet, >= 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
@@ -411,8 +414,8 @@ class TrajectoryDevice:
         self,
         motion: Motion,
         *,
-        force_limit: float = USUAL_FORCE_LIMIT,
-        torque_limit: float = USUAL_TORQUE_LIMIT,
+        force_limit: float = UNFELT_FORCE_LIMIT,
+        torque_limit: float = UNFELT_TORQUE_LIMIT,
         speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         self.info = _prescribed(
@@ -459,8 +462,9 @@ class ReplayDevice:
         ticks: The recording's rows, ``TICK_DTYPE``, at least two.
         period: The recorded loop's period in s; ``start`` accepts no other.
         name: Name of the recording in messages.
-        force_limit: Force limit of the data sheet in N, >= 0; it limits the recorded wrench.
-        torque_limit: Torque limit of the data sheet in N m, >= 0; it limits the recorded wrench.
+        force_limit: Force level in N of the data sheet, >= 0; it limits the wrench on the tool and
+            the recorded one.
+        torque_limit: Torque level in N m of the data sheet, >= 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
 
     Raises:
@@ -474,8 +478,8 @@ class ReplayDevice:
         period: float,
         *,
         name: str = "recording",
-        force_limit: float = USUAL_FORCE_LIMIT,
-        torque_limit: float = USUAL_TORQUE_LIMIT,
+        force_limit: float = UNFELT_FORCE_LIMIT,
+        torque_limit: float = UNFELT_TORQUE_LIMIT,
         speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         if len(ticks) < 2:
