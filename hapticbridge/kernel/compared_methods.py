@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, Scheme, State
+from hapticbridge.kernel.force_level import limited_wrench_after_step
 from hapticbridge.kernel.handle import note_tool, tool_after_step, tool_motion
-from hapticbridge.kernel.law import command_handle_velocity, wrench_after_step
+from hapticbridge.kernel.law import command_handle_velocity
 from hapticbridge.kernel.ledger import set_contact_springs_energy
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.pose import (
@@ -73,7 +74,7 @@ def compared_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Ve
         is_last: True for the last substep of the tick.
     """
     if s.run.scheme == Scheme.ZERO_ORDER_HOLD:
-        return wrench_after_step(s, is_last)
+        return limited_wrench_after_step(s, is_last)
     if s.run.scheme == Scheme.WELD:
         wrench = weld_wrench(s)  # before the kinematics are refreshed
         position, orientation, moved, turned = tool_after_step(s)

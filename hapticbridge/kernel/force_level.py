@@ -78,40 +78,31 @@ def bind_level(
 
 
 @compiled
-def keep_state(s: State) -> None:
-    """Keeps MuJoCo's state before a step."""
+def _copy_state(s: State, is_kept: bool) -> None:
+    """Copies MuJoCo's state to where it is kept, or back."""
     mj = s.mj
     kept = floats(s.level.state_before, mj.nq + mj.nv + mj.na + mj.nhistory + 1)
     end = 0
-    for source, count in (
+    for address, count in (
         (mj.qpos, mj.nq),
         (mj.qvel, mj.nv),
         (mj.act, mj.na),
         (mj.history, mj.nhistory),
         (mj.time, 1),
     ):
-        values = floats(source, count)
+        values = floats(address, count)
         for i in range(count):
-            kept[end + i] = values[i]
+            if is_kept:
+                kept[end + i] = values[i]
+            else:
+                values[i] = kept[end + i]
         end += count
 
 
 @compiled
-def _restore_state(s: State) -> None:
-    mj = s.mj
-    kept = floats(s.level.state_before, mj.nq + mj.nv + mj.na + mj.nhistory + 1)
-    end = 0
-    for target, count in (
-        (mj.qpos, mj.nq),
-        (mj.qvel, mj.nv),
-        (mj.act, mj.na),
-        (mj.history, mj.nhistory),
-        (mj.time, 1),
-    ):
-        values = floats(target, count)
-        for i in range(count):
-            values[i] = kept[end + i]
-        end += count
+def keep_state(s: State) -> None:
+    """Keeps MuJoCo's state before a step, for a repetition of the step."""
+    _copy_state(s, True)
 
 
 @compiled
@@ -178,7 +169,7 @@ def solve_level(s: State) -> bool:
         shares = (level.share[0], level.share[1])
         level.share[0], level.share[1] = wanted[0], wanted[1]
         set_gains(s, 1.0)
-        _restore_state(s)
+        _copy_state(s, False)
         if count == 0:
             mj_kinematics(s.mj.model, s.mj.data)  # forces on bodies act at the start's positions
         mj_step2(s.mj.model, s.mj.data)

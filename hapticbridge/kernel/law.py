@@ -31,11 +31,8 @@ from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.handle import (
     device_from_scene,
-    handle_of_step,
-    note_tool,
     scene_from_device,
     slip_handle,
-    tool_after_step,
 )
 from hapticbridge.kernel.ledger import moment_dot
 from hapticbridge.kernel.mujoco_c import floats
@@ -87,14 +84,15 @@ COUPLING_DTYPE = np.dtype(
         ("gains", "<f8", 6),  # of the actuators: three for forces, three for torques
         ("tuning_goal", "<f8", 12),  # TUNED, then gains
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
-        ("has_passive", "<i8"),
-        ("is_passive", "<f8", 6),  # 1 for an axis of the device without motor
+        ("lacks_motors", "<i8"),
+        ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
         ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
     ]
 )
-"""Sub-record ``coupling``, written by this module alone."""
+"""Sub-record ``coupling``, written by this module alone. ``hold`` is the most force in N and torque
+in N m along axes without motor, ``idle`` those while the hand is let go."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
@@ -151,8 +149,8 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
         coupling[name] = value
     coupling["gains"] = gains
     guarding = parameters.guarding
-    coupling["is_passive"] = [1.0 - (guarding.motors >> i & 1) for i in range(6)]
-    coupling["has_passive"] = guarding.motors != ALL_MOTORS
+    coupling["lacks_motor"] = [1.0 - (guarding.motors >> i & 1) for i in range(6)]
+    coupling["lacks_motors"] = guarding.motors != ALL_MOTORS
     coupling["hold"] = guarding.hold_force, guarding.hold_torque
     coupling["idle"] = guarding.idle_force, guarding.idle_torque
 
@@ -196,24 +194,6 @@ def law_wrench(
         scaled(k.rotational_damping * rate, subtract(handle_turn, turned)),
     )
     return force, torque
-
-
-@compiled
-def wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
-    """Evaluates the law after a step of MuJoCo, and notes the tool's new pose.
-
-    Args:
-        s: The bound state.
-        is_last: True for the last substep of the tick.
-
-    Returns:
-        Force, torque, and the tool's motion and rotation vector since the previous evaluation.
-    """
-    position, orientation, moved, turned = tool_after_step(s)
-    handle = handle_of_step(s, is_last)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-    note_tool(s.pose, position, orientation)
-    return force, torque, moved, turned
 
 
 @compiled
@@ -315,7 +295,7 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
     """Returns a vector whose part along the axes without motor is shortened to a length."""
     axes = s.run.axes
     x, y, z = device_from_scene(axes, v)
-    k = s.coupling.is_passive
+    k = s.coupling.lacks_motor
     part = scene_from_device(axes, (x * k[first], y * k[first + 1], z * k[first + 2]))
     return add(v, subtract(_within(part, length), part))
 
@@ -395,7 +375,7 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
         angle, k.owed[1] = _paid(k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1])
         max_stretch, max_twist = min(max_stretch, length), min(max_twist, angle)
     new, new_twist = _within(stretch, max_stretch), _within(twist, max_twist)
-    if k.has_passive:
+    if k.lacks_motors:
         new = _held(s, new, 0, k.hold[0] / k.stiffness)
         if k.rotational_stiffness > 0.0:
             new_twist = _held(s, new_twist, 3, k.hold[1] / k.rotational_stiffness)

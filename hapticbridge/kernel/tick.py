@@ -351,10 +351,7 @@ def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
         return limited_wrench_after_step(s, is_last)
     if s.run.scheme == Scheme.MIDPOINT:
         return lossless_wrench(s)
-    force, torque, moved, turned = compared_wrench(s, is_last)
-    if s.run.has_law:
-        force, torque = limited_wrench(s, force, torque)
-    return force, torque, moved, turned
+    return compared_wrench(s, is_last)
 
 
 @compiled
