@@ -11,7 +11,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
+from hapticbridge.certificate import (
+    condition_sentences,
+    fresh_share,
+    is_run_certified,
+    run_conditions,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
@@ -248,13 +253,16 @@ class Summary:
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
         timing = state["timing"][0]
+        due = outcome.ticks + outcome.skipped
         times = RunTimes(
             ticks=outcome.ticks,
-            due=outcome.ticks + outcome.skipped,
+            fresh=fresh_share(info, parameters.period, int(state["guard"]["fresh"][0]), due),
+            due=due,
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
             delay_energy=float(timing["most_uncovered"]),
             is_realtime=outcome.is_realtime,
             flags=int(state["watch"]["flags"][0]),
+            has_tripped=outcome.stopped_by == "trip",
         )
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(

@@ -3,8 +3,9 @@
 The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a force that acts at
 once. A run certifies its device only if it kept its time, which means two things.
 
-1. At the time between ticks that the run had on average, T/s with s the share of the deadlines that
-   it kept, and at its mean time t_d from sample to force, the condition still holds:
+1. At the time between new samples that the run had on average, T/s with s the share of the
+   deadlines that it kept, or of the samples that were new if that is less, and at its mean time t_d
+   from sample to force, the condition still holds:
 
        b >= N/s + 3 κ t_d/T,    κ = (K T/2)²/N
 
@@ -50,15 +51,19 @@ class RunTimes:
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         is_realtime: True if real time was requested from the system.
+        fresh: Share of the samples due that were new, 0 to 1.
         flags: Combined flags of the records, or of the watch alone.
+        has_tripped: True if the guard stopped the run.
     """
 
     ticks: int
+    fresh: float
     due: int
     mean_delay: float
     delay_energy: float
     is_realtime: bool
     flags: int = 0
+    has_tripped: bool = False
 
 
 def watch_sentence(flags: int) -> str:
@@ -85,8 +90,9 @@ class Timekeeping:
     """Time that a run kept, and the device condition at this time.
 
     Attributes:
-        rate: Ticks per second that really happened.
+        rate: Ticks with a new sample per second that really happened.
         share: Share of the deadlines that were kept, 0 to 1.
+        fresh: Share of the samples due that were new, 0 to 1.
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         conditions: Device conditions at these times.
@@ -96,10 +102,12 @@ class Timekeeping:
         is_realtime: True if real time was requested from the system.
         watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
         law_evaluations: Evaluations of the law per tick.
+        has_tripped: True if the guard stopped the run.
     """
 
     rate: float
     share: float
+    fresh: float
     mean_delay: float
     delay_energy: float
     conditions: tuple[DampingCondition, ...]
@@ -108,6 +116,7 @@ class Timekeeping:
     is_realtime: bool
     watch: str
     law_evaluations: int
+    has_tripped: bool
 
     @classmethod
     def of(
@@ -115,12 +124,14 @@ class Timekeeping:
     ) -> Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         share = times.ticks / times.due if times.due > times.ticks else 1.0
-        late = tuple(_at_times(each, parameters, share, times.mean_delay) for each in conditions)
+        least = min(share, times.fresh)
+        late = tuple(_at_times(each, parameters, least, times.mean_delay) for each in conditions)
         held = [each.holds for each in late if each.available is not None]
         is_borne = bool(held) and all(each.holds is not False for each in conditions)
         return cls(
-            rate=share / parameters.period if times.ticks else 0.0,
+            rate=least / parameters.period if times.ticks else 0.0,
             share=share,
+            fresh=times.fresh,
             mean_delay=times.mean_delay,
             delay_energy=times.delay_energy,
             conditions=late,
@@ -129,11 +140,13 @@ class Timekeeping:
             is_realtime=times.is_realtime,
             watch=watch_sentence(times.flags),
             law_evaluations=parameters.law_evaluations,
+            has_tripped=times.has_tripped,
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
-        """Returns a verdict on the device, False if time or force were not as it assumes."""
-        return False if self.is_kept is False or (verdict and self.watch) else verdict
+        """Returns a verdict on the device, False if the run was not as it assumes."""
+        is_refuted = bool(self.watch) or self.has_tripped
+        return False if self.is_kept is False or (verdict and is_refuted) else verdict
 
     def device_words(self, verdict: bool | None) -> str:
         """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
@@ -147,12 +160,17 @@ class Timekeeping:
             return f"device not certified: {NOT_KEPT}"
         if self.watch:
             return f"device not certified: {SWUNG}"
+        if self.has_tripped:
+            return "device not certified: the guard stopped the run"
         return f"device not certified: b < {bound}"
 
     @property
     def words(self) -> str:
         """Effective rate and share of the deadlines: ``914 Hz, 91.4 % of the deadlines kept``."""
-        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept"
+        lost = (
+            "" if self.fresh >= self.share else f", {100.0 * self.fresh:.3g} % of the samples new"
+        )
+        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}"
 
     @property
     def clause(self) -> str:

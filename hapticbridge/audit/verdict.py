@@ -28,6 +28,7 @@ from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
     damping_margin,
+    fresh_share,
     is_run_certified,
     run_conditions,
 )
@@ -335,11 +336,13 @@ def _time_facts(
     """Returns the time that a run kept, and its device's verdict and margin at this time."""
     times = RunTimes(
         ticks=timing.ticks,
+        fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
         delay_energy=timing.most_uncovered,
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
         flags=recording.flags,
+        has_tripped=any(event.get("event") == "trip" for event in recording.events),
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)
