@@ -375,12 +375,6 @@ def _prescribed(
     return DeviceInfo(
         name="trajectory",
         axes=AXES,
-        mass=None,
-        damping=None,
-        rotational_inertia=None,
-        rotational_damping=None,
-        friction=None,
-        resolution=None,
         force_limit=force_limit,
         torque_limit=torque_limit,
         speed_limit=speed_limit,

@@ -171,13 +171,6 @@ class SimulatedDevice:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
         _check_hands(hand, rotational_hand, friction)
         self._motion, duration = _target(hand, path)
-        mass = checked_number("mass", mass, "kg", is_positive=True)
-        damping = checked_number("damping", damping, "N s/m")
-        rotational_inertia = checked_number(
-            "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
-        )
-        rotational_damping = checked_number("rotational_damping", rotational_damping, "N m s/rad")
-        friction = checked_number("friction", friction, "N")
         self.info = DeviceInfo(
             name="simulated",
             axes=AXES,
@@ -186,13 +179,11 @@ class SimulatedDevice:
             rotational_inertia=rotational_inertia,
             rotational_damping=rotational_damping,
             friction=friction,
-            resolution=checked_number("resolution", resolution, "m"),
+            resolution=resolution,
             force_limit=force_limit,
             torque_limit=torque_limit,
             speed_limit=speed_limit,
-            rate=None,
             delay=0.0,
-            is_prescribed=False,
             is_real=False,
             duration=duration,
         )
