@@ -115,7 +115,7 @@ def test_energy_change_is_that_of_the_bodys_own_motion() -> None:
     lever = np.stack([-arm[:, 1], arm[:, 0]], axis=-1)
 
     def contact(motion: Array) -> Array:
-        return motion[:, :2] + motion[:, 2:] * lever
+        return np.asarray(motion[:, :2] + motion[:, 2:] * lever)
 
     def kinetic(motion: Array) -> Array:
         moving = mass * (motion[:, :2] ** 2).sum(-1) + inertia * motion[:, 2] ** 2

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +152,7 @@ class HaplyDevice:
         self._is_open, self._is_started = True, False
         self._under_way = self.held_back = 0
         self._pending: tuple[float, ...] | None = None
-        known = {"force_limit": FORCE_LIMIT, **(numbers or {})}
+        known: dict[str, Any] = {"force_limit": FORCE_LIMIT, **(numbers or {})}
         with calling_on_error(self.close):
             messages.refuse_scaled(listed)
             notify(messages.describe_filters(listed, force_gate))
