@@ -363,26 +363,17 @@ def _next_sample(
     sample.buttons = 0
 
 
-def _prescribed(
-    *,
-    duration: float,
-    rate: float | None,
-    force_limit: float,
-    torque_limit: float,
-    speed_limit: float,
-) -> DeviceInfo:
+def _prescribed(duration: float, rate: float | None, **limits: float) -> DeviceInfo:
     """Returns the data sheet of a device that no force moves."""
     return DeviceInfo(
         name="trajectory",
         axes=AXES,
-        force_limit=force_limit,
-        torque_limit=torque_limit,
-        speed_limit=speed_limit,
         rate=rate,
         delay=0.0,
         is_prescribed=True,
         is_real=False,
         duration=duration,
+        **limits,
     )
 
 
