@@ -21,7 +21,7 @@ from hapticbridge.device.base import (
     checked_period,
 )
 from hapticbridge.device.driver import Driver, Notify, UsbId
-from hapticbridge.device.transport.hid import HidApi, Link, opened
+from hapticbridge.device.transport.hid import HidApi, HidLink, opened
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE
@@ -182,7 +182,7 @@ class SpaceMouseDevice:
 
     def __init__(
         self,
-        link: Link,
+        link: HidLink,
         name: str = "spacemouse",
         *,
         speed: float = SPEED,

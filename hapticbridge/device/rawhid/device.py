@@ -33,7 +33,7 @@ from hapticbridge.device.rawhid.protocol import (
     force_frame,
     version_of,
 )
-from hapticbridge.device.transport.hid import HidApi, Link, opened
+from hapticbridge.device.transport.hid import HidApi, HidLink, opened
 from hapticbridge.device.watchdog import (
     SHORTEST_WATCHDOG,
     ForceOffGuardian,
@@ -59,7 +59,7 @@ CHANGES = tuple(name for name in Numbers._fields if name not in ("axes", "rate",
 """Numbers of the data sheet that the user may replace."""
 
 
-def request_sheet(link: Link, name: str) -> tuple[Numbers, str]:
+def request_sheet(link: HidLink, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
     Raises:
@@ -71,7 +71,7 @@ def request_sheet(link: Link, name: str) -> tuple[Numbers, str]:
     return numbers, str(title)
 
 
-def _page(link: Link, name: str, page: int) -> Numbers | str:
+def _page(link: HidLink, name: str, page: int) -> Numbers | str:
     for _ in range(ASKS):
         link.write(b"\0" + ask_frame(page, page))
         for report in reports(link, ASK_WAIT_MS):
@@ -88,7 +88,7 @@ def _page(link: Link, name: str, page: int) -> Numbers | str:
     )
 
 
-def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
+def reports(link: HidLink, timeout_ms: int) -> Iterator[bytes]:
     """Yields reports as they come, for about ``timeout_ms``; a report counts as 1 ms."""
     left = timeout_ms
     while left > 0:
@@ -209,7 +209,7 @@ class RawHidDevice:
 
     def __init__(
         self,
-        link: Link,
+        link: HidLink,
         name: str,
         changes: Mapping[str, Any] | None = None,
         now: Callable[[], float] = time.monotonic,

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from hapticbridge.device.base import calling_on_error
 from hapticbridge.device.driver import Driver, FoundDevice, access_problem, select_device
@@ -212,22 +212,6 @@ FRESH_MS = 2
 LONGEST_WRITE = 0.05
 """Longest time in s for a device to accept a report. A full-speed device is polled every
 millisecond, so after 50 polls it never will; Linux gives up only after 5 s."""
-
-
-class Link(Protocol):
-    """Report transport of a device; ``HidLink`` is the real one."""
-
-    def take(self) -> list[bytes]:
-        """Returns the received reports without waiting."""
-
-    def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report, or an empty one after the timeout."""
-
-    def write(self, report: bytes) -> None:
-        """Sends a report, starting with its number."""
-
-    def close(self) -> None:
-        """Releases the device."""
 
 
 class HidLink:
