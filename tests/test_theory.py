@@ -274,7 +274,7 @@ def test_a_transfer_function_that_returns_rubbish_is_refused(answer: Any, senten
     with pytest.raises(CouplingError, match=sentence):
         p.damping_spectrum_of(lambda _: answer, T, [1.0, 2.0])
     with pytest.raises(CouplingError, match="must be a callable of z"):
-        p.damping_spectrum_of(3, T, [1.0])
+        p.damping_spectrum_of(3, T, [1.0])  # type: ignore[arg-type]
 
 
 def test_an_undamped_mass_at_its_resonance_answers_without_limit() -> None:

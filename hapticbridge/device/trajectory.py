@@ -6,6 +6,7 @@ import math
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -363,7 +364,7 @@ def _next_sample(
     sample.buttons = 0
 
 
-def _prescribed(duration: float, rate: float | None, **limits: float) -> DeviceInfo:
+def _prescribed(duration: float, rate: float | None, **limits: Any) -> DeviceInfo:
     """Returns the data sheet of a device that no force moves."""
     return DeviceInfo(
         name="trajectory",

@@ -20,6 +20,7 @@ import math
 from collections.abc import Mapping
 from ctypes import byref, c_double, c_ushort
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +119,7 @@ class ForceDimensionDevice:
             self.effector_mass = mass.value if is_known and mass.value > 0.0 else None
             what = f"{self._name}: gravity compensation cannot be set"
             dhd.require("dhdSetGravityCompensation", int(gravity), self._id, what=what)
-            known = dict(numbers or {})
+            known: dict[str, Any] = dict(numbers or {})
             library_limits = [
                 float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")
             ]
