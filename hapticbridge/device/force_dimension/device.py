@@ -128,7 +128,7 @@ class ForceDimensionDevice:
             self.info = DeviceInfo(
                 name=self._name,
                 axes=AXES if self._turns else AXES[:3],
-                **{name: known.get(name) for name in MEASURED},
+                **{name: known[name] for name in MEASURED if name in known},
                 force_limit=limits[0],
                 torque_limit=limits[1],
                 rate=rate,
