@@ -238,7 +238,7 @@ def test_fields_of_a_grid_are_its_own_and_cannot_be_written() -> None:
     stiffness = np.array([1.0, 2.0])
     grid = CouplingGrid(stiffness, 1.0)
     stiffness[0] = 7.0
-    for field in (grid.stiffness, grid.damping, grid.rotational_stiffness):
+    for field in (grid.stiffness, grid.damping):
         array = np.asarray(field)
         assert not array.flags.writeable
         with pytest.raises(ValueError, match="read-only"):
@@ -309,17 +309,6 @@ def test_no_two_angles_of_the_search_are_equal_but_for_rounding(delay: int, lag:
     grid = search_grid(delay, lag)
     assert grid[-1] == np.pi
     assert (np.diff(grid) > 1e-3 * grid[:-1]).all()
-
-
-def test_worst_frequency_of_a_rotation_is_that_of_its_own_pair() -> None:
-    coupling = Coupling(1000, 0.1, 1.0, 2e-3)
-    turned = Coupling(1.0, 2e-3, 0, 0)
-    assert worst_frequency(coupling, T, delay=1, axis="rotation") == worst_frequency(
-        turned, T, delay=1
-    )
-    assert worst_frequency(coupling, T, delay=1, axis="rotation") != worst_frequency(
-        coupling, T, delay=1
-    )
 
 
 def test_tustins_damper_is_worst_at_nyquist_unless_there_is_none_or_a_low_pass() -> None:

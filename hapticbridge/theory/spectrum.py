@@ -17,7 +17,6 @@ from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.transfer import (
-    Axis,
     CouplingGrid,
     Discretization,
     SampledLaw,
@@ -70,7 +69,6 @@ def damping_spectrum(
     discretization: Discretization = "backward",
     delay: int = 0,
     filter_time: float = 0.0,
-    axis: Axis = "translation",
 ) -> NDArray[np.float64]:
     """Returns the device damping that a coupling requires at each frequency.
 
@@ -83,13 +81,13 @@ def damping_spectrum(
     negative.
 
     Returns:
-        b in N s/m (rotation: N m s/rad), shape S + F for couplings of shape S and frequencies ω in
+        b in N s/m, shape S + F for couplings of shape S and frequencies ω in
         rad/s of shape F; inf where none suffices.
 
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time)
     period, delay, filter_time = law.period, law.delay, law.filter_time
     theta = angles(frequency, period)
     stiffness, damping = (
