@@ -21,6 +21,7 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
+from hapticbridge.device.base import calling_on_error
 from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, choices
 from hapticbridge.guard import (
     CONTROLLERS,
@@ -219,11 +220,8 @@ def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator
         return
     refuse_simulated_time(device, clock)
     opened = device_for(scene, device)
-    try:
+    with calling_on_error(opened.close):
         yield opened
-    except BaseException:
-        opened.close()
-        raise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

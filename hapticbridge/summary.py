@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -128,19 +128,8 @@ class Ledger:
         return {name: value for name, value in asdict(self).items() if name in _ENERGIES[:-1]}
 
 
-_ENERGIES = (
-    "kinetic",
-    "potential",
-    "coupling_work",
-    "actuator_work",
-    "external_work",
-    "environment_energy",
-    "device_energy",
-    "slack",
-    "slack_share",
-)
-
-_TICKS = ("first_unstrict", "first_active", "first_device_excess")
+_NAMES = tuple(field.name for field in fields(Ledger))
+_ENERGIES, _TICKS = _NAMES[:9], _NAMES[9:]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

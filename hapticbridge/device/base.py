@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol
@@ -15,6 +16,17 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
+
+
+@contextmanager
+def calling_on_error(close: Callable[[], None]) -> Iterator[None]:
+    """Calls a function if the block fails, such as ``close`` of a device or of its link."""
+    try:
+        yield
+    except BaseException:
+        close()
+        raise
+
 
 # Data sheet of a haptic device
 

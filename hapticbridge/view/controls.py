@@ -127,7 +127,7 @@ class Sliders:
         self, gui: viser.GuiApi, span: AxisCouplingLimits, want: Callable[[], None]
     ) -> None:
         self.span = span
-        stiffness, damping = span.gains(span.start)
+        stiffness, damping = span.gains(span.run.start)
         self._steps = (
             _step(max(span.max_stiffness(0.0), stiffness)),
             _step(max(span.max_damping(span.min_stiffness), damping)),

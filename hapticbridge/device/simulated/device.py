@@ -178,13 +178,6 @@ class SimulatedDevice:
             raise DeviceError(f"dof = {dof!r}: must be 3 or 6 degrees of freedom")
         _check_hands(hand, rotational_hand, friction)
         self._motion, duration = _target(hand, path)
-        mass = checked_number("mass", mass, "kg", is_positive=True)
-        damping = checked_number("damping", damping, "N s/m")
-        rotational_inertia = checked_number(
-            "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
-        )
-        rotational_damping = checked_number("rotational_damping", rotational_damping, "N m s/rad")
-        friction = checked_number("friction", friction, "N")
         self.info = DeviceInfo(
             name="simulated",
             axes=AXES[:dof],
@@ -193,13 +186,11 @@ class SimulatedDevice:
             rotational_inertia=rotational_inertia,
             rotational_damping=rotational_damping,
             friction=friction,
-            resolution=checked_number("resolution", resolution, "m"),
+            resolution=resolution,
             force_limit=force_limit,
             torque_limit=torque_limit,
             speed_limit=speed_limit,
-            rate=None,
             delay=None if delay else 0.0,  # in samples, so its time is not known yet
-            is_prescribed=False,
             is_real=False,
             duration=duration,
             buttons=0,

@@ -488,11 +488,9 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
     return np.array(
         [
             quantization_limit(
-                SimulatedDevice(
-                    damping=float(b) * STIFFNESS * PERIOD,
-                    friction=float(s) * QUANTUM,
-                    resolution=RESOLUTION,
-                ).info,
+                float(b) * STIFFNESS * PERIOD,
+                float(s) * QUANTUM,
+                RESOLUTION,
                 coupling,
                 PERIOD,
             ).region

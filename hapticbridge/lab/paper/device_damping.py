@@ -63,10 +63,9 @@ def any_coupling() -> Section:
     for every environment.
     """
     omega = THETA / PERIOD
-    digital = signal.dlti([K + B / PERIOD, -B / PERIOD], [1, 0], dt=PERIOD)
     curves = {
         "spring": damping_spectrum_of(lambda z: np.full_like(z, K), PERIOD, omega),
-        "spring and damper (4)": damping_spectrum_of(digital, PERIOD, omega),
+        "spring and damper (4)": damping_spectrum_of(lambda z: delayed(z) * z, PERIOD, omega),
         f"the same, damper low-passed with τ = {TAU * 1e3:g} ms": damping_spectrum_of(
             low_passed, PERIOD, omega
         ),
