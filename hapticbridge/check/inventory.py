@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import ROW_KINDS, Observation, reached_trees
+from hapticbridge.check.observe import Observation, reached_trees
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contacts import meeting_pairs
@@ -117,7 +117,11 @@ def take_inventory(
         triangles=_hull_triangles(model, uses),
         possible_pairs=len(possible),
         met_pairs=None if observation is None else len(met),
-        rows=None if observation is None else _rows(observation),
+        rows=observation
+        and {
+            kind: (int(rows.max()), float(np.median(rows)))
+            for kind, rows in observation.rows.items()
+        },
         stiffness=(
             min(meeting.softest for meeting in carried),
             max(meeting.stiffest for meeting in carried),
@@ -167,13 +171,6 @@ def _uses(
         else:
             uses.append(MOVING if moves[geom] else FIXED)
     return uses
-
-
-def _rows(observation: Observation) -> dict[str, tuple[int, float]]:
-    return {
-        kind: (int(observation.rows[kind].max()), float(np.median(observation.rows[kind])))
-        for kind in ROW_KINDS
-    }
 
 
 def _hull_triangles(model: mujoco.MjModel, uses: list[str]) -> int:

@@ -118,11 +118,7 @@ class Places:
 
     def with_attribute(self, attribute: str) -> Place | None:
         """Returns the first element of any tag that has an attribute."""
-        for file, elements in self._files:
-            for element in elements:
-                if attribute in element.attributes:
-                    return Place(file, element.line, _describe(element))
-        return None
+        return self._first((), lambda element: attribute in element.attributes)
 
     def attributes_at(self, place: Place) -> dict[str, str]:
         """Returns the attributes written at a place, without inherited defaults."""
@@ -172,9 +168,10 @@ class Places:
         return Place(self._main, 0, label)
 
     def _first(self, tags: tuple[str, ...], fits: Callable[[Element], bool]) -> Place | None:
+        """Returns the first element with one of some tags, or with any if there are none."""
         for file, elements in self._files:
             for element in elements:
-                if element.tag in tags and fits(element):
+                if (not tags or element.tag in tags) and fits(element):
                     return Place(file, element.line, _describe(element))
         return None
 

@@ -49,8 +49,7 @@ class Bound:
 
     def execute(self) -> int:
         """Computes and prints; returns the exit code."""
-        if self.plot is not None:
-            check_ending(self.plot)
+        check_ending(self.plot)
         b = self.device_damping
         if b is not None:
             scalar("device damping", b, "N s/m", positive=True)

@@ -69,8 +69,7 @@ class Zwidth:
 
     def execute(self) -> int:
         """Computes and prints; returns the exit code."""
-        if self.plot is not None:
-            check_ending(self.plot)
+        check_ending(self.plot)
         if self.axis is not None and self.measure is None:
             raise HapticBridgeError("--axis goes with --measure DEVICE")
         period, axis = period_of(self.rate), self.axis or "x"

@@ -224,8 +224,8 @@ class Controls:
         # state of the run, now or after the waiting commands
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
         self._is_forced, self._is_clutched = True, False
-        self._force.on_update(by_hand(self._switch_force))
-        self._clutch.on_update(by_hand(self._switch_clutch))
+        self._force.on_update(by_hand(lambda: self._switch(force=bool(self._force.value))))
+        self._clutch.on_update(by_hand(lambda: self._switch(clutch=bool(self._clutch.value))))
         reset.on_click(lambda _: ask(Reset()))
         mark.on_click(lambda _: ask(Mark()))
         stop.on_click(lambda _: ask(Stop()))
@@ -243,13 +243,9 @@ class Controls:
             except CommandError as error:
                 self._refuse(str(error))
 
-    def _switch_force(self) -> None:
+    def _switch(self, **state: bool) -> None:
         with self._turn:
-            self._ask(Switch(force=bool(self._force.value)))
-
-    def _switch_clutch(self) -> None:
-        with self._turn:
-            self._ask(Switch(clutch=bool(self._clutch.value)))
+            self._ask(Switch(**state))
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Handles an event; the controls then show the state of the run, not the request."""

@@ -13,6 +13,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from hapticbridge.check.physics import matrix_of
+
 Array = NDArray[np.float64]
 
 SHOWN_GROUPS = 3
@@ -264,9 +266,7 @@ def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:
     for prop in props_of(model):
         if model.body_weldid[prop.body] != tool:
             continue
-        own = np.zeros(9)
-        mujoco.mju_quat2Mat(own, prop.turn)
-        local = prop.mesh.vertices @ own.reshape(3, 3).T + prop.place
+        local = prop.mesh.vertices @ matrix_of(prop.turn).T + prop.place
         world = local @ data.xmat[prop.body].reshape(3, 3).T + data.xpos[prop.body]
         part = trimesh.Trimesh((world - place) @ turn, prop.mesh.faces)
         part.merge_vertices(merge_norm=True, merge_tex=True)

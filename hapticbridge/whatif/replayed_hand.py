@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -86,19 +86,11 @@ class Outside:
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
         self._pressed, self._period = ticks["buttons"].copy(), period
         self._stale = ticks["flags"] & _STALE
-        self._rows: Iterator[int] = iter(())
+        self._tick, self._share = 0, 1.0
 
     def start(self, period: float) -> None:
         """Starts at the first tick of a loop with this period in s."""
-        share, last = period / self._period, len(self._pressed) - 1
-
-        def rows() -> Iterator[int]:
-            tick = 0
-            while True:
-                yield min(int(tick * share + 1e-9), last)  # a period in decimals is rounded
-                tick += 1
-
-        self._rows = rows()
+        self._tick, self._share = 0, period / self._period
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Puts the next tick's buttons into a sample; after the last tick they stay.
@@ -106,7 +98,9 @@ class Outside:
         Returns:
             ``STALE_SAMPLE`` for a stale sample, else 0.
         """
-        row = next(self._rows)
+        row = int(self._tick * self._share + 1e-9)  # a period in decimals is rounded
+        row = min(row, len(self._stale) - 1)
+        self._tick += 1
         sample["buttons"] = self._pressed[row]
         return int(self._stale[row])
 

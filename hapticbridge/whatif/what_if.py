@@ -139,7 +139,7 @@ def what_if(
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
         HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
-    progress = progress or _silent
+    progress = progress or (lambda _done, _total, _name: None)
     progress(0, 4, "auditing what was recorded")
     report = audit(path, strict=strict)
     if report.verdict == "invalid":
@@ -163,8 +163,8 @@ class _Experiment:
         *,
         strict: bool,
     ) -> None:
-        self._run, self._report, self._folder, self._progress = run, report, folder, progress
-        self._strict = strict
+        self._run, self._report, self._progress = run, report, progress
+        self._strict, self._path = strict, folder / "run.mcap"
         self._ticks, self._period = run.recording.ticks, run.parameters.period
         if len(self._ticks) < 3:
             raise RecordingError(
@@ -183,7 +183,9 @@ class _Experiment:
                 "the attached scene does not compile to the recorded model: a program changed it "
                 "after loading, or it was compiled elsewhere; these runs lack that change"
             )
-        runs = [self._as_recorded()]
+        peaks = self._peaks(self._ticks)
+        recorded = WhatIfRun(RECORDED, self._report, peaks, run.trip, self._period, run.recording)
+        runs = [recorded]
         self._progress(1, 4, "the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
@@ -197,7 +199,9 @@ class _Experiment:
         else:
             self._progress(2, 4, "the model hand, nothing changed")
             same = self._closed(settings)
-            hand_error = self._hand_error(same)
+            count = min(len(same.ticks), len(self._ticks))
+            off = same.ticks["device_position"][:count] - self._ticks["device_position"][:count]
+            hand_error = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
             self._progress(3, 4, "the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
@@ -210,10 +214,6 @@ class _Experiment:
         return WhatIf(
             run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self._concerns)
         )
-
-    def _as_recorded(self) -> WhatIfRun:
-        recording, peaks = self._run.recording, self._peaks(self._ticks)
-        return WhatIfRun(RECORDED, self._report, peaks, self._run.trip, self._period, recording)
 
     def _peaks(self, ticks: NDArray[np.void]) -> dict[str, float]:
         return _peaks(ticks, is_held=not self._run.info.is_prescribed)
@@ -235,11 +235,6 @@ class _Experiment:
         device = IdentifiedDevice(run.info, hand, self._ticks, self._period, run.anchor_pose)
         return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
-    def _hand_error(self, same: WhatIfRun) -> float:
-        count = min(len(same.ticks), len(self._ticks))
-        off = same.ticks["device_position"][:count] - self._ticks["device_position"][:count]
-        return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
     def _simulated(self, name: str, device: Device, clock: Clock, settings: Settings) -> WhatIfRun:
         repetition, path = Repetition(self._run, settings), self._path
         period, trip = repetition.into(path, device, clock)
@@ -248,10 +243,6 @@ class _Experiment:
         recording = read_recording(path)
         report = audit(path, strict=self._strict)
         return WhatIfRun(name, report, self._peaks(recording.ticks), trip, period, recording)
-
-    @property
-    def _path(self) -> Path:
-        return self._folder / "run.mcap"
 
     def _agreement(self) -> str:
         found = compare(self._run.recording.path, self._path)
@@ -306,7 +297,3 @@ def _peaks(ticks: NDArray[np.void], *, is_held: bool) -> dict[str, float]:
         "torque on tool": largest(tool[:, 3:]),
         "stretch": largest(ticks["handle_position"] - ticks["tool_position"]),
     }
-
-
-def _silent(_done: int, _total: int, _name: str) -> None:
-    """Ignores the progress."""
