@@ -117,11 +117,7 @@ def take_inventory(
         triangles=_hull_triangles(model, uses),
         possible_pairs=len(possible),
         met_pairs=None if observation is None else len(met),
-        rows=observation
-        and {
-            kind: (int(rows.max()), float(np.median(rows)))
-            for kind, rows in observation.rows.items()
-        },
+        rows=None if observation is None else _rows(observation),
         stiffness=(
             min(meeting.softest for meeting in carried),
             max(meeting.stiffest for meeting in carried),
@@ -171,6 +167,11 @@ def _uses(
         else:
             uses.append(MOVING if moves[geom] else FIXED)
     return uses
+
+
+def _rows(observation: Observation) -> dict[str, tuple[int, float]]:
+    rows = observation.rows.items()
+    return {kind: (int(each.max()), float(np.median(each))) for kind, each in rows}
 
 
 def _hull_triangles(model: mujoco.MjModel, uses: list[str]) -> int:
