@@ -204,7 +204,10 @@ def measure_cost(
     free, contact = TimingStats.of(time_of[is_free]), TimingStats.of(time_of[~is_free])
     all_ticks = TimingStats.of(time_of)
     medians = {
-        name: tuple(TimingStats.of(times[is_in]).median for is_in in (touching == 0, touching > 0))
+        name: (
+            TimingStats.of(times[touching == 0]).median,
+            TimingStats.of(times[touching > 0]).median,
+        )
         for name, times in stages.items()
     }
     whole = [sum(each[k] for each in medians.values()) for k in (0, 1)]

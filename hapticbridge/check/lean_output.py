@@ -143,12 +143,13 @@ def lean_rows(lean: Lean) -> list[Row]:
 
 def trial_facts(trial: VariantVerdict) -> Row:
     """Returns one trial as a dictionary; values that a failed trial lacks are None."""
+    error = trial.error
     return {
         "name": trial.name,
         "verdict": trial.verdict,
         "loses": trial.loses,
         "cost_ratio": trial.cost,
-        **{name: trial.error and felt(trial.error) for name, felt in _FELT.items()},
+        **{n: None if error is None else felt(error) for n, felt in _FELT.items()},
         "environment": trial.environment,
         "mujoco_warnings": trial.warnings,
         "needed_damping_ns_per_m": trial.needed_damping,

@@ -419,12 +419,9 @@ class Check:
 
     def _coupling(self, period: float) -> Coupling:
         info = SimulatedDevice().info
-        coupling = default_coupling(info, period, self.scale, self.scale)
-        if self.stiffness is not None:
-            coupling = replace(coupling, stiffness=self.stiffness)
-        if self.damping is not None:
-            coupling = replace(coupling, damping=self.damping)
-        return coupling
+        asked = {"stiffness": self.stiffness, "damping": self.damping}
+        gains = {name: gain for name, gain in asked.items() if gain is not None}
+        return replace(default_coupling(info, period, self.scale, self.scale), **gains)
 
 
 def _picture(case: SceneUnderCheck, cost: Cost | None, lean: Lean | None) -> Figure | None:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
 
@@ -56,7 +56,7 @@ class Stability:
             if not self.as_json:
                 _print(each, files)
         if self.as_json:
-            out.print_json(json.dumps(facts))
+            print_json(facts)
         return 0
 
     def _computed(self, each: StabilityMap) -> MapFiles:

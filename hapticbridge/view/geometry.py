@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from hapticbridge.check.physics import matrix_of
+from hapticbridge.check.physics import matrix_of, mesh_of
 
 Array = NDArray[np.float64]
 
@@ -118,10 +118,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float64], NDArr
         return corners, np.arange(len(corners)).reshape(-1, 3)
     if kind in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
         # MuJoCo also has a mesh of a signed distance field, at its zero level
-        mesh = int(model.geom_dataid[geom])
-        first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-        start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-        return model.mesh_vert[first : first + count], model.mesh_face[start : start + faces]
+        return mesh_of(model, int(model.geom_dataid[geom]))
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
         side = PLANE_SIDE * model.stat.extent
         x, y = (size[axis] or 0.5 * side for axis in (0, 1))
