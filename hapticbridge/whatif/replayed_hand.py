@@ -434,8 +434,8 @@ class IdentifiedDevice(SimulatedDevice):
     """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
 
     Unlike a prescribed motion (``again``), the hand yields to the force. It needs mass and damping
-    (``missing_for_closed_loop``) and at least three rows. Until the first tick the device is held at
-    ``anchor_pose``.
+    (``missing_for_closed_loop``) and at least three rows. Until the first tick the device is held
+    at ``anchor_pose``.
     """
 
     def __init__(self, run: RecordedRun, hand: Hand) -> None:
