@@ -437,6 +437,7 @@ def guard_parameters_for(
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
+        full_speed=info.speed_limit,
         energy=limits.energy,
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,

@@ -347,7 +347,7 @@ def _guard_runs() -> Iterator[tuple[str, Run]]:
         Run(
             LIGHT,
             lambda: Scripted(damping=0.1, rotational_damping=1e-4),
-            {"method": "implicitfast", "coupling": COUPLING, "limits": {"energy": 1e-5}},
+            {"method": "implicitfast", "coupling": COUPLING, "limits": {"energy": 1e-3}},
         ),
     )
     yield "trip: not a number", Run(PEG, lambda: Scripted(broken))

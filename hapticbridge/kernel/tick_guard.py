@@ -52,6 +52,7 @@ _FROM_PARAMETERS = (
     "dead_man",
     "has_hand",
     "reach",
+    "full_speed",
 )
 _THRESHOLDS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
@@ -59,6 +60,7 @@ GUARD_DTYPE = np.dtype(
     [
         *((name, "<i8") for name in _FROM_PARAMETERS[:5]),
         ("reach", "<f8"),
+        ("full_speed", "<f8"),
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),

@@ -75,6 +75,7 @@ _GUARD = {
     "has_hand": "",
     "stretch": "m",
     "angle": "rad",
+    "full_speed": "m/s",
     "speed": "m/s",
     "turn_speed": "rad/s",
     "energy": "J",
