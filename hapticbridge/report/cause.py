@@ -25,6 +25,7 @@ from hapticbridge.certificate import (
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TickFlag
 from hapticbridge.recording.reader import BLOCK
+from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.contacts import check_contacts, geom_name
 
@@ -156,9 +157,8 @@ unit. One in fifty is jitter between two clocks."""
 def cause_at_device(evidence: Evidence, window: slice) -> Cause:
     """Returns the likely cause of unpaid energy at the device."""
     method = evidence.method
-    hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
     if not method.has_law:
-        return hazard
+        return _method_cause(method)
     conditions = run_conditions(evidence.info, evidence.worst, method)
     failing = [condition for condition in conditions if condition.holds is False]
     if found := _delay_cause(evidence, failing):
@@ -170,7 +170,11 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
         return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
     if failing:
         return _overload_cause(evidence, failing)
-    return hazard if method.hazard else _unknown_cause(evidence)
+    return _method_cause(method) if method.hazard else _unknown_cause(evidence)
+
+
+def _method_cause(method: Method, where: str = "") -> Cause:
+    return Cause("method", f"{where}method '{method.name}': {method.hazard}", SAFE_METHOD)
 
 
 def _failing_words(failing: list[DampingCondition]) -> str:
@@ -356,11 +360,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         concern, _, remedy = concerns[0].rpartition("; write ")
         return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
-        return Cause(
-            "method",
-            f"{where}, whose setting is as recommended; method '{method.name}': {method.hazard}",
-            SAFE_METHOD,
-        )
+        return _method_cause(method, f"{where}, whose setting is as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
@@ -368,7 +368,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
-        return Cause("method", f"{where}; method '{method.name}': {method.hazard}", SAFE_METHOD)
+        return _method_cause(method, f"{where}; ")
     if turned > FAST_TURN:
         return Cause(
             "rate",
