@@ -23,12 +23,7 @@ from hapticbridge.lab.maps.base import (
     needed_by_6,
     used_damping,
 )
-from hapticbridge.lab.maps.coupling import (
-    DEVICE_DAMPING,
-    PATH,
-    PERIOD,
-    evaluate,
-)
+from hapticbridge.lab.maps.coupling import DEVICE_DAMPING, PATH, PERIOD, evaluate
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 

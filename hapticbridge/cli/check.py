@@ -18,7 +18,7 @@ from rich.table import Table
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, SceneUnderCheck, open_case
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
-from hapticbridge.check.fault import Fault, length
+from hapticbridge.check.fault import Fault, length, others, weight
 from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,
@@ -163,13 +163,11 @@ def print_case(case: SceneUnderCheck) -> None:
 def print_inventory(inventory: Inventory) -> None:
     """Prints what the scene models."""
     out.print("\n[bold]What it models[/]")
-    mass = inventory.tool_mass
     uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
     lines = {
         "bodies": f"{inventory.bodies}, {inventory.moving_bodies} of them moving",
         "degrees of freedom": f"{inventory.degrees_of_freedom}, "
-        f"{inventory.tool_degrees_of_freedom} of them the tool's "
-        + (f"({mass:.3g} kg)" if mass >= 0.1 else f"({1e3 * mass:.3g} g)"),
+        f"{inventory.tool_degrees_of_freedom} of them the tool's ({weight(inventory.tool_mass)})",
         "geoms": ": ".join(filter(None, (str(sum(inventory.geoms.values())), uses))),
     }
     if inventory.triangles:
@@ -201,7 +199,7 @@ def print_inventory(inventory: Inventory) -> None:
     if reasons:
         out.print("  cannot be felt")
     for reason, names in reasons.items():
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        more = others(len(names) - MAX_NAMED)
         out.print(f"    {reason}: {plain(', '.join(names[:MAX_NAMED]))}{more}")
 
 
