@@ -19,7 +19,7 @@ _TAGS = {
 """Tags of a kind of element where they differ from its name."""
 
 _LISTS = {"body": "bodies", "equality": "equalities", "mesh": "meshes"}
-"""Lists of ``mujoco.MjSpec`` that are not called after their kind and an s."""
+"""Lists of an MjSpec that are not called after their kind and an s."""
 
 
 @dataclass(frozen=True, slots=True)
