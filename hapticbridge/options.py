@@ -309,6 +309,11 @@ class RunSetup:
             scale=scales[0],
             controller=options.controller,
         )
+        for button, purpose in ((options.clutch, "--clutch"), (options.dead_man, "--dead-man")):
+            if button is not None and info.buttons is not None and button >= info.buttons:
+                raise DeviceError(
+                    f"{purpose} {button}: the device '{info.name}' has {info.buttons} buttons"
+                )
         guard = replace(
             guard,
             clutch=button_mask(options.clutch, "clutch"),

@@ -53,25 +53,6 @@ def was_never_lossless(count: int, flags: int) -> bool:
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
 
 
-def watch_sentence(flags: int) -> str:
-    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
-
-    Args:
-        flags: Combined flags of a run's records; without the watch's own the text is empty.
-    """
-    if flags & int(TickFlag.RUNS_AWAY):
-        return (
-            "the force was taken away because the device gained speed against it: an axis is "
-            "reversed (check the axes and signs of the device) or the force comes very late"
-        )
-    if flags & int(TickFlag.SWINGING):
-        return (
-            "the force was lowered because it swung as that of a late device does: lower "
-            "--stiffness, and measure the device's delay ('hapticbridge identify')"
-        )
-    return ""
-
-
 # Energies metered by the kernel, and the environment's verdict
 
 Environment = Literal["strict", "within slack", "active"]
@@ -214,14 +195,14 @@ class Summary:
             metering; for any other the audit of the recording decides.
         conditions: Device conditions, as sentences.
         is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation, and the run kept its time. None if its damping is unknown, or
+            translation and rotation, the run kept its time, and the force did not swing as a late
+            one does. None if its damping is unknown, or
             if no coupling law makes the condition sufficient.
         timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
-        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
     """
 
     ticks: int
@@ -247,7 +228,6 @@ class Summary:
     stopped_by: str
     recording: Path | None
     reach: float | None
-    watch: str
 
     @property
     def verdict(self) -> str:
@@ -274,6 +254,7 @@ class Summary:
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
             delay_energy=float(timing["most_uncovered"]),
             is_realtime=outcome.is_realtime,
+            flags=int(state["watch"]["flags"][0]),
         )
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
@@ -304,5 +285,4 @@ class Summary:
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
-            watch=watch_sentence(int(state["watch"]["flags"][0])),
         )

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from hapticbridge.certificate import DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.timing import DELAY_PRICE
+from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
 
 INSTANT = 1e-3
@@ -34,6 +35,9 @@ larger one can be felt."""
 
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
+
+SWUNG = "its force came late or reversed"
+"""Words for what the watch found (``kernel.swing_watch``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,7 @@ class RunTimes:
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         is_realtime: True if real time was requested from the system.
+        flags: Combined flags of the records, or of the watch alone.
     """
 
     ticks: int
@@ -53,6 +58,26 @@ class RunTimes:
     mean_delay: float
     delay_energy: float
     is_realtime: bool
+    flags: int = 0
+
+
+def watch_sentence(flags: int) -> str:
+    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
+
+    Args:
+        flags: Combined flags of a run's records; without the watch's own the text is empty.
+    """
+    if flags & int(TickFlag.RUNS_AWAY):
+        return (
+            "the force was taken away because the device gained speed against it: an axis is "
+            "reversed (check the axes and signs of the device) or the force comes very late"
+        )
+    if flags & int(TickFlag.SWINGING):
+        return (
+            "the force was lowered because it swung as that of a late device does: lower "
+            "--stiffness, and measure the device's delay ('hapticbridge identify')"
+        )
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +90,12 @@ class Timekeeping:
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         conditions: Device conditions at these times.
+        in_time: The same for ticks and forces in time.
         is_kept: True if all conditions hold and the energy is at most ``INSTANT``; None if no
             condition holds even for a run in time.
         is_realtime: True if real time was requested from the system.
+        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
+        law_evaluations: Evaluations of the law per tick.
     """
 
     rate: float
@@ -75,8 +103,11 @@ class Timekeeping:
     mean_delay: float
     delay_energy: float
     conditions: tuple[DampingCondition, ...]
+    in_time: tuple[DampingCondition, ...]
     is_kept: bool | None
     is_realtime: bool
+    watch: str
+    law_evaluations: int
 
     @classmethod
     def of(
@@ -93,13 +124,30 @@ class Timekeeping:
             mean_delay=times.mean_delay,
             delay_energy=times.delay_energy,
             conditions=late,
+            in_time=tuple(conditions),
             is_kept=all(held) and times.delay_energy <= INSTANT if is_borne else None,
             is_realtime=times.is_realtime,
+            watch=watch_sentence(times.flags),
+            law_evaluations=parameters.law_evaluations,
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
-        """Returns a verdict on the device, False if the run did not keep its time."""
-        return False if self.is_kept is False else verdict
+        """Returns a verdict on the device, False if time or force were not as it assumes."""
+        return False if self.is_kept is False or (verdict and self.watch) else verdict
+
+    def device_words(self, verdict: bool | None) -> str:
+        """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
+        count = self.law_evaluations
+        bound = "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
+        if verdict:
+            return f"device certified{self.clause}: b >= {bound}"
+        if verdict is None:
+            return "device not judged: nothing proves that it bears the coupling"
+        if self.is_kept is False:
+            return f"device not certified: {NOT_KEPT}"
+        if self.watch:
+            return f"device not certified: {SWUNG}"
+        return f"device not certified: b < {bound}"
 
     @property
     def words(self) -> str:
@@ -119,7 +167,7 @@ class Timekeeping:
     def remedy(self) -> str:
         """Changes that help a run to keep its time."""
         request = "" if self.is_realtime else "--realtime, "
-        return f"{request}less stiffness, or a --rate that 'hapticbridge check' finds possible"
+        return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
 
     @property
     def hint(self) -> str:
@@ -130,17 +178,23 @@ class Timekeeping:
 
     @property
     def fault(self) -> str:
-        """Sentence on the time that was not kept, with the remedy; empty if it was."""
+        """Sentence on the time that was not kept or on a late force, with the remedy; or empty."""
+        return "; ".join(text for text in (self._not_kept, self.watch) if text)
+
+    @property
+    def _not_kept(self) -> str:
         if self.is_kept is not False:
             return ""
         late = f" and {format_si(self.mean_delay, 's')} from sample to force"
         at_times = f"at {self.rate:.4g} Hz{late if self.mean_delay else ''} it needs"
-        failed = [each for each in self.conditions if each.holds is False]
+        pairs = zip(self.conditions, self.in_time, strict=True)
+        failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
-            unit = "N s/m" if failed[0].axis == "translation" else "N m s/rad"
+            late_one, usual = failed[0]
+            unit = "N s/m" if usual.axis == "translation" else "N m s/rad"
             found = (
-                f"{at_times} {failed[0].needed:.3g} {unit} of damping in {failed[0].axis} and has "
-                f"{failed[0].available:.3g}"
+                f"{at_times} {late_one.needed:.3g} {unit} of damping in {usual.axis}, not "
+                f"{usual.needed:.3g} as in time, and has {usual.available:.3g}"
             )
         else:
             found = (

@@ -179,7 +179,7 @@ class Scripted(ScriptedDevice):
         functions = {name: options.pop(name) for name in ("buttons", "is_stale") if name in options}
         super().__init__(pose, **functions)
         sheet = hb.open_device("simulated").info
-        self.info = replace(sheet, name="scripted", duration=None, **options)
+        self.info = replace(sheet, name="scripted", duration=None, buttons=None, **options)
 
 
 def command(bridge: hb.Bridge, asked: Command) -> None:

@@ -30,7 +30,6 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.sweep.results import Interrupted, Table
-from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
@@ -59,11 +58,13 @@ def print_audits(table: Table) -> None:
         name = plain(file) + (" [yellow](cut)[/]" if cut[row] == 1 else "")
         out.print(f"{margin:>8}  {coloured} {duration:>8}  {name}")
         if codes[row]:
-            out.print(f"{'':>10}{_why(verdict, reason, str(table.texts('certified')[row]))}")
+            out.print(f"{'':>10}{plain(' '.join(reason.splitlines()))}")
     counts = Counter(verdicts)
     counted = ", ".join(
         f"{counts[verdict]} {verdict}" for verdict in _VERDICT_COLOURS if counts[verdict]
     )
+    if refused := list(table.texts("certified")).count("no"):
+        counted += f"; {refused} on a device that is not certified"
     out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {counted}")
 
 
@@ -72,12 +73,6 @@ def print_unreadable(table: Table) -> None:
     for verdict, reason in zip(table.texts("verdict"), table.texts("reason"), strict=True):
         if verdict == UNREADABLE:
             print_error(reason)
-
-
-def _why(verdict: str, reason: str, certified: str) -> str:
-    if verdict == "passive" and certified == "no" and NOT_KEPT not in reason:
-        return "the device has less damping than the coupling needs"
-    return plain(" ".join(reason.splitlines()))
 
 
 def print_what_if(found: WhatIf) -> None:
@@ -248,7 +243,8 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
-    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.words}[/]")
+    judged = "environment " if report.verdict == "passive" else ""
+    out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
@@ -262,10 +258,8 @@ def _print_report(report: AuditReport) -> None:
             "damping unknown"
         )
     kept = report.timekeeping
-    if kept is not None and report.certified:
-        out.print(f"  device certified{kept.clause}")
-    elif kept is not None and kept.fault:
-        out.print(f"  device not certified: {NOT_KEPT}")
+    if kept is not None and report.conditions:
+        out.print(f"  {kept.device_words(report.certified)}")
     if report.is_cut:
         out.print(
             "  the file is cut: the verdict is on what it holds; "

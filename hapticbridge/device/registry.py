@@ -95,6 +95,7 @@ _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).pa
 _SIMULATED_OPTIONS: Options = {
     **dict.fromkeys((*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS), float),
     "delay": int,
+    "dof": int,
     "hand": str,
     "path": Path,
 }

@@ -48,6 +48,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
+    felt,
     retune,
     slip,
 )
@@ -417,14 +418,15 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
 def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device.
 
-    In this order: scale, share of the lever, of the passivity controller's damping what fits, and
-    the energy limit at full speed.
+    In this order: scale, axes with a motor, share of the lever, of the passivity controller's
+    damping what fits, and the energy limit at full speed.
     """
     run = s.run
     if not run.has_law:  # nothing limits the wrench on the tool, so the device alone is spared
         force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
+    force, torque = felt(s, force, torque)
     share = s.guard.share
     if share != 1.0:
         force, torque = scaled(share, force), scaled(share, torque)

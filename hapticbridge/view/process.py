@@ -26,7 +26,7 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
-from hapticbridge.summary import watch_sentence
+from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
