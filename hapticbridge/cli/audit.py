@@ -23,7 +23,7 @@ from hapticbridge.audit.batch import (
     worst_exit_code,
     write_audits,
 )
-from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.plotting import check_ending
@@ -72,7 +72,7 @@ def print_unreadable(table: Table) -> None:
     """Names on stderr what was passed over."""
     for verdict, reason in zip(table.texts("verdict"), table.texts("reason"), strict=True):
         if verdict == UNREADABLE:
-            err.print(f"[red]error:[/red] {plain(' '.join(str(reason).splitlines()))}")
+            print_error(reason)
 
 
 def print_what_if(found: WhatIf) -> None:
@@ -99,7 +99,6 @@ SCENE_SIZE = 640, 400
 """Width and height of a page's picture in pixels. It takes 150 kB; a larger one delays the page."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
-_COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +148,7 @@ class Audit:
         """Audits; returns the exit code."""
         if not self.files:
             raise RecordingError("audit needs at least one recording")
-        if self.plot is not None:
-            check_ending(self.plot)
+        check_ending(self.plot)
         if self.report is not None:
             check_page_name(self.report)
         if self.table is not None:
@@ -204,7 +202,7 @@ class Audit:
             print_audits(table)
         if self.table is not None:
             write_audits(table, self.table)
-            err.print(f"wrote {plain(str(self.table))}")
+            print_written(self.table)
 
     def _ask(self, file: Path) -> int:
         with progress("what if") as show:
@@ -220,7 +218,7 @@ class Audit:
             with err.status("drawing …"):
                 scene = _scene_picture(before.recording, before.report)
                 write_what_if(found, self.report, scene)
-        self._name_written()
+        print_written(self.plot, self.report)
         return found.exit_code
 
     def _draw(self, report: AuditReport) -> None:
@@ -230,12 +228,7 @@ class Audit:
                 plot_recording(recording, self.plot)
             if self.report is not None:
                 write_report(recording, report, self.report, _scene_picture(recording, report))
-        self._name_written()
-
-    def _name_written(self) -> None:
-        for written in (self.plot, self.report):
-            if written is not None:
-                err.print(f"wrote {plain(str(written))}")
+        print_written(self.plot, self.report)
 
 
 def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
@@ -249,7 +242,7 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 
 def _print_report(report: AuditReport) -> None:
-    colour = _COLOURS[report.verdict]
+    colour = _VERDICT_COLOURS[report.verdict]
     judged = "environment " if report.verdict == "passive" else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")

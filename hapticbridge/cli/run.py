@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
-from hapticbridge.cli.terminal import err, notify, out
+from hapticbridge.cli.terminal import err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -368,7 +367,7 @@ class Run:
         stack.close()
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
-            out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
+            print_json(values | {"recording": str(self.record or "") or None})
         else:
             print_summary(summary, has_hand=not device.info.is_prescribed)
         is_good = summary.verdict == "passive" and summary.is_certified is not False

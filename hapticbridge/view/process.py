@@ -132,8 +132,7 @@ def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) 
 def _read_job(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
     job = json.loads(stream.readline())
     files = {name: stream.read(size) for name, size in job["attachments"]}
-    run = run_of(job["metadata"], files)
-    return job, run
+    return job, run_of(job["metadata"], files)
 
 
 def _calm() -> None:
