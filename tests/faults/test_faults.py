@@ -131,7 +131,7 @@ class GivesWay:
         self._force = 0.0
 
 
-def given_to_a_hand_that_jumps(scene: Path, slow_until: float, changes: dict[str, float]) -> float:
+def given_to_a_hand_that_jumps(scene: Path, slow_until: float, changes: dict[str, Any]) -> float:
     """Returns the energy in J that a motor gives to a hand that jumps to full speed."""
     hand = GivesWay(slow_until)
     bridge = Bridge(scene, hand, clock=SimulatedClock())

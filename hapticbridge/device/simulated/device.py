@@ -218,7 +218,7 @@ class SimulatedDevice:
         self._delay = delay
         self._states = np.zeros(1, STATE_DTYPE)
         # a memoryview assigns six numbers in 0.05 µs, NumPy in 0.15 µs
-        self._written = memoryview(self._states["written"][0, :dof])
+        self._written = memoryview(self._states["written"][0, :dof].data)
         if dof == 3:
             self._motion[:, 4:] = 1.0, 0.0, 0.0, 0.0
         self._is_started = False
