@@ -34,6 +34,14 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
+    picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
+    motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")
+    code, _, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
+    assert code == 0, err
+    assert picture.exists()
+
+
 def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) -> None:
     plant = PLANT["margin"]
     scene = bench(tmp_path / "scene", plant)

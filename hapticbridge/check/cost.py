@@ -331,10 +331,14 @@ def draw_cost(cost: Cost, title: str) -> Figure:
         )
     growth.set_xlabel("constraint rows in the tick")
     growth.set_ylabel("median time per tick in µs")
-    growth.set_ylim(0.0, 1.15e6 * max(seconds for _, _, seconds in steps))
+    slowest = max((seconds for _, _, seconds in steps), default=0.0)
+    growth.set_ylim(0.0, 1.15e6 * (slowest or whole))
     rate = math.floor(cost.highest_rate)
     growth.set_title(f"how it grows; up to {rate:,} Hz", fontsize="medium")
-    growth.legend(fontsize="small", loc="lower right")
+    if steps:
+        growth.legend(fontsize="small", loc="lower right")
+    else:
+        growth.text(0.5, 0.5, "the motion is too short", ha="center", transform=growth.transAxes)
     return figure
 
 
