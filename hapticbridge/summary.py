@@ -175,6 +175,7 @@ class Summary:
         peak_tool_force: Largest norm of the force on the tool in N. It differs from that on the
             hand by ``force_scale``, and while the force rises or fades.
         peak_tool_torque: Largest norm of the torque on the tool in N m.
+        limits_reached: Which of ``force`` and ``torque`` on the tool reached its limit.
         energies: Energies by name in J.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used.
@@ -208,6 +209,7 @@ class Summary:
     peak_torque: float
     peak_tool_force: float
     peak_tool_torque: float
+    limits_reached: tuple[str, ...]
     energies: dict[str, float]
     environment: str
     slack_share: float
@@ -261,6 +263,11 @@ class Summary:
             skipped=outcome.skipped,
             dropped=outcome.dropped,
             **{name: float(state["loop"][name][0]) for name in _PEAKS},
+            limits_reached=tuple(
+                kind
+                for kind, limit in zip(("force", "torque"), state["level"]["level"][0], strict=True)
+                if state["loop"][f"peak_tool_{kind}"][0] >= limit * (1.0 - 1e-9)
+            ),
             energies=ledger.energies(),
             environment=ledger.environment,
             slack_share=ledger.slack_share,

@@ -162,7 +162,8 @@ class Audit:
             err.print("note: --jobs and --scheduler are for several recordings; here is one")
         if self.what_if:
             return self._ask(files[0])
-        with err.status(f"auditing {plain(str(files[0]))} …"):
+        first = "the first audit on a machine compiles for about 20 s"
+        with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
             report = audit(files[0], strict=self.strict)
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json())]))

@@ -146,7 +146,9 @@ def print_summary(summary: Summary, *, has_hand: bool = True) -> None:
         (summary.peak_force, summary.peak_torque),
         (summary.peak_tool_force, summary.peak_tool_torque),
     )
-    table.add_row("peak", format_wrenches(hand if has_hand else None, tool))
+    reached = " and ".join(f"{name} limit" for name in summary.limits_reached)
+    reached = f" ({reached} reached)" if reached else ""
+    table.add_row("peak", format_wrenches(hand if has_hand else None, tool) + reached)
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
