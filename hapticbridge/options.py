@@ -408,6 +408,7 @@ class RunSetup:
             handle_origin=handle_origin,
             device_start=pose,
             scheme=self.method.scheme,
+            is_rigid=self.method.is_rigid,
             effective=effective,
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,

@@ -53,6 +53,8 @@ class Method:
             integration adds it; no unit.
         added_share: Share of K h that the integration adds to the damping, subtracted or not; None
             if it adds another amount or removes some.
+        is_rigid: True if contacts are rigid and strictly passive (``kernel.rigid_contact``), which
+            needs the integrator ``discrete`` and a coupling law; False for those of the scene.
     """
 
     name: str
@@ -67,13 +69,11 @@ class Method:
     warns: bool = True
     compensated_share: float = 0.0
     added_share: float | None = None
+    is_rigid: bool = False
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
-        """MuJoCo's part of a substep through the Python bindings.
-
-        ``kernel.tick.advance`` calls the C function with equal results to the bit.
-        """
+        """MuJoCo's step through the Python bindings, with the contacts of the scene."""
         step: Callable[[Any, Any], None] = (
             mujoco.mj_step if self.has_coupling else mujoco.mj_fwdPosition
         )
@@ -273,6 +273,7 @@ IMPLICIT = Method(
     scheme=Scheme.IMPLICIT,
     integrator="discrete",
     added_share=IMPLICIT_SHARE,
+    is_rigid=True,
 )
 
 COMPENSATED = replace(
@@ -292,6 +293,7 @@ LOSSLESS_COUPLING = Method(
     reach=REACH,
     compensated_share=MIDPOINT_SHARE,
     added_share=MIDPOINT_SHARE,
+    is_rigid=True,
 )
 
 METHODS = {method.name: method for method in (IMPLICIT, COMPENSATED, LOSSLESS_COUPLING)}
@@ -422,7 +424,8 @@ def prepare(
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
     scene.set_reach(method.reach)
-    if warns and method.warns:
+    scene.set_contact(is_rigid=method.is_rigid)
+    if warns and method.warns and not method.is_rigid:
         warn_of_contacts(scene.model, scene.grip, scene.path)
     step = period / substeps
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))

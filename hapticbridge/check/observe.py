@@ -253,6 +253,7 @@ def rehearsal_parameters(
         handle_origin=scene.grip_pose(),
         device_start=IDENTITY_POSE,
         scheme=method.scheme,
+        is_rigid=method.is_rigid,
     )
 
 

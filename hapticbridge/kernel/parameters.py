@@ -226,6 +226,8 @@ class RunParameters:
         device_rotational_damping: Rotational damping in N m s/rad; None without rotation, or if
             ``device_damping`` is.
         guarding: Limits and thresholds of the guard.
+        is_rigid: True if contacts are rigid (``kernel.rigid_contact``), False for those of the
+            scene.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -250,6 +252,7 @@ class RunParameters:
     device_damping: float | None = None
     device_rotational_damping: float | None = None
     guarding: GuardParameters = UNGUARDED
+    is_rigid: bool = False
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)
