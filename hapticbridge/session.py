@@ -175,7 +175,6 @@ class TickKernel:
 
     def bind(self, bound: BoundKernel, setup: RunSetup) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
-        method = setup.method
         self.bound, self.step, self.substeps = bound, bound.step, range(setup.substeps)
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
         self.is_ahead = False

@@ -82,6 +82,7 @@ RIGID_DTYPE = np.dtype(
     [
         ("is_rigid", "<i8"),
         ("repetitions", "<i8"),
+        ("active_contacts", "<i8"),
         ("share", "<f8"),
         ("tank", "<f8"),
         ("cap", "<f8"),
@@ -89,7 +90,8 @@ RIGID_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
-``repetitions`` counts repeated steps since the start; ``share`` σ of the last step; ``tank`` D and
+``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
+force; ``share`` σ of the last step; ``tank`` D and
 ``cap`` in J; ``last_energy`` Σ E_k in J at the last tick."""
 
 
@@ -191,23 +193,27 @@ def lower_share(s: State) -> bool:
 
 
 @compiled
-def restore_positions(s: State) -> None:
-    """Writes the contacts' distances back to the positions of their rows."""
+def finish_contacts(s: State) -> None:
+    """Counts the contacts with a force, and restores the positions of their rows."""
     mj = s.mj
-    if not s.contact.is_rigid:
-        return
-    positions = floats(pointer_at(mj.efc_pos), ints(mj.nefc, 1)[0])
+    count = ints(mj.nefc, 1)[0]
+    positions = floats(pointer_at(mj.efc_pos), count)
+    force = floats(pointer_at(mj.efc_force), count)
+    s.contact.active_contacts = 0
     contacts = pointer_at(mj.contact)
     for c in range(ints(mj.ncon, 1)[0]):
         contact = contacts + c * mj.contact_size
         row = ints(contact + mj.contact_row, 1)[0]
         if row >= 0:
             positions[row] = floats(contact + mj.contact_distance, 1)[0]
+            s.contact.active_contacts += force[row] > 0.0
 
 
 @compiled
 def fill_tank(s: State) -> None:
     """Adds the energy that the environment dissipated in the tick; takes what it created."""
     contact, created = s.contact, s.energy.environment_energy
+    if not contact.is_rigid:
+        return
     contact.tank = min(contact.tank - (created - contact.last_energy), contact.cap)
     contact.last_energy = created

@@ -89,7 +89,7 @@ from hapticbridge.kernel.mujoco_c import (
     release_fence,
 )
 from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
-from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, restore_positions
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -356,7 +356,7 @@ def advance(state: NDArray[np.void]) -> None:
 
 @compiled
 def between_halves(state: NDArray[np.void]) -> None:
-    """Runs the part of ``advance`` between the halves of MuJoCo's step, for ``BoundKernel.step``."""
+    """Runs the part of ``advance`` between MuJoCo's halves, for ``BoundKernel.step``."""
     aim_contacts(state[0])
 
 
@@ -393,7 +393,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if count == 1 and not is_last:
         return OK
     force, torque, moved, turned = _evaluate(s, is_last)
-    restore_positions(s)
+    if s.contact.is_rigid:
+        finish_contacts(s)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
@@ -421,6 +422,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
+    if s.contact.is_rigid:
+        loop.active_contacts = s.contact.active_contacts
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:

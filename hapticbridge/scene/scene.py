@@ -17,7 +17,6 @@ from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
 
-
 _CONTACT_OPTIONS = {
     "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
     "impratio": IMPRATIO,
@@ -25,6 +24,15 @@ _CONTACT_OPTIONS = {
     "o_margin": MARGIN,
 }
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
+
+
+def has_rigid_contact(model: mujoco.MjModel) -> bool:
+    """Returns True if a model has the options that ``Scene.set_contact`` sets for rigid ones."""
+    options, margins = dict(_CONTACT_OPTIONS), [model.opt.o_margin]
+    del options["o_margin"]
+    for name in _MARGINS:
+        margins += getattr(model, name).ravel().tolist()
+    return min(margins) >= MARGIN and all(getattr(model.opt, k) == v for k, v in options.items())
 
 
 @dataclass(slots=True)
