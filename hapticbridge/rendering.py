@@ -551,7 +551,7 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
         raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
     if method.is_rigid and not has_rigid_contact(model):
-        raise SceneError("rigid contacts require an elliptic cone, impratio 100 and a margin")
+        raise SceneError("rigid contacts require an elliptic cone, impratio 1000 and a margin")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
     if has_weld != method.is_weld:
         raise SceneError(

@@ -55,8 +55,6 @@ sees no more pictures. Check and picture cost the loop 4 µs each after the wren
 
 _NO_FORCE = np.zeros(6)
 
-MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
-
 
 class StopRequest:
     """Requests to end a run, from any thread or from a signal handler.

@@ -71,6 +71,8 @@ from hapticbridge.kernel.tick_guard import (
 from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
 
+MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
+
 _FROM_PARAMETERS = (
     "period",
     "substeps",
@@ -181,16 +183,16 @@ class BoundKernel:
         return float(self.state["energy"]["slack"][0])
 
     @property
-    def step(self) -> Callable[[mujoco.MjModel, mujoco.MjData], None]:
+    def step(self) -> MujocoStep:
         """MuJoCo's part of a substep through the Python bindings.
 
         ``kernel.tick.advance`` calls the C functions with equal results to the bit.
         """
-        run = self._record["run"]
-        if run["scheme"] == Scheme.MASSLESS:
-            return mujoco.mj_fwdPosition
+        plain: MujocoStep = mujoco.mj_step
+        if self._record["run"]["scheme"] == Scheme.MASSLESS:
+            plain = mujoco.mj_fwdPosition
         if not self._record["contact"]["is_rigid"]:
-            return mujoco.mj_step
+            return plain
         state, aim = self.state, direct(between_halves, self.state)
 
         def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
