@@ -23,7 +23,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import prepare
+from hapticbridge.rendering import IMPLICIT, prepare
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.summary import Ledger
@@ -159,11 +159,12 @@ def bind(
     *,
     period: float = T,
     substeps: int = 1,
+    contact: str = "rigid",
     device_start: tuple[float, ...] = IDENTITY,
     **changes: Any,
 ) -> tuple[BoundKernel, RunParameters]:
     """Prepares a scene for ``implicit`` and binds the kernel to it, without force limits."""
-    prepare(scene, coupling, period, substeps)
+    prepare(scene, coupling, period, substeps, IMPLICIT.with_contact(contact))
     parameters = unlimited(scene, coupling, period, substeps, device_start, **changes)
     return BoundKernel(scene.model, scene.data, parameters), parameters
 

@@ -20,7 +20,6 @@ from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.rigid_contact import tank_cap
 
 SLACK_SHARE = 0.5
 """Share of the slack that counts with several laws per tick, without unit; equal to the assumption
@@ -135,8 +134,9 @@ class EnergyBalance:
             in_springs = released_by_coupling(parameters, gains, motion)
         excess = _device_excess(parameters, totals, created, in_springs)
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
-        cap = tank_cap(parameters.coupling.stiffness)
-        ceiling = np.minimum(np.minimum.accumulate(cap + created), before["tank_ceiling"])
+        ceiling = np.minimum(
+            np.minimum.accumulate(parameters.tank_cap + created), before["tank_ceiling"]
+        )
         totals["tank_ceiling"] = ceiling
         return cls(
             coupling_work=coupling_work,

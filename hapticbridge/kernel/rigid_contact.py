@@ -18,7 +18,8 @@ environment has dissipated,
     D_k = min(cap, D_{k−1} − E_k) <= −Σ E_k,    D_0 = 0
 
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
-remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next.
+remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
+moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
@@ -39,7 +40,9 @@ import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.ledger import mocap_contact_work
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.parameters import RunParameters
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
@@ -68,11 +71,6 @@ RESERVE = 1e-7
 """Energy in J of the tank that is never spent; it covers rounding and the remainder of the
 integration."""
 
-CLEARANCE = 1e-3
-"""Stretch in m of the coupling whose energy ½ K c² is the cap of the tank. Dissipation of a long
-time then pays for no more than the hand itself stores in the coupling within a millimetre. A larger
-cap frees a jammed tool sooner, and lets it be pushed out harder."""
-
 _EXACT = 1e-9
 """ε of the module's equations, without unit: the spring that is left in the row of a contact, and
 the velocity that is left in the rows of friction."""
@@ -96,15 +94,10 @@ force; ``share`` σ of the last step; ``tank`` D and
 ``cap`` in J; ``last_energy`` Σ E_k in J at the last tick."""
 
 
-def bind_contact(contact: Part, *, is_rigid: bool, stiffness: float) -> None:
-    """Fills in the sub-record, with an empty tank and the cap for a coupling K in N/m."""
-    contact["is_rigid"] = is_rigid
-    contact["cap"] = tank_cap(stiffness)
-
-
-def tank_cap(stiffness: float) -> float:
-    """Returns the largest energy in J that the tank holds, ½ K c², for a coupling K in N/m."""
-    return 0.5 * stiffness * CLEARANCE**2
+def bind_contact(contact: Part, parameters: RunParameters) -> None:
+    """Fills in the sub-record, with an empty tank."""
+    contact["is_rigid"] = parameters.is_rigid
+    contact["cap"] = parameters.tank_cap
 
 
 @compiled
@@ -142,7 +135,8 @@ def _aim(s: State) -> None:
 def aim_contacts(s: State) -> None:
     """Makes the contacts of the coming ``mj_step2`` rigid; needs MuJoCo's velocity stage."""
     if s.contact.is_rigid and ints(s.mj.ncon, 1)[0] > 0:
-        s.contact.share = 1.0 if _spendable(s) > 0.0 else 0.0
+        has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
+        s.contact.share = 1.0 if has_energy else 0.0
         _aim(s)
 
 
@@ -182,12 +176,14 @@ def lower_share(s: State) -> bool:
     contact = s.contact
     if not contact.is_rigid or contact.share <= 0.0 or ints(s.mj.ncon, 1)[0] == 0:
         return False
-    spendable, returned = _spendable(s), returned_energy(s)
-    if returned <= max(spendable, 0.0):
+    allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
+    if s.energy.mocap_has_moved:
+        allowed += mocap_contact_work(s)  # the external port pays for it
+    if returned <= allowed:
         return False
     # C is nearly proportional to the share while the forces stay; a second excess ends it
-    is_first = contact.share == 1.0 and spendable > 0.0
-    contact.share = SPENDABLE * spendable / returned if is_first else 0.0
+    is_first = contact.share == 1.0 and allowed > 0.0
+    contact.share = SPENDABLE * allowed / returned if is_first else 0.0
     contact.repetitions += 1
     _aim(s)
     return True

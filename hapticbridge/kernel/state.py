@@ -306,11 +306,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
-        bind_contact(
-            s["contact"],
-            is_rigid=parameters.is_rigid,
-            stiffness=parameters.coupling.stiffness,
-        )
+        bind_contact(s["contact"], parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record
