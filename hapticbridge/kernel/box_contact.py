@@ -242,9 +242,7 @@ def _face(r: Numbers, corner: Any, p: Any, f: Any, least: float) -> tuple[int, f
             continue
         up = 1.0 if q >= 0.0 else -1.0
         c0, c1, c2 = corner[0] * r[3 * i], corner[1] * r[3 * i + 1], corner[2] * r[3 * i + 2]
-        # above the face proper it is the closest point, whatever the cone
-        is_above = near >= 0.0 and beside <= 0.0
-        if near > gap and (is_above or max(up * c0, up * c1, up * c2) <= CONE):
+        if near > gap and max(up * c0, up * c1, up * c2) <= CONE:
             gap, face, side = near, i, up
         # the far face, by which a vertex leaves that is past the middle of a thin plate
         far = near - 2.0 * abs(q)
@@ -461,8 +459,11 @@ def use_box_contact(model: mujoco.MjModel, *, is_used: bool = True) -> None:
         model.opt.enableflags &= ~BOX_CONTACT
 
 
-def uses_box_contact(model: mujoco.MjModel) -> bool:
-    """Returns True if the model's boxes meet by this function; it must be installed then.
+def bind_box_contact(model: mujoco.MjModel) -> bool:
+    """Installs the function if a model uses it, as a model from a recording may.
+
+    Returns:
+        True if the model uses it.
 
     Raises:
         SceneError: As ``install``.
