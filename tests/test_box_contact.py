@@ -14,14 +14,8 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.kernel.box_contact import (
-    BOX_CONTACT,
-    CONE,
-    MOST_POINTS,
-    NEAR,
-    bind_box_contact,
-    use_box_contact,
-)
+from hapticbridge.kernel.box_contact import CONE, MOST_POINTS, NEAR
+from hapticbridge.kernel.colliders import EXACT_POINTS, bind_colliders, use_exact_points
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +33,7 @@ def two_boxes(first: Floats, second: Floats, *, ours: bool = True) -> mujoco.MjM
         <body><freejoint/><geom size="{sizes[1]}"/></body>
       </worldbody></mujoco>""")
     if ours:
-        use_box_contact(model)
+        use_exact_points(model)
     return model
 
 
@@ -303,7 +297,7 @@ def test_other_models_of_the_process_keep_the_stock_function() -> None:
     assert mine.points()[0].shape != alone[0].shape or not np.array_equal(
         mine.points()[1], alone[1]
     )
-    use_box_contact(mine.model, is_used=False)
+    use_exact_points(mine.model, is_used=False)
     mine.place(*pose)
     assert np.array_equal(mine.points()[1], alone[1])
 
@@ -313,9 +307,9 @@ def test_copies_and_the_binary_form_keep_the_choice(tmp_path: Path) -> None:
     path = tmp_path / "model.mjb"
     mujoco.mj_saveModel(model, str(path))
     for other in (mujoco.MjModel.from_binary_path(str(path)), model.__copy__()):
-        assert other.opt.enableflags & BOX_CONTACT
-        assert bind_box_contact(other)
-    assert not bind_box_contact(two_boxes(np.full(3, 0.01), np.full(3, 0.01), ours=False))
+        assert other.opt.enableflags & EXACT_POINTS
+        assert bind_colliders(other)
+    assert not bind_colliders(two_boxes(np.full(3, 0.01), np.full(3, 0.01), ours=False))
 
 
 def test_threads_find_the_same_points() -> None:

@@ -14,11 +14,6 @@ least depth that meets it; a vertex past the middle of a thin plate therefore le
 came. A pair deeper than twice the boxes' depth of penetration does not count. Gaps change
 continuously with the pose, and no pair appears that is already deep.
 
-The function replaces MuJoCo's in the table ``mjCOLLISIONFUNC``, one for the whole process. It acts
-on models with the bit ``BOX_CONTACT`` in ``opt.enableflags``, which MuJoCo does not use; copies of
-a model and its binary form keep the bit. For other models it calls ``mjc_BoxBox``. It has no state
-of its own, so threads may step models together.
-
 References:
     Gottschalk, S.: Collision queries using oriented bounding boxes, PhD thesis, UNC 2000.
     Gregorius, D.: The separating axis test between convex polyhedra, GDC 2013.
@@ -26,17 +21,13 @@ References:
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import SceneError
-from hapticbridge.jit import callback, compiled, external, stack_floats
-from hapticbridge.kernel.mujoco_c import floats, ints, library_path, pointer_at, struct_of
+from hapticbridge.jit import compiled, stack_floats
+from hapticbridge.kernel.mujoco_c import floats
 
 CONE = 0.02
 """Angle in rad by which a normal may lie outside a feature's normal cone. Faces that lie on each
@@ -65,16 +56,8 @@ MOST_POINTS = 8
 """Largest number of points of a pair; MuJoCo stops with an error at more. Two faces on each other
 have at most 8 in common. Of more points those with the smallest gaps stay."""
 
-BOX_CONTACT = 1 << 30
-"""Bit of ``opt.enableflags`` that selects this function."""
-
-_POINT = 10
+POINT = 10
 """Numbers of an ``mjPreContact``: gap, position, normal, tangent."""
-
-_MODEL, _DATA = struct_of("mjModel"), struct_of("mjData")
-_FLAGS = _MODEL.opt.offset + struct_of("mjOption").enableflags.offset
-_SIZES, _PLACES, _TURNS = _MODEL.geom_size.offset, _DATA.geom_xpos.offset, _DATA.geom_xmat.offset
-_BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 # Scratch memory of a pair: rotation between the boxes by rows, its transpose, then the two centres
 # and half-sizes, each in the frame of the other box or its own.
@@ -82,7 +65,6 @@ _R, _BACK, _T, _U, _A, _B, _SCRATCH = 0, 9, 18, 21, 24, 27, 30
 
 _scratch = stack_floats(_SCRATCH)
 _normals = stack_floats(9 * 6)
-_mjc_box_box: Any = external("mjc_BoxBox", "int32(intp, intp, intp, int32, int32, float64)")
 
 Numbers = NDArray[np.float64]
 
@@ -92,7 +74,7 @@ def _add(points: Numbers, count: int, gap: float, p: Any, n: Any) -> int:
     """Adds a point with position p and normal n in the world; returns the number of points."""
     at, worst = -1, gap
     for k in range(count):
-        one = _POINT * k
+        one = POINT * k
         x, y, z = points[one + 1] - p[0], points[one + 2] - p[1], points[one + 3] - p[2]
         if x * x + y * y + z * z < NEAR * NEAR:
             alike = points[one + 4] * n[0] + points[one + 5] * n[1] + points[one + 6] * n[2]
@@ -104,7 +86,7 @@ def _add(points: Numbers, count: int, gap: float, p: Any, n: Any) -> int:
         if points[one] > worst:
             at, worst = one, points[one]
     if count < MOST_POINTS:
-        _write(points, _POINT * count, gap, p, n)
+        _write(points, POINT * count, gap, p, n)
         return count + 1
     if at >= 0:
         _write(points, at, gap, p, n)
@@ -393,82 +375,3 @@ def box_points(
     second = (s[_BACK : _BACK + 9], s[_U : _U + 3], b, a)
     count = _vertices(points, count, first, (place1, turn1, 1.0), limits)
     return _vertices(points, count, second, (place2, turn2, -1.0), limits)
-
-
-@compiled
-def box_box(model: int, data: int, contacts: int, first: int, second: int, margin: float) -> int:
-    """Finds the contact points of two boxes, as MuJoCo's ``mjfCollision`` (addresses as integers).
-
-    Returns:
-        The number of points, written to ``contacts``.
-    """
-    if not ints(model + _FLAGS, 1)[0] & BOX_CONTACT:
-        return int(_mjc_box_box(model, data, contacts, first, second, margin))
-    sizes, places = pointer_at(model + _SIZES), pointer_at(data + _PLACES)
-    turns = pointer_at(data + _TURNS)
-    one = (
-        floats(places + 24 * first, 3),
-        floats(turns + 72 * first, 9),
-        floats(sizes + 24 * first, 3),
-    )
-    other = (
-        floats(places + 24 * second, 3),
-        floats(turns + 72 * second, 9),
-        floats(sizes + 24 * second, 3),
-    )
-    return box_points(floats(contacts, _POINT * MOST_POINTS), one, other, margin)
-
-
-# The table of MuJoCo's collision functions, and the models that use this one
-
-_C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
-"""Arguments of ``mjfCollision``: model, data, points, two geoms, margin."""
-
-
-@cache
-def install() -> None:
-    """Puts the function into MuJoCo's table, once in a process.
-
-    Models without the bit ``BOX_CONTACT`` keep MuJoCo's function, called from this one.
-
-    Raises:
-        SceneError: Another program has put a function of its own into the table.
-    """
-    library = ctypes.CDLL(str(library_path()))
-    kinds = int(mujoco.mjtGeom.mjNGEOMTYPES)
-    table = (ctypes.c_void_p * kinds**2).in_dll(library, "mjCOLLISIONFUNC")
-    place = _BOX * kinds + _BOX
-    if table[place] != ctypes.cast(library.mjc_BoxBox, ctypes.c_void_p).value:
-        raise SceneError(
-            "another program has replaced MuJoCo's collision of two boxes in this process; run "
-            "without it, or choose contact 'scene'"
-        )
-    table[place] = callback(box_box, *_C_TYPES)
-
-
-def use_box_contact(model: mujoco.MjModel, *, is_used: bool = True) -> None:
-    """Selects this function or MuJoCo's for the boxes of a model, in all its data.
-
-    Raises:
-        SceneError: As ``install``.
-    """
-    if is_used:
-        install()
-        model.opt.enableflags |= BOX_CONTACT
-    else:
-        model.opt.enableflags &= ~BOX_CONTACT
-
-
-def bind_box_contact(model: mujoco.MjModel) -> bool:
-    """Installs the function if a model uses it, as a model from a recording may.
-
-    Returns:
-        True if the model uses it.
-
-    Raises:
-        SceneError: As ``install``.
-    """
-    is_used = bool(model.opt.enableflags & BOX_CONTACT)
-    if is_used:
-        install()
-    return is_used
