@@ -92,6 +92,13 @@ def floats(address: int, count: int) -> NDArray[np.float64]:
 
 
 @compiled
+def singles(address: int, count: int) -> NDArray[np.float32]:
+    """Returns ``count`` numbers of single precision at an address, as a view."""
+    view: NDArray[np.float32] = _view(_as_pointer(address), count, np.float32)
+    return view
+
+
+@compiled
 def ints(address: int, count: int) -> NDArray[np.int32]:
     """Returns ``count`` 32-bit integers at an address, as a view."""
     view: NDArray[np.int32] = _view(_as_pointer(address), count, np.int32)
