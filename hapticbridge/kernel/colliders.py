@@ -49,6 +49,7 @@ _MESHES, _VERTICES, _NORMALS = (
     _MODEL.mesh_polynormal.offset,
 )
 _FIRST_VERTEX, _VERTEX_COUNT = _MODEL.mesh_vertadr.offset, _MODEL.mesh_vertnum.offset
+_CORNER, _CORNERS = _MODEL.mesh_polyvertadr.offset, _MODEL.mesh_polyvert.offset
 _FIRST_FACE, _FACE_COUNT = _MODEL.mesh_polyadr.offset, _MODEL.mesh_polynum.offset
 _PLACES, _TURNS = _DATA.geom_xpos.offset, _DATA.geom_xmat.offset
 
@@ -66,6 +67,9 @@ tried: 0.2 rad."""
 
 ROUNDING = 1e-9
 """Difference of gaps in m that counts as rounding; meshes have vertices of single precision."""
+
+BESIDE = 1e-6
+"""Length in m by which a vertex may lie beside a face and still be on it: single precision."""
 
 _SIGNATURE = "int32(intp, intp, intp, int32, int32, float64)"
 _mjc_box_box: Any = external("mjc_BoxBox", _SIGNATURE)
@@ -263,11 +267,41 @@ def flat_flat(model: int, data: int, contacts: int, first: int, second: int, mar
                 points[at + 4 + i] = n[i]
             points[at] = gap
         lowest = min(lowest, points[at])
-    if largest < lowest - ROUNDING and choice > 0:
-        if choice == 1:
-            px, py, pz = qx - largest * n[0], qy - largest * n[1], qz - largest * n[2]
+    if choice == 0 or largest >= lowest - ROUNDING:
+        return count
+    # the lowest vertex is on the other body's face, unless it lies beside it
+    if choice == 1:
+        px, py, pz = qx - largest * n[0], qy - largest * n[1], qz - largest * n[2]
+        is_on_face = _is_inside(model, first, one, a, (px, py, pz))
+    else:
+        q = px + largest * n[0], py + largest * n[1], pz + largest * n[2]
+        is_on_face = _is_inside(model, second, other, b, q)
+    if is_on_face:
         _move_nearest(points, count, largest, (px, py, pz), n)
     return count
+
+
+@compiled
+def _is_inside(model: int, geom: int, flat: Any, placed: Any, p: Any) -> bool:
+    """Returns True if a point in the world is in a box or mesh, or beside it by rounding."""
+    (vertices, _, faces, count), (place, turn, size) = flat, placed
+    x, y, z = p[0] - place[0], p[1] - place[1], p[2] - place[2]
+    u = turn[0] * x + turn[3] * y + turn[6] * z
+    v = turn[1] * x + turn[4] * y + turn[7] * z
+    w = turn[2] * x + turn[5] * y + turn[8] * z
+    if faces == 0:
+        return bool(max(abs(u) - size[0], abs(v) - size[1], abs(w) - size[2]) < BESIDE)
+    mesh = ints(pointer_at(model + _MESHES) + 4 * geom, 1)[0]
+    first = ints(pointer_at(model + _FIRST_FACE) + 4 * mesh, 1)[0]
+    corner = ints(pointer_at(model + _CORNER) + 4 * first, count)
+    corners = pointer_at(model + _CORNERS)
+    normals = floats(faces, 3 * count)
+    for k in range(count):
+        on_face = singles(vertices + 12 * ints(corners + 4 * corner[k], 1)[0], 3)
+        gap = normals[3 * k] * (u - on_face[0]) + normals[3 * k + 1] * (v - on_face[1])
+        if gap + normals[3 * k + 2] * (w - on_face[2]) >= BESIDE:
+            return False
+    return True
 
 
 # The table, and the models that use these functions
