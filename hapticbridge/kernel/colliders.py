@@ -132,8 +132,11 @@ def round_flat(model: int, data: int, contacts: int, first: int, second: int, ma
     py = place[1] + half * uy + size[0] * my
     pz = place[2] + half * uz + size[0] * mz
     gap = plane - (x * px + y * py + z * pz)
-    if gap < points[at]:
-        _move_nearest(points, count, gap, (px, py, pz), (x, y, z))
+    if gap < points[at] - ROUNDING:
+        # a round shape that lies along the face may have its lowest point beside it
+        flat, placed = _flat(model, second), _placed(model, data, second)
+        if _is_inside(model, second, flat, placed, (px + gap * x, py + gap * y, pz + gap * z)):
+            _move_nearest(points, count, gap, (px, py, pz), (x, y, z))
     return count
 
 
@@ -154,7 +157,7 @@ def _move_nearest(points: Numbers, count: int, gap: float, p: Any, n: Any) -> No
 
 
 @compiled
-def _flat(model: int, data: int, geom: int) -> tuple[int, int, int, int]:
+def _flat(model: int, geom: int) -> tuple[int, int, int, int]:
     """Returns the vertices of a mesh and their number, the normals of its faces and their number.
 
     They are addresses; a box has 0 for each.
@@ -233,7 +236,7 @@ def flat_flat(model: int, data: int, contacts: int, first: int, second: int, mar
     count = int(_mjc_convex(model, data, contacts, first, second, margin))
     if count == 0 or not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return count
-    one, other = _flat(model, data, first), _flat(model, data, second)
+    one, other = _flat(model, first), _flat(model, second)
     if max(one[1], other[1], one[3], other[3]) > MOST_VERTICES:
         return count
     a, b = _placed(model, data, first), _placed(model, data, second)
