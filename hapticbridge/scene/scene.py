@@ -126,10 +126,11 @@ class Scene:
         if not is_rigid:
             for name, value in own.items():
                 setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
-            own.clear()
+            self._own_contact = {}
             return
-        own |= {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
+        own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
         own |= {name: getattr(model, name).copy() for name in _MARGINS}
+        self._own_contact = own  # a new object: copies of the scene share the old one
         for name, value in _CONTACT_OPTIONS.items():
             setattr(model.opt, name, value)
         model.opt.o_margin = max(own["o_margin"], MARGIN)
