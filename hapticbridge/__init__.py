@@ -45,37 +45,4 @@ if TYPE_CHECKING:
 
     passivity = theory
 else:
-    __getattr__, __dir__, __all__ = lazy_exports(
-        __name__,
-        {
-            "theory": "hapticbridge.theory",
-            "passivity": "hapticbridge.theory:",
-            "AuditReport": "hapticbridge.audit",
-            "Bridge": "hapticbridge.bridge",
-            "RealClock": "hapticbridge.clock",
-            "SimulatedClock": "hapticbridge.clock",
-            "Coupling": "hapticbridge.coupling",
-            "Device": "hapticbridge.device",
-            "DeviceInfo": "hapticbridge.device",
-            "open_device": "hapticbridge.device",
-            "CouplingError": "hapticbridge.errors",
-            "DeviceError": "hapticbridge.errors",
-            "DeviceLost": "hapticbridge.errors",
-            "HapticBridgeError": "hapticbridge.errors",
-            "RecordingError": "hapticbridge.errors",
-            "SafetyTrip": "hapticbridge.errors",
-            "SceneError": "hapticbridge.errors",
-            "Limits": "hapticbridge.guard",
-            "BridgeOptions": "hapticbridge.options",
-            "Workspace": "hapticbridge.options",
-            "SAMPLE_DTYPE": "hapticbridge.record",
-            "TickFlag": "hapticbridge.record",
-            "read_recording": "hapticbridge.recording",
-            "repair": "hapticbridge.recording",
-            "Scene": "hapticbridge.scene",
-            "load_scene": "hapticbridge.scene",
-            "scene_names": "hapticbridge.scene",
-            "Summary": "hapticbridge.summary",
-        },
-        present=("audit",),
-    )
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

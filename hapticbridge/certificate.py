@@ -34,6 +34,19 @@ def device_period(info: DeviceInfo, period: float) -> float:
     return own if own > period * (1.0 + _WHOLE) else period
 
 
+def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
+    """Returns the share of the device's samples due that were new, 0 to 1.
+
+    Args:
+        info: The device; with a rate of its own it owes fewer samples than there are deadlines.
+        period: T in s.
+        fresh: Number of ticks with a new sample.
+        due: Number of deadlines.
+    """
+    owed = due * period / device_period(info, period)
+    return min(fresh / owed, 1.0) if owed else 1.0
+
+
 def delay_ticks(info: DeviceInfo, period: float) -> int | None:
     """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
     if info.delay is None:

@@ -36,6 +36,11 @@ def import_extra(
         ) from None
 
 
+def printable(text: str) -> str:
+    """Replaces control characters, which would break a terminal, a title or an SVG."""
+    return "".join(letter if letter.isprintable() else "�" for letter in text)
+
+
 # JSON without NaN and infinity, and JSON from other programs
 
 

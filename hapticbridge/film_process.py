@@ -47,6 +47,9 @@ TOOL_ALPHA = 0.5
 """Opacity of moving bodies, 0 to 1. Grip, handle and spring are inside the tool and must be seen
 through it; below 0.4 the tool itself is hard to see."""
 
+FREE = -1
+"""MuJoCo's number of the free camera, as the scene's file sets it."""
+
 QUALITY = 15
 """Constant rate factor of H.264, 0 (best) to 51. At 15 the coupling's thin lines stay sharp."""
 
@@ -286,18 +289,14 @@ class Camera:
         self._stage = stage
         model = stage.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        self._camera, self._shown = mujoco.MjvCamera(), mujoco.MjvOption()
-        mujoco.mjv_defaultFreeCamera(model, self._camera)
-        if name is not None:
-            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-            self._camera.fixedcamid = _camera_id(model, name)
+        self._camera = FREE if name is None else _camera_id(model, name)
+        self._shown = mujoco.MjvOption()
         shadows = model.vis.quality
         shadows.shadowsize = min(shadows.shadowsize, SHADOW)
         # grip and handle are points in the model, without a shape to see
         self._shown.sitegroup[:] = 0
-        flags = mujoco.mjtVisFlag
         model.vis.map.alpha = TOOL_ALPHA
-        self._shown.flags[flags.mjVIS_TRANSPARENT] = True
+        self._shown.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = True
         self.renderer = mujoco.Renderer(model, height, width)
 
     def frame(self, tick: int) -> Frame:

@@ -18,6 +18,7 @@ from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
+from hapticbridge.kernel.tick_guard import FARTHEST
 from hapticbridge.record import SAMPLE_DTYPE
 
 # Limits of the wrench and of the run
@@ -209,11 +210,6 @@ def wait_until_still(
                 f"the device '{device.info.name}' has moved for {PATIENCE:g} s; hold it still, "
                 "then start again: force is enabled only at rest"
             )
-
-
-FARTHEST = 2.0
-"""Largest plausible distance in m of a device from the origin of its frame, where its data sheet
-names no reach. No desk is larger."""
 
 
 def refuse_implausible_pose(info: DeviceInfo, sample: NDArray[np.void]) -> None:
@@ -437,6 +433,7 @@ def guard_parameters_for(
         stale_ticks=math.ceil(STALE_PERIODS * own / period),
         speed=JUMP_MARGIN * info.speed_limit if info.speed_limit > 0 else math.inf,
         turn_speed=FASTEST_TURN,
+        full_speed=info.speed_limit,
         energy=limits.energy,
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,

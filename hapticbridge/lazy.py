@@ -6,31 +6,46 @@ import the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import ast
+import sys
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 
 
 def lazy_exports(
-    package: str, places: Mapping[str, str], present: tuple[str, ...]
+    package: str,
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """Returns ``__getattr__``, ``__dir__`` and ``__all__`` of a package.
+    """Returns ``__getattr__``, ``__dir__`` and ``__all__`` of a package, from its own source.
 
-    Modules directly below the package are found without an entry.
+    Imports above its ``if TYPE_CHECKING:`` have happened. Those in the block are for the type
+    checker, and happen here at the first use of their names. Modules directly below the package are
+    found without an import.
 
     Args:
         package: Full name of the package.
-        places: Module of each public name. A trailing colon stands for the module itself.
-        present: Public names that exist from the start.
     """
+    source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    present: list[str] = []
+    places: dict[str, tuple[str, str]] = {}
+    for top in ast.parse(source).body:
+        for node in top.body if isinstance(top, ast.If) else [top]:
+            match node:
+                case ast.ImportFrom(module=str(module), names=aliases) if node is not top:
+                    places |= {alias.name: (module, alias.name) for alias in aliases}
+                case ast.ImportFrom(names=aliases):
+                    present += [alias.name for alias in aliases if alias.asname]
+                case ast.Assign(targets=[ast.Name(id=name)], value=ast.Name(id=other)):
+                    places[name] = places[other]
     names = sorted({*places, *present})
 
     def find(name: str) -> object:
-        place = places.get(name, f"{package}.{name}")
-        if name not in places and (name.startswith("__") or find_spec(place) is None):
+        place, attribute = places.get(name, (package, name))
+        if name not in places and (name.startswith("__") or not find_spec(f"{package}.{name}")):
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module = import_module(place.removesuffix(":"))
-        is_module = place.endswith(":") or place == f"{package}.{name}"
-        return module if is_module else getattr(module, name)
+        if place == package:
+            return import_module(f"{package}.{attribute}")
+        return getattr(import_module(place), attribute)
 
     return find, lambda: names, names

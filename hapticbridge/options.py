@@ -21,6 +21,7 @@ from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
+from hapticbridge.device.base import calling_on_error
 from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, choices
 from hapticbridge.guard import (
     CONTROLLERS,
@@ -226,11 +227,8 @@ def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator
         return
     refuse_simulated_time(device, clock)
     opened = device_for(scene, device)
-    try:
+    with calling_on_error(opened.close):
         yield opened
-    except BaseException:
-        opened.close()
-        raise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -316,6 +314,11 @@ class RunSetup:
             scale=scales[0],
             controller=options.controller,
         )
+        for button, purpose in ((options.clutch, "--clutch"), (options.dead_man, "--dead-man")):
+            if button is not None and info.buttons is not None and button >= info.buttons:
+                raise DeviceError(
+                    f"{purpose} {button}: the device '{info.name}' has {info.buttons} buttons"
+                )
         guard = replace(
             guard,
             clutch=button_mask(options.clutch, "clutch"),

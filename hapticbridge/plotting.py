@@ -22,12 +22,16 @@ DOTS_PER_INCH = 100
 larger files."""
 
 
-def check_ending(path: Path) -> None:
+def check_ending(path: Path | None) -> None:
     """Checks that a picture can be written to a file, before anything is computed for it.
+
+    None, for no picture, passes.
 
     Raises:
         HapticBridgeError: The extension is not one of ``ENDINGS``, or the folder does not exist.
     """
+    if path is None:
+        return
     if path.suffix.lower() not in ENDINGS:
         raise HapticBridgeError(
             f"the picture '{path}' must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"

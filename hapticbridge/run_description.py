@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -296,6 +297,8 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
         method = method_of(meta)
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
         damping, rotational = (None, None) if device is None else device.dissipating_damping
+        numbers: dict[str, Any] = {name: meta_float(meta, name) for name in _FLOATS}
+        numbers |= {name: meta_numbers(meta, name, 7) for name in _POSES}
         return RunParameters(
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
@@ -303,17 +306,10 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
             ramp_ticks=meta_count(meta, "ramp_ticks"),
             axes=meta_numbers(meta, "axes", 9),
-            scale=meta_float(meta, "scale"),
-            force_scale=meta_float(meta, "force_scale"),
-            force_limit=meta_float(meta, "force_limit"),
-            torque_limit=meta_float(meta, "torque_limit"),
-            device_origin=meta_numbers(meta, "device_origin", 7),
-            handle_origin=meta_numbers(meta, "handle_origin", 7),
-            device_start=meta_numbers(meta, "device_start", 7),
             scheme=method.scheme,
             is_rigid=method.is_rigid,
             effective=_effective(meta, method),
-            contact_stiffness=meta_float(meta, "contact_stiffness"),
+            **numbers,
             device_damping=damping,
             device_rotational_damping=rotational,
             guarding=GuardParameters.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,

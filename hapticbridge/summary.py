@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import condition_sentences, is_run_certified, run_conditions
+from hapticbridge.certificate import (
+    condition_sentences,
+    fresh_share,
+    is_run_certified,
+    run_conditions,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
@@ -51,25 +56,6 @@ def was_always_implicit(ticks: NDArray[np.void]) -> bool:
 def was_never_lossless(count: int, flags: int) -> bool:
     """Returns True if no record was lossless, by the number of records and their combined flags."""
     return count > 0 and not flags & int(TickFlag.MIDPOINT)
-
-
-def watch_sentence(flags: int) -> str:
-    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
-
-    Args:
-        flags: Combined flags of a run's records; without the watch's own the text is empty.
-    """
-    if flags & int(TickFlag.RUNS_AWAY):
-        return (
-            "the force was taken away because the device gained speed against it: an axis is "
-            "reversed (check the axes and signs of the device) or the force comes very late"
-        )
-    if flags & int(TickFlag.SWINGING):
-        return (
-            "the force was lowered because it swung as that of a late device does: lower "
-            "--stiffness, and measure the device's delay ('hapticbridge identify')"
-        )
-    return ""
 
 
 # Energies metered by the kernel, and the environment's verdict
@@ -142,19 +128,8 @@ class Ledger:
         return {name: value for name, value in asdict(self).items() if name in _ENERGIES[:-1]}
 
 
-_ENERGIES = (
-    "kinetic",
-    "potential",
-    "coupling_work",
-    "actuator_work",
-    "external_work",
-    "environment_energy",
-    "device_energy",
-    "slack",
-    "slack_share",
-)
-
-_TICKS = ("first_unstrict", "first_active", "first_device_excess")
+_NAMES = tuple(field.name for field in fields(Ledger))
+_ENERGIES, _TICKS = _NAMES[:9], _NAMES[9:]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,6 +175,7 @@ class Summary:
         peak_tool_force: Largest norm of the force on the tool in N. It differs from that on the
             hand by ``force_scale``, and while the force rises or fades.
         peak_tool_torque: Largest norm of the torque on the tool in N m.
+        limits_reached: Which of ``force`` and ``torque`` on the tool reached its limit.
         energies: Energies by name in J.
         environment: ``strict``, ``within slack`` or ``active``.
         slack_share: Largest share of the slack that was used.
@@ -214,14 +190,14 @@ class Summary:
             metering; for any other the audit of the recording decides.
         conditions: Device conditions, as sentences.
         is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation, and the run kept its time. None if its damping is unknown, or
+            translation and rotation, the run kept its time, and the force did not swing as a late
+            one does. None if its damping is unknown, or
             if no coupling law makes the condition sufficient.
         timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
-        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
     """
 
     ticks: int
@@ -233,6 +209,7 @@ class Summary:
     peak_torque: float
     peak_tool_force: float
     peak_tool_torque: float
+    limits_reached: tuple[str, ...]
     energies: dict[str, float]
     environment: str
     slack_share: float
@@ -247,7 +224,6 @@ class Summary:
     stopped_by: str
     recording: Path | None
     reach: float | None
-    watch: str
 
     @property
     def verdict(self) -> str:
@@ -268,12 +244,16 @@ class Summary:
         ledger = Ledger.of(state)
         conditions = run_conditions(info, parameters, method)
         timing = state["timing"][0]
+        due = outcome.ticks + outcome.skipped
         times = RunTimes(
             ticks=outcome.ticks,
-            due=outcome.ticks + outcome.skipped,
+            fresh=fresh_share(info, parameters.period, int(state["guard"]["fresh"][0]), due),
+            due=due,
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
             delay_energy=float(timing["most_uncovered"]),
             is_realtime=outcome.is_realtime,
+            flags=int(state["watch"]["flags"][0]),
+            has_tripped=outcome.stopped_by == "trip",
         )
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
@@ -283,6 +263,11 @@ class Summary:
             skipped=outcome.skipped,
             dropped=outcome.dropped,
             **{name: float(state["loop"][name][0]) for name in _PEAKS},
+            limits_reached=tuple(
+                kind
+                for kind, limit in zip(("force", "torque"), state["level"]["level"][0], strict=True)
+                if state["loop"][f"peak_tool_{kind}"][0] >= limit * (1.0 - 1e-9)
+            ),
             energies=ledger.energies(),
             environment=ledger.environment,
             slack_share=ledger.slack_share,
@@ -304,5 +289,4 @@ class Summary:
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
-            watch=watch_sentence(int(state["watch"]["flags"][0])),
         )

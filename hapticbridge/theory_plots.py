@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,17 +93,14 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         low_pass: float = 0.0,
         law: Coupling = requested,
     ) -> Alternative:
-        needed = minimum_damping(
-            law, step, discretization=scheme, delay=delay, filter_time=low_pass
-        )
+        loop: Any = {"discretization": scheme, "delay": delay, "filter_time": low_pass}
+        needed = minimum_damping(law, step, **loop)
         frequency = _frequencies(step)
-        spectrum = damping_spectrum(
-            law, step, frequency, discretization=scheme, delay=delay, filter_time=low_pass
-        )
+        spectrum = damping_spectrum(law, step, frequency, **loop)
         if delay == 0 and law.damping == 0:  # a plain spring needs K T/2 at all frequencies
             return Alternative(name, needed, None, (frequency, spectrum))
-        worst = worst_frequency(law, step, discretization=scheme, delay=delay, filter_time=low_pass)
-        return Alternative(name, needed, float(worst), (frequency, spectrum))
+        worst = float(worst_frequency(law, step, **loop))
+        return Alternative(name, needed, worst, (frequency, spectrum))
 
     def by(method: Method) -> Alternative:
         used = method.law_coupling(requested, period)

@@ -3,8 +3,9 @@
 The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a force that acts at
 once. A run certifies its device only if it kept its time, which means two things.
 
-1. At the time between ticks that the run had on average, T/s with s the share of the deadlines that
-   it kept, and at its mean time t_d from sample to force, the condition still holds:
+1. At the time between new samples that the run had on average, T/s with s the share of the
+   deadlines that it kept, or of the samples that were new if that is less, and at its mean time t_d
+   from sample to force, the condition still holds:
 
        b >= N/s + 3 κ t_d/T,    κ = (K T/2)²/N
 
@@ -25,6 +26,7 @@ from dataclasses import dataclass
 from hapticbridge.certificate import DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.timing import DELAY_PRICE
+from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
 
 INSTANT = 1e-3
@@ -34,6 +36,9 @@ larger one can be felt."""
 
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
+
+SWUNG = "its force came late or reversed"
+"""Words for what the watch found (``kernel.swing_watch``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +51,38 @@ class RunTimes:
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         is_realtime: True if real time was requested from the system.
+        fresh: Share of the samples due that were new, 0 to 1.
+        flags: Combined flags of the records, or of the watch alone.
+        has_tripped: True if the guard stopped the run.
     """
 
     ticks: int
+    fresh: float
     due: int
     mean_delay: float
     delay_energy: float
     is_realtime: bool
+    flags: int = 0
+    has_tripped: bool = False
+
+
+def watch_sentence(flags: int) -> str:
+    """Describes what the watch did to the force (``kernel.swing_watch``), with the remedy.
+
+    Args:
+        flags: Combined flags of a run's records; without the watch's own the text is empty.
+    """
+    if flags & int(TickFlag.RUNS_AWAY):
+        return (
+            "the force was taken away because the device gained speed against it: an axis is "
+            "reversed (check the axes and signs of the device) or the force comes very late"
+        )
+    if flags & int(TickFlag.SWINGING):
+        return (
+            "the force was lowered because it swung as that of a late device does: lower "
+            "--stiffness, and measure the device's delay ('hapticbridge identify')"
+        )
+    return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,23 +90,33 @@ class Timekeeping:
     """Time that a run kept, and the device condition at this time.
 
     Attributes:
-        rate: Ticks per second that really happened.
+        rate: Ticks with a new sample per second that really happened.
         share: Share of the deadlines that were kept, 0 to 1.
+        fresh: Share of the samples due that were new, 0 to 1.
         mean_delay: Mean time in s from a sample to its force.
         delay_energy: Largest energy in J that delays may have given to the hand.
         conditions: Device conditions at these times.
+        in_time: The same for ticks and forces in time.
         is_kept: True if all conditions hold and the energy is at most ``INSTANT``; None if no
             condition holds even for a run in time.
         is_realtime: True if real time was requested from the system.
+        watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
+        law_evaluations: Evaluations of the law per tick.
+        has_tripped: True if the guard stopped the run.
     """
 
     rate: float
     share: float
+    fresh: float
     mean_delay: float
     delay_energy: float
     conditions: tuple[DampingCondition, ...]
+    in_time: tuple[DampingCondition, ...]
     is_kept: bool | None
     is_realtime: bool
+    watch: str
+    law_evaluations: int
+    has_tripped: bool
 
     @classmethod
     def of(
@@ -84,27 +124,53 @@ class Timekeeping:
     ) -> Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         share = times.ticks / times.due if times.due > times.ticks else 1.0
-        late = tuple(_at_times(each, parameters, share, times.mean_delay) for each in conditions)
+        least = min(share, times.fresh)
+        late = tuple(_at_times(each, parameters, least, times.mean_delay) for each in conditions)
         held = [each.holds for each in late if each.available is not None]
         is_borne = bool(held) and all(each.holds is not False for each in conditions)
         return cls(
-            rate=share / parameters.period if times.ticks else 0.0,
+            rate=least / parameters.period if times.ticks else 0.0,
             share=share,
+            fresh=times.fresh,
             mean_delay=times.mean_delay,
             delay_energy=times.delay_energy,
             conditions=late,
+            in_time=tuple(conditions),
             is_kept=all(held) and times.delay_energy <= INSTANT if is_borne else None,
             is_realtime=times.is_realtime,
+            watch=watch_sentence(times.flags),
+            law_evaluations=parameters.law_evaluations,
+            has_tripped=times.has_tripped,
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
-        """Returns a verdict on the device, False if the run did not keep its time."""
-        return False if self.is_kept is False else verdict
+        """Returns a verdict on the device, False if the run was not as it assumes."""
+        is_refuted = bool(self.watch) or self.has_tripped
+        return False if self.is_kept is False or (verdict and is_refuted) else verdict
+
+    def device_words(self, verdict: bool | None) -> str:
+        """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
+        count = self.law_evaluations
+        bound = "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
+        if verdict:
+            return f"device certified{self.clause}: b >= {bound}"
+        if verdict is None:
+            return "device not judged: nothing proves that it bears the coupling"
+        if self.is_kept is False:
+            return f"device not certified: {NOT_KEPT}"
+        if self.watch:
+            return f"device not certified: {SWUNG}"
+        if self.has_tripped:
+            return "device not certified: the guard stopped the run"
+        return f"device not certified: b < {bound}"
 
     @property
     def words(self) -> str:
         """Effective rate and share of the deadlines: ``914 Hz, 91.4 % of the deadlines kept``."""
-        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept"
+        lost = (
+            "" if self.fresh >= self.share else f", {100.0 * self.fresh:.3g} % of the samples new"
+        )
+        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}"
 
     @property
     def clause(self) -> str:
@@ -119,7 +185,7 @@ class Timekeeping:
     def remedy(self) -> str:
         """Changes that help a run to keep its time."""
         request = "" if self.is_realtime else "--realtime, "
-        return f"{request}less stiffness, or a --rate that 'hapticbridge check' finds possible"
+        return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
 
     @property
     def hint(self) -> str:
@@ -130,17 +196,23 @@ class Timekeeping:
 
     @property
     def fault(self) -> str:
-        """Sentence on the time that was not kept, with the remedy; empty if it was."""
+        """Sentence on the time that was not kept or on a late force, with the remedy; or empty."""
+        return "; ".join(text for text in (self._not_kept, self.watch) if text)
+
+    @property
+    def _not_kept(self) -> str:
         if self.is_kept is not False:
             return ""
         late = f" and {format_si(self.mean_delay, 's')} from sample to force"
         at_times = f"at {self.rate:.4g} Hz{late if self.mean_delay else ''} it needs"
-        failed = [each for each in self.conditions if each.holds is False]
+        pairs = zip(self.conditions, self.in_time, strict=True)
+        failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
-            unit = "N s/m" if failed[0].axis == "translation" else "N m s/rad"
+            late_one, usual = failed[0]
+            unit = "N s/m" if usual.axis == "translation" else "N m s/rad"
             found = (
-                f"{at_times} {failed[0].needed:.3g} {unit} of damping in {failed[0].axis} and has "
-                f"{failed[0].available:.3g}"
+                f"{at_times} {late_one.needed:.3g} {unit} of damping in {usual.axis}, not "
+                f"{usual.needed:.3g} as in time, and has {usual.available:.3g}"
             )
         else:
             found = (

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from typing import Any
+
+import pytest
 
 Called = Callable[..., tuple[int, str, str]]
 """The fixture ``call``: it runs a command; returns exit code, stdout and stderr."""
+
+
+def facts_of(call: Called, *words: object) -> tuple[int, Any]:
+    """Returns the exit code of a command, and what it printed: JSON without inf and nan."""
+    code, out, _ = call(*words, "--json")
+    return code, json.loads(out, parse_constant=pytest.fail)
 
 
 def one_sentence(err: str) -> str:

@@ -6,15 +6,17 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from hapticbridge.lab.maps.base import Point, StabilityMap, run_map
 
 
 def boundary_of(
-    drawn: StabilityMap, folder: Path, count: int, keep: Callable[[Point], bool] = bool
+    module: ModuleType, folder: Path, count: int, keep: Callable[[Point], bool] = bool
 ) -> Mapping[str, Any]:
     """Draws a map at those of its points that are kept, none of which may fail."""
+    drawn = StabilityMap.of(module)
     few = replace(drawn, points=lambda n: [point for point in drawn.points(n) if keep(point)])
     with ThreadPoolExecutor(2) as executor:
         files = run_map(few, folder, points=count, executor=executor)

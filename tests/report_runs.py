@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import Hand, SimulatedDevice
+from hapticbridge.device import Device, Hand, SimulatedDevice
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
@@ -65,6 +65,14 @@ def _tapping(tick: int) -> tuple[float, ...]:
     return (0, 0, -0.004 * (1 - np.cos(0.04 * tick)), 1, 0, 0, 0)
 
 
+def made_in(path: Path, mjcf: str, device: Device, coupling: Coupling, **options: Any) -> Path:
+    """Records a run in a scene of its own, which is written beside the recording."""
+    scene = path.with_suffix(".xml")
+    scene.write_text(mjcf)
+    recorded(path, str(scene), device, coupling, **options)
+    return path
+
+
 def active_by_method(folder: Path) -> Path:
     """A light tool under an integrator that creates energy in free motion."""
     path = folder / "method.mcap"
@@ -75,15 +83,11 @@ def active_by_method(folder: Path) -> Path:
 
 def active_by_contact(folder: Path) -> Path:
     """A ball pushed onto a floor that is far stiffer than the step resolves."""
-    scene, path = folder / "floor.xml", folder / "contact.mcap"
-    scene.write_text(HARD_FLOOR)
-    recorded(path, str(scene), ScriptedDevice(_tapping), LOOSE, duration=1.0)
-    return path
+    path, device = folder / "floor.mcap", ScriptedDevice(_tapping)
+    return made_in(path, HARD_FLOOR, device, LOOSE, duration=1.0)
 
 
 def _held_to_an_anvil(path: Path, stiffness: float, duration: float, **sheet: Any) -> Path:
-    scene = path.with_suffix(".xml")
-    scene.write_text(ANVIL)
     simulated = {
         "delay": 2 if sheet.get("delay") else 0,
         "resolution": sheet.get("resolution", 0.0),
@@ -91,8 +95,7 @@ def _held_to_an_anvil(path: Path, stiffness: float, duration: float, **sheet: An
     device = SimulatedDevice(mass=0.4, damping=2.0, hand=LIGHT_HAND, **simulated)
     device.info = replace(device.info, **sheet)
     coupling = Coupling(stiffness, 0.05, 0.1, 1e-4)
-    recorded(path, str(scene), device, coupling, duration=duration, limits=FULL)
-    return path
+    return made_in(path, ANVIL, device, coupling, duration=duration, limits=FULL)
 
 
 def active_by_rate(folder: Path) -> Path:
@@ -112,47 +115,36 @@ def active_by_quantisation(folder: Path) -> Path:
 
 def active_by_mocap(folder: Path) -> Path:
     """A body that is put elsewhere tick by tick and knocks against a tool at rest."""
-    scene, path = folder / "push.xml", folder / "inputs.mcap"
-    scene.write_text(PUSHED)
-    recorded(
-        path, str(scene), ScriptedDevice(_resting), LOOSE, duration=0.05, on_tick=_knock("pusher")
-    )
-    return path
+    path, device = folder / "push.mcap", ScriptedDevice(_resting)
+    return made_in(path, PUSHED, device, LOOSE, duration=0.05, on_tick=_knock("pusher"))
 
 
 def active_beside_a_fan(folder: Path) -> Path:
     """The hard floor again, while a body that touches nothing is moved far away."""
-    scene, path = folder / "fan.xml", folder / "fan.mcap"
+    path, device = folder / "fan.mcap", ScriptedDevice(_tapping)
     fan = '<body name="fan" mocap="true" pos="1 0 0"><geom size="0.02"/></body>'
-    scene.write_text(HARD_FLOOR.replace("<worldbody>", f"<worldbody>{fan}"))
-    recorded(
-        path, str(scene), ScriptedDevice(_tapping), LOOSE, duration=0.06, on_tick=_knock("fan", 1.0)
-    )
-    return path
+    floor = HARD_FLOOR.replace("<worldbody>", f"<worldbody>{fan}")
+    return made_in(path, floor, device, LOOSE, duration=0.06, on_tick=_knock("fan", 1.0))
 
 
 def active_by_rotation(folder: Path) -> Path:
     """K_r T/2 = 0.01 N m s/rad on a device of 0.002."""
-    scene, path = folder / "turn.xml", folder / "turn.mcap"
-    scene.write_text(ANVIL)
     hand = replace(
         LIGHT_HAND, rotational_inertia=1e-5, rotational_damping=0.0, rotational_stiffness=0.05
     )
     device = SimulatedDevice(mass=0.4, damping=2.0, hand=hand)
-    recorded(path, str(scene), device, Coupling(300.0, 0.05, 20.0, 1e-4), duration=0.5, limits=FULL)
-    return path
+    coupling = Coupling(300.0, 0.05, 20.0, 1e-4)
+    return made_in(folder / "turn.mcap", ANVIL, device, coupling, duration=0.5, limits=FULL)
 
 
 def active_by_repeated_samples(folder: Path) -> Path:
     """K T/2 + B' = 1.75 N s/m on a device of 2, three of four samples of which get lost."""
-    scene, path = folder / "lossy.xml", folder / "lossy.mcap"
-    scene.write_text(ANVIL)
-    device = LossyDevice(mass=0.4, damping=2.0, hand=LIGHT_HAND)
+    path, device = folder / "lossy.mcap", LossyDevice(mass=0.4, damping=2.0, hand=LIGHT_HAND)
     # a device whose delay is known would be certified, and not be watched
     device.info = replace(device.info, delay=None)
     coupling = Coupling(3500.0, 0.05, 0.1, 1e-4)
-    recorded(path, str(scene), device, coupling, duration=2.0, limits=FULL, is_guarded=False)
-    return path
+    options: dict[str, Any] = {"duration": 2.0, "limits": FULL, "is_guarded": False}
+    return made_in(path, ANVIL, device, coupling, **options)
 
 
 class LossyDevice(SimulatedDevice):

@@ -209,24 +209,31 @@ def test_a_change_of_the_one_kind_of_gains_leaves_the_other(run: Callable[..., A
 FREE = Limits(force=10.0, torque=0.5, ramp=0.05, energy=math.inf)
 
 
-def rubbed_and_pressed(tick: int) -> tuple[float, ...]:
-    """Moved to and fro against the coupling's damper until 2 s, then 40 mm aside and back."""
+def rubbed_and(
+    tick: int, rub: tuple[float, float], then: tuple[float, float, float, float]
+) -> float:
+    """A swing of a size and a rate until 2 s, then a size from a tick on, that rises and falls."""
     if tick < 2000:
         swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
-        way = 0.04 * swing * math.sin(0.02 * tick)
-    else:
-        way = 0.04 * min(max((tick - 2500) / 400, 0.0), 1.0, max((3800 - tick) / 400, 0.0))
-    return (way, 0, 0, 1, 0, 0, 0)
+        return rub[0] * swing * math.sin(rub[1] * tick)
+    size, begin, rise, fall = then
+    return size * min(max((tick - begin) / rise, 0.0), 1.0, max((3800 - tick) / fall, 0.0))
+
+
+def rubbed_and_pressed(tick: int) -> tuple[float, ...]:
+    """Moved to and fro against the coupling's damper until 2 s, then 40 mm aside and back."""
+    return (rubbed_and(tick, (0.04, 0.02), (0.04, 2500, 400, 400)), 0, 0, 1, 0, 0, 0)
 
 
 def rubbed_and_turned(tick: int) -> tuple[float, ...]:
     """Turned to and fro until 2 s, then by half a radian and back."""
-    if tick < 2000:
-        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
-        angle = 0.3 * swing * math.sin(0.04 * tick)
-    else:
-        angle = 0.5 * min(max((tick - 2500) / 400, 0.0), 1.0, max((3800 - tick) / 400, 0.0))
+    angle = rubbed_and(tick, (0.3, 0.04), (0.5, 2500, 400, 400))
     return (0, 0, 0, math.cos(angle / 2), 0, math.sin(angle / 2), 0)
+
+
+def rubbed_and_pushed(tick: int) -> tuple[float, ...]:
+    """Moved to and fro until 2 s, then 40 mm into the spring and back."""
+    return (rubbed_and(tick, (0.02, 0.04), (0.04, 2200, 300, 600)), 0, 0, 1, 0, 0, 0)
 
 
 SPRING = """<mujoco>
@@ -239,16 +246,6 @@ SPRING = """<mujoco>
     </body>
   </worldbody>
 </mujoco>"""
-
-
-def rubbed_and_pushed(tick: int) -> tuple[float, ...]:
-    """Moved to and fro until 2 s, then 40 mm into the spring and back."""
-    if tick < 2000:
-        swing = min(max((tick - 100) / 200, 0.0), (2000 - tick) / 200, 1.0)
-        way = 0.02 * swing * math.sin(0.04 * tick)
-    else:
-        way = 0.04 * min(max((tick - 2200) / 300, 0.0), 1.0, max((3800 - tick) / 600, 0.0))
-    return (way, 0, 0, 1, 0, 0, 0)
 
 
 OF_A_SPRING: dict[str, Any] = {"scene": SPRING, "pose": rubbed_and_pushed}

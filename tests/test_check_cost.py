@@ -12,6 +12,7 @@ import pytest
 from hapticbridge.check import cost as costs
 from hapticbridge.check.case import samples_of
 from hapticbridge.check.cost import Cost, measure_cost
+from hapticbridge.check.observe import Setting
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
@@ -62,10 +63,10 @@ def cost_of_wall(
     scene = load_scene(wall)
     samples = samples_of(motion, 1e-3)
     if clock is None:
-        return measure_cost(scene, samples, COUPLING, 1e-3)
+        return measure_cost(scene, samples, Setting(COUPLING))
     if plant is not None:
         plant(clock)  # not before: MuJoCo's compiler calls some of it too
-    return measure_cost(scene, samples, COUPLING, 1e-3, clock=clock.pythons)
+    return measure_cost(scene, samples, Setting(COUPLING), clock=clock.pythons)
 
 
 def changed(cost: Cost) -> dict[str, tuple[float, float]]:
@@ -143,7 +144,7 @@ def test_what_the_bridge_adds_to_the_step_is_its_own_line(clock: PlantedClock) -
 
     scene = load_scene("point_mass")
     motion = Motion([0, 0.2], [(0, 0, 0), (0.01, 0, 0)])
-    cost = measure_cost(scene, samples_of(motion, 1e-3), COUPLING, 1e-3, clock=pythons)
+    cost = measure_cost(scene, samples_of(motion, 1e-3), Setting(COUPLING), clock=pythons)
     assert changed(cost).keys() == {costs.BRIDGE}
     assert changed(cost)[costs.BRIDGE][0] == pytest.approx(4)
     assert cost.contact.ticks == 0
@@ -174,4 +175,4 @@ def test_motion_that_ends_in_nothing_finite_is_an_error() -> None:
     samples = samples_of(Motion([0, 0.2], [(0, 0, 0), (0.01, 0, 0)]), 1e-3)
     samples["position"][100] = np.nan
     with pytest.raises(SceneError, match="not finite after tick 100"):
-        measure_cost(scene, samples, COUPLING, 1e-3)
+        measure_cost(scene, samples, Setting(COUPLING))

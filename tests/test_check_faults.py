@@ -28,10 +28,11 @@ from hapticbridge.check.case import open_case
 from hapticbridge.check.fault import Fault, length, weight
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
+from hapticbridge.check.observe import Setting
 from hapticbridge.check.physics import depth_under
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
-from hapticbridge.check.version import SceneVariant, Setting, name_everything
+from hapticbridge.check.version import SceneVariant, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.cli import main
 from hapticbridge.cli.main import USAGE_ERROR

@@ -180,15 +180,6 @@ def test_tendons_and_equalities_influence(tmp_path: Path, joints: str, reached: 
     assert named == {f"body '{name}'" for name in ("a", "b") if name not in reached}
 
 
-def test_in_a_scene_with_flexes_nothing_that_moves_is_called_idle(tmp_path: Path) -> None:
-    cloth = """<flexcomp name="c" type="grid" count="3 3 1" spacing=".02 .02 .02" pos="0 0 -.02"
-      radius=".002" mass="0.1" dim="2"><contact selfcollide="none"/><edge equality="true"/>
-      </flexcomp>"""
-    case = case_of(written(tmp_path, mjcf(GOOD_OPTION, world=cloth)))
-    counted = take_inventory(case.model, "grip", case.places, case.observation)
-    assert not [each for each in counted.idle if each.place.element.startswith("body")]
-
-
 def test_without_a_motion_what_can_meet_counts_as_met(tmp_path: Path) -> None:
     case = case_of(bench(tmp_path / "scene"))
     counted = take_inventory(case.model, "grip", case.places)

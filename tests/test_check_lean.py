@@ -22,13 +22,14 @@ from hapticbridge.check.case import motion_for
 from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
 from hapticbridge.check.lean_output import draw_lean, lean_facts, write_lean, write_table
+from hapticbridge.check.observe import Setting
 from hapticbridge.check.perception import felt_error
 from hapticbridge.check.simplify import (
     contact_simplifications,
     freedom_simplifications,
     shape_simplifications,
 )
-from hapticbridge.check.version import SceneVariant, Setting, name_everything
+from hapticbridge.check.version import SceneVariant, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling

@@ -14,8 +14,8 @@ from outside_scenes import hand_rows, mjcf
 from hapticbridge.check import physics
 from hapticbridge.check.contact_faults import inertia_of
 from hapticbridge.check.fault import length, number, weight
-from hapticbridge.check.model_faults import creep_speed, dent_of, mesh_of
-from hapticbridge.check.physics import constraint_stiffness, depth_under
+from hapticbridge.check.model_faults import creep_speed, dent_of
+from hapticbridge.check.physics import constraint_stiffness, depth_under, mesh_of
 from hapticbridge.scene import scene_path
 from hapticbridge.scene.contacts import settings_among
 

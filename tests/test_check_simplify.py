@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.check import lean, simplify
 from hapticbridge.check.case import motion_for
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, VariantVerdict
-from hapticbridge.check.observe import quiet
+from hapticbridge.check.observe import Setting, quiet
 from hapticbridge.check.simplify import Simplification
-from hapticbridge.check.version import SceneVariant, Setting, name_everything
+from hapticbridge.check.version import SceneVariant, name_everything
 from hapticbridge.check.witness import CLEARANCE, witness
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 from check_scenes import PLANTS, bench, line_of
-from cli_cases import Called
+from cli_cases import Called, facts_of
 from outside_scenes import CONTACT, hand_file, mjcf, scene_file
 
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import scene_path
 
 PLANT = {plant.kind: plant for plant in PLANTS}
-
-
-def facts_of(call: Called, *arguments: object) -> tuple[int, Any]:
-    code, out, _ = call("check", *arguments, "--json")
-    return code, json.loads(out)
 
 
 def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> None:
@@ -41,6 +34,14 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:
+    picture, motion = tmp_path / "check.png", tmp_path / "short.csv"
+    motion.write_text("t,x,y,z\n0,0,0,0\n0.05,0.001,0,0\n")
+    code, _, err = call("check", "point_mass", "--motion", motion, "--plot", picture)
+    assert code == 0, err
+    assert picture.exists()
+
+
 def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) -> None:
     plant = PLANT["margin"]
     scene = bench(tmp_path / "scene", plant)
@@ -55,7 +56,7 @@ def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) ->
 
 def test_the_json_holds_counts_faults_and_cost(tmp_path: Path, call: Called) -> None:
     scene = bench(tmp_path / "scene", PLANT["keyframe"])
-    code, facts = facts_of(call, scene, "--rate", 2000, "--stiffness", 1000)
+    code, facts = facts_of(call, "check", scene, "--rate", 2000, "--stiffness", 1000)
     assert (code, facts["period_s"], facts["coupling"]["stiffness"]) == (1, 0.0005, 1000)
     assert facts["inventory"]["degrees_of_freedom"] == 14
     assert {"free", "contact", "stages", "highest_rate", "by_rows"} <= facts["cost"].keys()
@@ -66,7 +67,7 @@ def test_the_json_holds_counts_faults_and_cost(tmp_path: Path, call: Called) -> 
 def test_a_recording_is_a_motion_too(tmp_path: Path, call: Called) -> None:
     recording = tmp_path / "run.mcap"
     call("run", "virtual_wall", "--fast", "--duration", 0.5, "--record", recording)
-    code, facts = facts_of(call, "virtual_wall", "--motion", recording)
+    code, facts = facts_of(call, "check", "virtual_wall", "--motion", recording)
     length = 0.001 * (len(read_recording(recording).ticks) - 1)
     assert (code, facts["motion"]["seconds"]) == (0, pytest.approx(length))
 
@@ -78,10 +79,10 @@ def test_scale_and_workspace_decide_if_the_motion_fits(call: Called) -> None:
 
 
 def test_parameters_of_a_scene_are_checked_as_set(call: Called) -> None:
-    code, facts = facts_of(call, "peg_in_hole", "--set", "clearance=0.0005")
+    code, facts = facts_of(call, "check", "peg_in_hole", "--set", "clearance=0.0005")
     assert (code, facts["parameters"]["clearance"]) == (0, 0.0005)
     assert facts["inventory"]["possible_pairs"] == 5
-    usual = facts_of(call, "peg_in_hole")[1]["inventory"]
+    usual = facts_of(call, "check", "peg_in_hole")[1]["inventory"]
     assert facts["inventory"]["deepest"] != usual["deepest"]
 
 
@@ -99,7 +100,7 @@ def test_a_copy_of_a_scene_in_another_folder_is_read_where_it_lies(
 ) -> None:
     copy = tmp_path / "round_peg"
     shutil.copytree(scene_path("round_peg").parent, copy)
-    code, facts = facts_of(call, copy / "round_peg.xml")
+    code, facts = facts_of(call, "check", copy / "round_peg.xml")
     assert (code, facts["scene"]) == (0, str(copy / "round_peg.xml"))
 
 
@@ -140,7 +141,7 @@ def test_check_writes_a_leaner_scene_that_runs(
 
 
 def test_the_json_holds_what_was_tried(studded: tuple[str, ...], call: Called) -> None:
-    code, facts = facts_of(call, *studded, "--lean", "--budget", 0.5)
+    code, facts = facts_of(call, "check", *studded, "--lean", "--budget", 0.5)
     lean = facts["lean"]
     assert (code, lean["budget_jnd"], lean["written"]) == (0, 0.5, None)
     assert lean["result"]["felt_jnd"] <= 0.5

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from cli_cases import Called
+from cli_cases import Called, facts_of
 
 from hapticbridge.device import SimulatedDevice
 
 ZWIDTH = "zwidth --damping 2 --mass 0.1 --friction 0.05 --resolution 1e-5 --rate 1000"
 FREE = "simulated:hand=none,resolution=1e-6"
-
-
-def facts_of(call: Called, command: str) -> Any:
-    """Returns what a command printed, which must be JSON without inf and nan."""
-    return json.loads(call(*command.split())[1], parse_constant=pytest.fail)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +31,7 @@ def test_the_next_command_runs_certified_and_is_rendered_as_it_asks(
 
 
 def test_the_json_holds_the_whole_region(call: Called) -> None:
-    facts = facts_of(call, f"{ZWIDTH} --json")
+    _, facts = facts_of(call, *ZWIDTH.split())
     for name, damping in (("requested", 1.7), ("law", 0.5), ("effective", 1.7)):
         coupling = facts["corner"][name]
         assert coupling["stiffness"] == pytest.approx(2400, rel=1e-12)
@@ -52,7 +46,7 @@ def test_what_is_measured_meets_the_line_of_a_device_that_nobody_holds(
     tmp_path: Path, call: Called
 ) -> None:
     picture = tmp_path / "width.svg"
-    facts = facts_of(call, f"zwidth --measure {FREE} --plot {picture} --json")
+    _, facts = facts_of(call, "zwidth", "--measure", FREE, "--plot", picture)
     line = next(line for line in facts["lines"] if line["name"] == "stable without a hand")
     for limit in facts["measured"]:
         # the line is given at points; between them it is nearly straight

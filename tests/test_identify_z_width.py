@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.identify.z_width import MeasuredLimit, measure_limit, try_wall
+from hapticbridge.identify.z_width import MeasuredLimit, WallBench
 from hapticbridge.theory.device_limits import free_device_stiffness
 from hapticbridge.theory.sampled_loop import WorstHand
 
@@ -25,8 +23,7 @@ def clocked(device: SimulatedDevice) -> SimulatedClock:
 
 
 def limit_of(device: SimulatedDevice, damping: float, most: float = 1e6) -> MeasuredLimit:
-    how: Any = {"first_stiffness": 200.0, "max_stiffness": most, "force": 5.0}
-    return measure_limit(device, clocked(device), damping=damping, period=PERIOD, **how)
+    return WallBench(device, clocked(device), PERIOD, force=5.0).limit(damping, 200.0, most)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -59,7 +56,7 @@ def test_a_wall_just_below_the_limit_dies_down_and_one_just_above_grows() -> Non
 
 def test_a_wall_far_too_stiff_stays_within_the_force_and_ends_without() -> None:
     device = SimulatedDevice(hand=None)
-    trial = try_wall(device, clocked(device), 1e5, 0.0, period=PERIOD, force=3.0)
+    trial = WallBench(device, clocked(device), PERIOD, force=3.0).try_wall(1e5, 0.0)
     assert not trial.is_borne
     assert trial.peak <= 3.0
     assert trial.energy > 0.0  # the wall fed the device, which is what makes it grow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from closed_forms import sprung_swing
+from closed_forms import swing_from_rest
 from kernel_runs import Array, T, at_rest, load, samples_of
 from random_hands import random_motion
 from test_kernel_lossless import OUT_AND_BACK, SLIDER, STOP, bound, circling, distance, led
@@ -92,7 +92,7 @@ def test_a_sprung_mass_follows_its_closed_form_to_second_order(name: str) -> Non
         path[:, 0] = 0.02 * np.sin(4 * np.pi * t)
         rows, ledger = led(scene, "lossless", ASKED, path, period)
         assert ledger.environment == "strict"
-        error = rows["tool_position"][:, 0] / 0.02 - sprung_swing(t, ASKED, constants)
+        error = rows["tool_position"][:, 0] / 0.02 - swing_from_rest(t, ASKED, 1.0, constants)
         errors.append(float(np.sqrt(np.mean(error**2))))
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert orders == pytest.approx(2.0, abs=0.05)  # at the end of the step: 0.9 to 1.1

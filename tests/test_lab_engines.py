@@ -32,6 +32,7 @@ from hapticbridge.lab.engines.base import (
     Engine,
     Pose,
     Shape,
+    Simulation,
     Task,
     Velocity,
     composed,
@@ -56,13 +57,17 @@ def turn(quaternion: tuple[float, ...]) -> Rotation:
     return Rotation.from_quat(quaternion, scalar_first=True)
 
 
+def coast(simulation: Simulation, steps: int) -> None:
+    for _ in range(steps):
+        simulation.advance(NOTHING, NOTHING)
+
+
 def test_a_tool_falls_as_half_g_t_squared_to_first_order(engine: Engine) -> None:
     task = Task("fall", Body(0.3, (1e-3, 2e-3, 2.5e-3)), gravity=(0.0, 0.0, -GRAVITY))
     errors = []
     for timestep in (2e-3, 1e-3):
         with opened(engine, task, timestep) as simulation:
-            for _ in range(round(0.2 / timestep)):
-                simulation.advance(NOTHING, NOTHING)
+            coast(simulation, round(0.2 / timestep))
             errors.append(simulation.pose().position[2] + 0.5 * GRAVITY * 0.2**2)
             assert simulation.velocity().linear[2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
     # a step that takes the new velocity is ahead by half a step's fall
@@ -132,14 +137,12 @@ def test_a_spinning_tool_turns_as_euler_says_to_its_engines_order(engine: Engine
     errors = []
     for timestep in (1e-3, 5e-4):
         with opened(engine, task, timestep) as simulation:
-            for _ in range(round(0.1 / timestep)):
-                simulation.advance(NOTHING, NOTHING)
+            coast(simulation, round(0.1 / timestep))
             errors.append((truth.inv() * turn(simulation.pose().quaternion)).magnitude())
     assert errors[0] < 0.2
     assert errors[0] / errors[1] == pytest.approx(2, rel=0.2)
     with opened(engine, task, 1e-3) as simulation:
-        for _ in range(1000):
-            simulation.advance(NOTHING, NOTHING)
+        coast(simulation, 1000)
         local = turn(simulation.pose().quaternion).inv().apply(simulation.velocity().angular)
     gain = np.sum(inertia * local**2) / np.sum(inertia * rate**2) - 1
     least, most = GAINS[engine.name]
@@ -168,8 +171,7 @@ def test_a_moving_tool_starts_with_the_velocity_of_its_centre(engine: Engine) ->
     with opened(engine, task, 1e-4) as simulation:
         assert simulation.velocity().linear == pytest.approx(velocity.linear, rel=1e-6)
         assert simulation.velocity().angular == pytest.approx(velocity.angular, rel=1e-6)
-        for _ in range(100):
-            simulation.advance(NOTHING, NOTHING)
+        coast(simulation, 100)
         pose = simulation.pose()
     before = START.position + turn(START.quaternion).apply(FRAME.position)
     after = pose.position + turn(pose.quaternion).apply(FRAME.position)
@@ -189,8 +191,7 @@ def test_a_shape_rests_on_the_floor(engine: Engine, kind: str) -> None:
             engine.open(task, 1e-3)
         return
     with opened(engine, task, 1e-3) as simulation:
-        for _ in range(200):
-            simulation.advance(NOTHING, NOTHING)
+        coast(simulation, 200)
         contacts = simulation.contacts()
         # 1 N sinks into the softest engine's contact by 60 µm; a wrong axis or margin is 1 mm
         assert simulation.pose().position[2] == pytest.approx(height, abs=1e-4)

@@ -16,7 +16,7 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.maps import contact
 from hapticbridge.lab.maps import contact_rigs as rigs
 from hapticbridge.lab.maps.base import loop_in, set_tool_mass
-from hapticbridge.lab.maps.contact import CONTACT, method_runs
+from hapticbridge.lab.maps.contact import method_runs
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene.contacts import SUGGESTED
 
@@ -116,8 +116,10 @@ def test_map_at_reduced_resolution_agrees_with_the_rule(
     monkeypatch.setattr(contact, "peg_runs", few)
     names = (rigs.SHIPPED, "damped: 0.0005 8")
     monkeypatch.setattr(contact, "HANDS", 1)
+    points = contact.points
+    monkeypatch.setattr(contact, "points", lambda _: points(1))
     boundary = boundary_of(
-        replace(CONTACT, points=lambda _: CONTACT.points(1)),
+        contact,
         tmp_path,
         4,
         lambda p: p["rig"] == "peg" or (p["rig"] == "search" and p["treatment"] in names),

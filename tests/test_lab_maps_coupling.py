@@ -15,6 +15,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.lab.maps import coupling
 from hapticbridge.lab.maps.base import (
     Point,
     free_tool_and_wall,
@@ -22,13 +23,7 @@ from hapticbridge.lab.maps.base import (
     needed_by_6,
     used_damping,
 )
-from hapticbridge.lab.maps.coupling import (
-    COUPLING,
-    DEVICE_DAMPING,
-    PATH,
-    PERIOD,
-    evaluate,
-)
+from hapticbridge.lab.maps.coupling import DEVICE_DAMPING, PATH, PERIOD, evaluate
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
 
@@ -133,7 +128,7 @@ def test_the_audit_of_a_bridge_names_the_tick_and_the_port_of_the_map(
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(COUPLING, tmp_path, 24, lambda p: p["method"] == "implicit")
+    boundary = boundary_of(coupling, tmp_path, 24, lambda p: p["method"] == "implicit")
     implicit = boundary["methods"]["implicit"]
     assert implicit["largest_deviation"] < 0.01
     assert implicit["passive_share_below_6"] == 1.0

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from map_runs import boundary_of
 
+from hapticbridge.lab.maps import device
 from hapticbridge.lab.maps.device import (
     DAMPERS,
-    DEVICE,
     LARGE,
     METHODS_SHOWN,
     PERIOD,
@@ -103,7 +103,7 @@ def test_regions_follow_from_what_the_runs_did(small: str, large: str, region: s
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     # the grid and one damper of each method
     said = boundary_of(
-        DEVICE,
+        device,
         tmp_path,
         9,
         lambda p: p["what"] == "cell" or (p["what"], p.get("damping")) == ("friction", DAMPERS[1]),

@@ -110,7 +110,7 @@ def test_the_peg_fills_its_hole_and_touches_nothing_else() -> None:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(geometry.GEOMETRY, tmp_path, 16)
+    boundary = boundary_of(geometry, tmp_path, 16)
     assert boundary["direct"]["largest_deviation"] < 0.15
     for name in geometry.BEHIND:
         assert boundary[name]["largest_over_smallest"] < 1.05

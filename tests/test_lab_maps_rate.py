@@ -115,7 +115,7 @@ def is_kept(each: Point) -> bool:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(rate.RATE, tmp_path, 20, is_kept)
+    boundary = boundary_of(rate, tmp_path, 20, is_kept)
     by_delay = boundary["methods"]["lossless"]
     assert set(by_delay) == {"0", "5"}
     for mine in by_delay.values():

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from map_runs import boundary_of
 
+from hapticbridge.lab.maps import restitution
 from hapticbridge.lab.maps.base import Point
 from hapticbridge.lab.maps.restitution import (
     APPROACH,
     INERTIA,
     LENGTH,
     MASS,
-    RESTITUTION,
     RESTITUTION_LAWS,
     TIP,
     drop,
@@ -103,7 +103,7 @@ def test_newtons_law_is_the_nearest_to_what_rebounds() -> None:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(RESTITUTION, tmp_path, 630)
+    boundary = boundary_of(restitution, tmp_path, 630)
     by_setting = boundary["settings"]
     assert by_setting["scenes"]["largest_energy_change"] < 0
     assert by_setting["hard spring"]["largest_energy_change"] > 0.1

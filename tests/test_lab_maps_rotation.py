@@ -95,7 +95,7 @@ def test_explicit_creates_energy_at_the_cut_and_implicit_does_not() -> None:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(rotation.ROTATION, tmp_path, 190)
+    boundary = boundary_of(rotation, tmp_path, 190)
     assert boundary["fastest_passive"]["implicit"] > 0
     assert boundary["fastest_passive"]["explicit"] is None
     assert boundary["cut"]["speed_measured"] == pytest.approx(rotation.cut_speed(SOFT), rel=0.02)

@@ -122,7 +122,7 @@ def is_kept(point: Point) -> bool:
 
 
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
-    boundary = boundary_of(tool_mass.TOOL_MASS, tmp_path, 16, is_kept)
+    boundary = boundary_of(tool_mass, tmp_path, 16, is_kept)
     methods = boundary["methods"]
     assert methods["implicit"]["unstable_held_still"] == 0
     assert methods["explicit"]["unstable_held_still"] > 0

@@ -314,7 +314,7 @@ def test_ticks_allocate_none(
             blocks[tick // 12_000] = sys.getallocatedblocks()
 
     with fast(
-        "peg_in_hole", "simulated", pipelined=pipelined, controller=controller, clutch=0, **watchers
+        "peg_in_hole", "simulated", pipelined=pipelined, controller=controller, **watchers
     ) as bridge:
         read_heap()
         gc.collect()

@@ -22,7 +22,7 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import likely_cause, what_would_do
+from hapticbridge.report.cause import Cause, likely_cause, what_would_do
 from hapticbridge.report.evidence import Evidence, decimated
 from hapticbridge.report.facts import MAX_EVENTS, MAX_INPUTS, event_rows, guard_facts
 from hapticbridge.report.page import is_warned, notes
@@ -40,6 +40,16 @@ def evidence_of(recording: Recording) -> Evidence:
 
 def changed(recording: Recording, **parts: Any) -> Recording:
     return Recording(**{**vars(recording), **parts})
+
+
+def cause_by(evidence: Evidence, report: AuditReport) -> Cause:
+    cause = likely_cause(evidence, report)
+    assert cause is not None
+    return cause
+
+
+def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> Cause:
+    return cause_by(evidence_of(changed(recording, **parts)), report)
 
 
 def test_a_long_page_stays_small_and_keeps_its_peaks(run_file: Path, tmp_path: Path) -> None:
@@ -83,8 +93,7 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     assert "The moment" not in text
     recording, active = made(report_runs.active_by_method)
     energy, allowed = evidence_of(recording).judged(active)
-    cause = likely_cause(evidence_of(recording), active)
-    assert cause is not None
+    cause = cause_of(recording, active)
     write_report(recording, active, page)
     text = html.unescape(page.read_text(encoding="utf-8"))
     first = text[text.index("<section") : text.index("</section>")]
@@ -189,18 +198,11 @@ def test_a_run_is_active_for_the_cause_that_it_was_made_for(
     recording, report = made(run)
     assert (report.verdict, report.port) == ("active", port)
     evidence = evidence_of(recording)
-    cause = likely_cause(evidence, report)
-    assert cause is not None
+    cause = cause_by(evidence, report)
     assert cause.kind == kind
     assert told in cause.evidence
     energy, allowed = evidence.judged(report)
     assert energy[report.tick] - allowed[report.tick] == pytest.approx(report.joules)
-
-
-def cause_of(recording: Recording, report: AuditReport, **parts: Any) -> tuple[str, str]:
-    cause = likely_cause(evidence_of(changed(recording, **parts)), report)
-    assert cause is not None
-    return cause.kind, cause.evidence
 
 
 @pytest.mark.parametrize(
@@ -219,21 +221,21 @@ def test_another_device_has_another_cause(
     recording, report = made(run)
     assert had in recording.meta["device"]
     meta = recording.meta | {"device": recording.meta["device"].replace(had, has)}
-    assert cause_of(recording, report, meta=meta)[0] == kind
+    assert cause_of(recording, report, meta=meta).kind == kind
 
 
 def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -> None:
     recording, report = made(report_runs.active_by_contact)
-    assert "touched" in cause_of(recording, report)[1]
+    assert "touched" in cause_of(recording, report).evidence
     hazardous = recording.meta | {"method": "implicitfast"}
-    assert cause_of(recording, report, meta=hazardous)[0] == "contact setting"
+    assert cause_of(recording, report, meta=hazardous).kind == "contact setting"
     foreign = replace(report, resimulation="not re-simulated: recorded with mujoco 3.0.0")
-    kind, told = cause_of(recording, foreign)
-    assert (kind, "touched" in told) == ("contact setting", False)
+    cause = cause_of(recording, foreign)
+    assert (cause.kind, "touched" in cause.evidence) == ("contact setting", False)
     recording, report = made(report_runs.active_by_mocap)
     still = [event for event in recording.events if event["event"] != "input"]
-    assert cause_of(recording, report)[0] == "inputs"
-    assert cause_of(recording, report, events=still)[0] == "contact setting"
+    assert cause_of(recording, report).kind == "inputs"
+    assert cause_of(recording, report, events=still).kind == "contact setting"
 
 
 def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:
@@ -242,21 +244,22 @@ def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made
     sheet = recording.meta["device"].replace('"damping": 2.0', '"damping": 20.0')
     meta, ticks = recording.meta | {"device": sheet}, recording.ticks.copy()
     ticks["flags"][[report.tick - 500, report.tick + 1]] |= int(TickFlag.OVERRUN)
-    assert cause_of(recording, report, meta=meta, ticks=ticks)[0] == "unknown"  # not before it
+    assert cause_of(recording, report, meta=meta, ticks=ticks).kind == "unknown"  # not before it
     ticks["flags"][report.tick - 100 : report.tick - 97] |= int(TickFlag.OVERRUN)
-    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
-    assert (kind, "late by a period or more in the 0.2 s before: 3," in told) == ("rate", True)
+    cause = cause_of(recording, report, meta=meta, ticks=ticks)
+    assert cause.kind == "rate"
+    assert "late by a period or more in the 0.2 s before: 3," in cause.evidence
 
 
 def test_a_fast_turn_without_contact_is_suspected_and_a_slow_one_is_not(made: Made) -> None:
     recording, report = made(report_runs.active_by_method)
     meta = recording.meta | {"method": "implicit"}
-    assert cause_of(recording, report, meta=meta)[0] == "unknown"
+    assert cause_of(recording, report, meta=meta).kind == "unknown"
     ticks = recording.ticks.copy()
     half = 0.5 * 0.03 * ticks["tick"]
     ticks["tool_quaternion"] = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=1)
-    kind, told = cause_of(recording, report, meta=meta, ticks=ticks)
-    assert (kind, "0.03 rad a tick (30 rad/s)" in told) == ("rate", True)
+    cause = cause_of(recording, report, meta=meta, ticks=ticks)
+    assert (cause.kind, "0.03 rad a tick (30 rad/s)" in cause.evidence) == ("rate", True)
 
 
 @pytest.mark.parametrize(
@@ -274,8 +277,7 @@ def test_the_remedy_is_what_the_device_condition_asks_for(
     run: Callable[[Path], Path], told: str, made: Made
 ) -> None:
     recording, report = made(run)
-    cause = likely_cause(evidence_of(recording), report)
-    assert cause is not None
+    cause = cause_of(recording, report)
     assert told in cause.remedy
     assert ("raise the rate" in cause.remedy) == (cause.kind == "rate")
     if run is report_runs.active_by_rate:  # no rate of the loop helps a device with its own
@@ -294,8 +296,7 @@ def test_a_damper_beyond_the_device_is_called_so_and_no_rate_is_asked_for(made: 
     ):
         coupling = replace(evidence.worst.coupling, stiffness=500.0, damping=damping)
         worst = replace(evidence.worst, coupling=coupling)
-        cause = likely_cause(replace(evidence, worst=worst, method=method_named(method)), report)
-        assert cause is not None
+        cause = cause_by(replace(evidence, worst=worst, method=method_named(method)), report)
         assert cause.kind == kind
         assert remedy in cause.remedy
         assert ("raise the rate" in cause.remedy) == (kind == "rate")

@@ -93,8 +93,7 @@ def region(d: Draw) -> Any:
 
 
 def mechanism(d: Draw) -> Any:
-    device = SimpleNamespace(damping=d.least(), friction=d.least(), resolution=d.least())
-    limit = p.quantization_limit(device, d.coupling(), d.above())
+    limit = p.quantization_limit(d.least(), d.least(), d.least(), d.coupling(), d.above())
     return [limit.stiffness, limit.beta, limit.sigma, limit.friction_needed]
 
 
@@ -124,8 +123,7 @@ def turned(d: Draw) -> Any:
 def hit(d: Draw) -> Any:
     velocity = [float(d.signed()), -d.above()]
     law = d.name(("newton", "poisson", "stronge"))
-    other = d.body() if d.rng.random() < 0.5 else None
-    impact = m.resolve_impact(d.body(), velocity, d.least(), 0.5, law, other)
+    impact = m.resolve_impact(d.body(), velocity, d.least(), 0.5, law)
     return np.concatenate([impact.impulse, impact.velocity, [impact.energy_change]])
 
 
@@ -198,9 +196,7 @@ def test_a_magnitude_out_of_range_is_refused_with_the_range(value: float) -> Non
 
 def test_what_is_smaller_than_the_range_counts_as_zero_where_zero_is_valid() -> None:
     assert p.minimum_damping(Coupling(1000, 1e-310, 0, 0), T, discretization="tustin") == 0.5
-    assert p.quantization_limit(
-        SimpleNamespace(damping=1, friction=1e-320, resolution=1e-315), COUPLING, T
-    ).sigma == np.inf  # fmt: skip
+    assert p.quantization_limit(1, 1e-320, 1e-315, COUPLING, T).sigma == np.inf
     with pytest.raises(CouplingError, match="it must be finite and >= 0"):
         p.CouplingGrid(1.0, -1e-310)
 
@@ -235,19 +231,13 @@ def test_what_is_no_coupling_hand_or_body_is_refused(value: Any) -> None:
         lambda: p.SampledLoop(value, T),
         lambda: m.drive_mass(value, 1, [0, 1], T, "held"),
         lambda: m.exact_mass_response(value, 1, 1),
-        lambda: p.quantization_limit(
-            SimpleNamespace(damping=1, friction=1, resolution=1), value, T
-        ),
+        lambda: p.quantization_limit(1, 1, 1, value, T),
     ):
         with pytest.raises(HapticBridgeError, match=r"coupling is .*; it must be"):
             call()
-    with pytest.raises(CouplingError, match="device damping is not known"):
-        p.quantization_limit(object(), COUPLING, T)  # type: ignore[arg-type]
     with pytest.raises(MechanicsError, match="body is"):
         m.resolve_impact(value, [0, -1], 0, 0)
     if value is not None:
-        with pytest.raises(MechanicsError, match="other is"):
-            m.resolve_impact(m.ImpactBody(1, 1, [0, 0]), [0, -1], 0, 0, other=value)
         with pytest.raises(CouplingError, match="hand is"):
             p.SampledLoop(COUPLING, T).simulate(value, 10)
 
@@ -284,7 +274,7 @@ def test_a_transfer_function_that_returns_rubbish_is_refused(answer: Any, senten
     with pytest.raises(CouplingError, match=sentence):
         p.damping_spectrum_of(lambda _: answer, T, [1.0, 2.0])
     with pytest.raises(CouplingError, match="must be a callable of z"):
-        p.damping_spectrum_of(3, T, [1.0])
+        p.damping_spectrum_of(3, T, [1.0])  # type: ignore[arg-type]
 
 
 def test_an_undamped_mass_at_its_resonance_answers_without_limit() -> None:

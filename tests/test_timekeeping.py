@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, SlowClock, recorded
+from bridge_runs import fast, sway
 from cli_cases import Called
 from numpy.typing import NDArray
 
@@ -20,6 +21,7 @@ from hapticbridge.certificate import default_coupling, is_certified
 from hapticbridge.check.cost import Cost, Growth, TimingStats
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.summary import Summary
 from hapticbridge.timekeeping import INSTANT
@@ -287,3 +289,48 @@ def test_check_finds_a_rate_that_this_machine_cannot_hold(
     code, out, _ = call("check", "virtual_wall")
     assert code == 0
     assert "cannot hold" not in out
+
+
+def test_samples_that_are_not_new_count_as_missed_deadlines(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(sway, is_stale=lambda tick: tick % 10 != 0)
+    with fast("point_mass", device, recording=path) as bridge:
+        summary = bridge.run(0.5)
+    report = audit(path)
+    for kept in (summary.timekeeping, report.timekeeping):
+        assert kept is not None
+        assert kept.share == 1.0
+        assert kept.fresh == pytest.approx(0.1, abs=0.01)
+        assert kept.is_kept is False
+        assert "10 % of the samples new" in kept.words
+    assert report.exit_code == 1
+
+
+def test_a_run_that_the_guard_stopped_is_not_certified(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with (
+        fast("point_mass", ScriptedDevice(leap_at(200)), recording=path) as bridge,
+        pytest.raises(SafetyTrip, match="jumped"),
+    ):
+        bridge.run(0.5)
+    report = audit(path)
+    assert report.certified is False
+    assert report.exit_code == 1
+
+
+def leap_at(leap: int) -> Callable[[int], tuple[float, ...]]:
+    """Returns the poses of a device at rest that is 3 m away from a tick on."""
+    return lambda tick: (0.0, 0.0, 3.0 if tick >= leap else 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def test_a_first_sample_far_from_the_start_is_refused() -> None:
+    device = ScriptedDevice(leap_at(0))
+    at_start, device.start = device.start, lambda period: at_home(at_start(period))  # type: ignore[method-assign]
+    with fast("point_mass", device) as bridge, pytest.raises(SafetyTrip, match="jumped"):
+        bridge.run(0.1)
+    assert not np.any(device.writes)
+
+
+def at_home(sample: NDArray[np.void]) -> NDArray[np.void]:
+    sample["position"][0] = 0.0
+    return sample

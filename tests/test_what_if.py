@@ -291,12 +291,9 @@ TOO_STIFF = Coupling(10_000.0, 0.05, 0.1, 1e-4)
 
 
 def swung(path: Path, controller: str | None, duration: float = 0.1) -> Path:
-    scene = path.with_suffix(".xml")
-    scene.write_text(LIGHTLY_HELD)
     device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
     options: dict[str, Any] = {"duration": duration, "controller": controller}
-    recorded(path, str(scene), device, TOO_STIFF, **options)
-    return path
+    return report_runs.made_in(path, LIGHTLY_HELD, device, TOO_STIFF, **options)
 
 
 @pytest.mark.parametrize("button", ["clutch", "dead_man"])

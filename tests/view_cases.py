@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from audit_cases import ScriptedDevice, recorded
-from report_runs import LOOSE
+from audit_cases import ScriptedDevice
+from report_runs import LOOSE, made_in
 
 from hapticbridge.guard import Limits
 
@@ -35,7 +35,5 @@ def pressed(tick: int) -> tuple[float, ...]:
 
 def pressed_floor(folder: Path) -> Path:
     """Records a ball that is moved aside and pressed onto a floor, and held there."""
-    scene, path = folder / "floor.xml", folder / "floor.mcap"
-    scene.write_text(FLOOR)
-    recorded(path, str(scene), ScriptedDevice(pressed), LOOSE, duration=1.5, limits=AT_ONCE)
-    return path
+    path, device = folder / "floor.mcap", ScriptedDevice(pressed)
+    return made_in(path, FLOOR, device, LOOSE, duration=1.5, limits=AT_ONCE)

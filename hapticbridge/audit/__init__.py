@@ -17,8 +17,4 @@ if TYPE_CHECKING:
     from hapticbridge.audit.report import AuditReport as AuditReport
     from hapticbridge.audit.report import verdict_words as verdict_words
 else:
-    __getattr__, __dir__, __all__ = lazy_exports(
-        __name__,
-        {"AuditReport": "hapticbridge.audit.report", "verdict_words": "hapticbridge.audit.report"},
-        present=("audit",),
-    )
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -19,6 +19,7 @@ from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array
 from hapticbridge.audit.wrench_limits import AuditedBlock
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.record import TickFlag, has_flag
 
 _DELAY_PRICE = 3.0  # damping in (K T/2)²/N that a delay of a period needs
 
@@ -34,6 +35,7 @@ class TimingTally:
     Attributes:
         parameters: Run parameters.
         ticks: Number of records so far.
+        fresh: Number of records with a new sample so far.
         due: Number of deadlines so far.
         delays: Sum of the times from sample to force in s.
         most_uncovered: Largest energy in J that delays may have given to the hand.
@@ -44,6 +46,7 @@ class TimingTally:
 
     parameters: RunParameters
     ticks: int = 0
+    fresh: int = 0
     due: int = 0
     delays: float = 0.0
     most_uncovered: float = 0.0
@@ -55,6 +58,7 @@ class TimingTally:
         """Adds consecutive records, at least one."""
         ticks, parameters = block.ticks, self.parameters
         self.ticks += len(ticks)
+        self.fresh += int(np.count_nonzero(~has_flag(ticks, TickFlag.STALE_SAMPLE)))
         self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
         rows = np.concatenate([block.state.row, ticks])
         delay = 1e-9 * (rows["write_ns"] - rows["read_ns"])

@@ -28,6 +28,7 @@ from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
     damping_margin,
+    fresh_share,
     is_run_certified,
     run_conditions,
 )
@@ -36,7 +37,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
-from hapticbridge.summary import Environment, was_never_lossless, watch_sentence
+from hapticbridge.summary import Environment, was_never_lossless
 from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
@@ -176,8 +177,9 @@ def decide(
         return Decision("active", other, reason, tick, "device", joules, energies.slack_share)
     if unstrict is None:
         # rounding may leave it above zero
-        lost = format_energy(max(-energies.energies["environment_energy"], 0.0))
-        reason = f"the environment never gave out more than it got ({lost} dissipated)"
+        lost = max(-energies.energies["environment_energy"], 0.0)
+        spent = f"{format_energy(lost)} dissipated" if lost else "nothing was dissipated"
+        reason = f"the environment never gave out more than it got ({spent})"
         return Decision("passive", "strict", reason)
     share = energies.slack_share
     if active is None and not strict:
@@ -241,10 +243,11 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        kept, watched = facts.get("timekeeping"), watch_sentence(recording.flags)
-        not_kept = "" if kept is None else kept.fault
-        ending = unusual_end(recording.events)
-        notes = (found["reason"], not_kept, watched, ending, facts["unchecked"])
+        kept = facts.get("timekeeping")
+        doubt = "" if kept is None else kept.fault
+        if facts["certified"] is False and not doubt:
+            doubt = "the device has less damping than the coupling needs"
+        notes = (found["reason"], doubt, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 
@@ -333,10 +336,13 @@ def _time_facts(
     """Returns the time that a run kept, and its device's verdict and margin at this time."""
     times = RunTimes(
         ticks=timing.ticks,
+        fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
         delay_energy=timing.most_uncovered,
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
+        flags=recording.flags,
+        has_tripped=any(event.get("event") == "trip" for event in recording.events),
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)

@@ -223,6 +223,7 @@ def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviati
     expected = np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )
+    expected *= [parameters.guarding.motors >> i & 1 for i in range(6)]
     sent = ticks["wrench_on_device"]
     deviation = Deviation.between(
         "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and share"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.observe import Observation, observe, quiet
+from hapticbridge.check.observe import Observation, Setting, observe, quiet
 from hapticbridge.check.source_map import Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
@@ -183,11 +183,17 @@ def open_case(
     if chosen is None:
         chosen, name = _default_motion(), "the default hand motion: slow, 1 cm about each axis"
     samples = samples_of(chosen, period)
-    places = Places(source, scene.model)
-    case = SceneUnderCheck(
+    scene.set_timestep(period)
+    observation, fault = None, ""
+    try:
+        with quiet():
+            observation = observe(scene, samples, Setting(coupling, period), progress)
+    except (SceneError, mujoco.FatalError) as error:
+        fault = " ".join(str(error).split())
+    return SceneUnderCheck(
         source=source,
         scene=scene,
-        places=places,
+        places=Places(source, scene.model),
         info=info,
         coupling=coupling,
         period=period,
@@ -198,14 +204,9 @@ def open_case(
         refused=refused,
         workspace=workspace,
         has_chosen_period=has_chosen_period,
+        observation=observation,
+        motion_fault=fault,
     )
-    scene.set_timestep(period)
-    try:
-        with quiet():
-            seen = observe(scene, samples, coupling, period, progress)
-        return replace(case, observation=seen)
-    except (SceneError, mujoco.FatalError) as error:
-        return replace(case, motion_fault=" ".join(str(error).split()))
 
 
 def _compile(source: SceneSource, grip: str) -> tuple[Scene, dict[int, str]]:

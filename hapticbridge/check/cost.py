@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.fault import Fault
-from hapticbridge.check.observe import not_finite, rehearsal_parameters
+from hapticbridge.check.observe import Setting, not_finite, rehearsal_parameters
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE
-from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
@@ -172,8 +171,7 @@ class Cost:
 def measure_cost(
     scene: Scene,
     samples: NDArray[np.void],
-    coupling: Coupling,
-    period: float,
+    setting: Setting,
     *,
     clock: Callable[[], int] = time.perf_counter_ns,
     progress: Callable[[int, int], None] | None = None,
@@ -196,17 +194,20 @@ def measure_cost(
     passes = []
     for k in range(PASSES):
         report_progress(k)
-        times, in_contact, rows = _time_ticks(scene, samples, coupling, period, clock)
+        times, in_contact, rows = _time_ticks(scene, samples, setting, clock)
         passes.append(times[WARM_UP:])
     report_progress(PASSES)
-    stages, touching = _time_stages(scene, samples, coupling, period)
+    stages, touching = _time_stages(scene, samples, setting)
     report_progress(PASSES + 1)
     time_of, contacts_of = np.min(passes, axis=0), in_contact[WARM_UP:]
     is_free = contacts_of == 0
     free, contact = TimingStats.of(time_of[is_free]), TimingStats.of(time_of[~is_free])
     all_ticks = TimingStats.of(time_of)
     medians = {
-        name: (_median(times[touching == 0]), _median(times[touching > 0]))
+        name: (
+            TimingStats.of(times[touching == 0]).median,
+            TimingStats.of(times[touching > 0]).median,
+        )
         for name, times in stages.items()
     }
     whole = [sum(each[k] for each in medians.values()) for k in (0, 1)]
@@ -223,15 +224,11 @@ def measure_cost(
 
 
 def _time_ticks(
-    scene: Scene,
-    samples: NDArray[np.void],
-    coupling: Coupling,
-    period: float,
-    clock: Callable[[], int],
+    scene: Scene, samples: NDArray[np.void], setting: Setting, clock: Callable[[], int]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Returns time in s, contacts and constraint rows of every tick."""
-    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
-    state, row, ring = binding.state, binding.row, Ring.local(_RING)
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
+    state, row, ring, period = binding.state, binding.row, Ring.local(_RING), setting.period
     ring.cursors[TAIL] = NOBODY_READS
     before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)
@@ -256,16 +253,16 @@ def _time_ticks(
 
 
 def _time_stages(
-    scene: Scene, samples: NDArray[np.void], coupling: Coupling, period: float
+    scene: Scene, samples: NDArray[np.void], setting: Setting
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.int64]]:
     """Returns the time in s of every stage of every step by MuJoCo's timers, and the contacts."""
-    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     state, row, model, data = binding.state, binding.row, scene.model, scene.data
     spent = np.zeros((samples.size, int(_TIMER.mjNTIMER)))
     contacts = np.zeros(samples.size, np.int64)
     durations = data.timer.duration
     for k in range(samples.size):
-        before_step(state, samples[k : k + 1], row, 0, period)
+        before_step(state, samples[k : k + 1], row, 0, setting.period)
         earlier = durations.copy()  # energies are refreshed after the step, by stages with timers
         mujoco.mj_step(model, data)
         spent[k] = durations - earlier
@@ -275,10 +272,6 @@ def _time_stages(
     whole = spent[WARM_UP:, int(_TIMER.mjTIMER_STEP)]
     stages[REST] = np.maximum(whole - sum(stages.values()), 0.0)
     return stages, contacts[WARM_UP:]
-
-
-def _median(times: NDArray[np.float64]) -> float:
-    return float(np.median(times)) if times.size else float("nan")
 
 
 # Plot of a scene's cost
@@ -338,10 +331,14 @@ def draw_cost(cost: Cost, title: str) -> Figure:
         )
     growth.set_xlabel("constraint rows in the tick")
     growth.set_ylabel("median time per tick in µs")
-    growth.set_ylim(0.0, 1.15e6 * max(seconds for _, _, seconds in steps))
+    slowest = max((seconds for _, _, seconds in steps), default=0.0)
+    growth.set_ylim(0.0, 1.15e6 * (slowest or whole))
     rate = math.floor(cost.highest_rate)
     growth.set_title(f"how it grows; up to {rate:,} Hz", fontsize="medium")
-    growth.legend(fontsize="small", loc="lower right")
+    if steps:
+        growth.legend(fontsize="small", loc="lower right")
+    else:
+        growth.text(0.5, 0.5, "the motion is too short", ha="center", transform=growth.transAxes)
     return figure
 
 
@@ -403,10 +400,7 @@ class Stage:
 
     def reset(self) -> None:
         """Resets the scene."""
-        setting = self._setting
-        parameters = rehearsal_parameters(
-            self._scene, setting.coupling, setting.period, setting.substeps
-        )
+        parameters = rehearsal_parameters(self._scene, self._setting)
         self._binding = BoundKernel(self._scene.model, self._scene.data, parameters)
 
     def run(self, chunk: int) -> float:

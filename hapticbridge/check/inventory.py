@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import ROW_KINDS, Observation, reached_trees
+from hapticbridge.check.observe import Observation, reached_trees
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene.contacts import meeting_pairs
@@ -170,10 +170,8 @@ def _uses(
 
 
 def _rows(observation: Observation) -> dict[str, tuple[int, float]]:
-    return {
-        kind: (int(observation.rows[kind].max()), float(np.median(observation.rows[kind])))
-        for kind in ROW_KINDS
-    }
+    rows = observation.rows.items()
+    return {kind: (int(each.max()), float(np.median(each))) for kind, each in rows}
 
 
 def _hull_triangles(model: mujoco.MjModel, uses: list[str]) -> int:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import UNKNOWN_DAMPING
 from hapticbridge.check.cost import CostMeter, processor_costs
-from hapticbridge.check.observe import Playback, quiet
+from hapticbridge.check.observe import Playback, Setting, quiet
 from hapticbridge.check.perception import FeltError, felt_error
 from hapticbridge.check.simplify import (
     OTHER_MOTIONS,
@@ -24,7 +24,7 @@ from hapticbridge.check.simplify import (
     shape_simplifications,
     solver_simplifications,
 )
-from hapticbridge.check.version import SceneVariant, Setting, name_everything
+from hapticbridge.check.version import SceneVariant, name_everything
 from hapticbridge.check.witness import witness
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
@@ -74,6 +74,16 @@ class VariantVerdict:
     environment: str = ""
     warnings: int = 0
     needed_damping: float = 0.0
+
+    @property
+    def jnd(self) -> float:
+        """Felt error in just noticeable differences; 0 if it failed."""
+        return 0.0 if self.error is None else self.error.jnd
+
+    @property
+    def percent(self) -> float:
+        """Cost in percent of the original; 100 if it failed."""
+        return 100.0 * (self.cost or 1.0)
 
 
 class Judge:
@@ -268,9 +278,9 @@ def all_simplifications(original: SceneVariant, motion: Motion) -> list[Simplifi
 
 def _search(judge: Judge, simpler: list[Simplification], progress: Progress | None) -> Lean:
     total, alone = 2 * len(simpler), []
+    progress = progress or (lambda _done, _total, _name: None)
     for k, each in enumerate(simpler):
-        if progress is not None:
-            progress(k, total, each.name)
+        progress(k, total, each.name)
         if (found := _apply(judge, each, judge.original)) is not None:
             alone.append((each, found[1]))
     # a small saving of the whole may be a large share of the rest
@@ -280,8 +290,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
     order.sort(key=lambda pair: (pair[0].loses == OTHER_MOTIONS, pair[1].cost or 0.0))
     best, share, together = judge.original, 1.0, []
     for k, (each, _) in enumerate(order):
-        if progress is not None:
-            progress(len(simpler) + k, total, each.name)
+        progress(len(simpler) + k, total, each.name)
         found = _apply(judge, each, best, share)
         if found is not None and found[1].verdict == MAY_GO:
             best, share = found[0], found[1].cost or share
@@ -292,8 +301,7 @@ def _search(judge: Judge, simpler: list[Simplification], progress: Progress | No
         result = judge.judge("lean", "all that was taken", best)
     if not together:
         result = replace(result, cost=1.0)  # not measured against itself
-    if progress is not None:
-        progress(total, total, "")
+    progress(total, total, "")
     return Lean(judge, best, tuple(trial for _, trial in alone), tuple(together), result)
 
 

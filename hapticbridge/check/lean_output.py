@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from hapticbridge.check.lean import (
     VariantVerdict,
 )
 from hapticbridge.check.observe import quiet
+from hapticbridge.check.perception import FeltError
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
@@ -31,7 +33,6 @@ from hapticbridge.scene import SceneSource, read_scene
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
 
 # Plot of cost against felt error
@@ -60,58 +61,47 @@ NAMES = 1.04
 
 def draw_lean(lean: Lean, name: str) -> Figure:
     """Draws cost against felt error of every version that was tried."""
-    points = [(trial.name, trial, "") for trial in lean.alone if trial.error is not None]
-    steps = [(f"{k + 1}: {t.name}", t, "path") for k, t in enumerate(lean.together)]
-    points += steps
+    tried = [trial for trial in lean.alone if trial.error is not None]
+    points = [(trial.name, trial, _COLOURS[trial.verdict]) for trial in tried]
+    points += [(f"{k}: {trial.name}", trial, _PATH) for k, trial in enumerate(lean.together, 1)]
     figure = new_figure(8.0, max(4.2, 1.3 + LINE * len(points)))
     axes = figure.add_subplot()
     axes.set_yscale("symlog", linthresh=LINEAR)
-    errors = [_error_of(trial) for _, trial, _ in points]
-    axes.set_ylim(-0.35 * LINEAR, 2.5 * max([lean.judge.budget, *errors]))
-    costs = [100.0 * _cost(trial) for _, trial, _ in points]
-    axes.set_xlim(0.0, 1.06 * max([104.0, *costs]))
-    axes.axhline(lean.judge.budget, color="black", linewidth=1.0, linestyle="--")
+    budget = lean.judge.budget
+    axes.set_ylim(-0.35 * LINEAR, 2.5 * max([budget, *(trial.jnd for _, trial, _ in points)]))
+    axes.set_xlim(0.0, 1.06 * max([104.0, *(trial.percent for _, trial, _ in points)]))
     axes.axvline(100.0, color="0.8", linewidth=1.0, zorder=0)
-    _draw_path(axes, lean)
-    for _, trial, kind in points:
-        if not kind:
-            axes.plot(
-                100.0 * _cost(trial),
-                _error_of(trial),
-                _MARKERS[trial.verdict],
-                color=_COLOURS[trial.verdict],
-                markersize=6,
-                alpha=0.8,
-            )
+    for verdict in dict.fromkeys(trial.verdict for trial in tried):
+        those = [trial for trial in tried if trial.verdict == verdict]
+        axes.plot(
+            [trial.percent for trial in those],
+            [trial.jnd for trial in those],
+            _MARKERS[verdict],
+            color=_COLOURS[verdict],
+            markersize=6,
+            alpha=0.8,
+            label=f"alone: {verdict}",
+        )
+    axes.plot(
+        [100.0, *(trial.percent for trial in lean.together)],
+        [0.0, *(trial.jnd for trial in lean.together)],
+        "D-",
+        color=_PATH,
+        markersize=6,
+        zorder=3,
+        label="taken together, in order" if lean.together else None,
+    )
+    axes.axhline(
+        budget, color="black", linewidth=1.0, linestyle="--", label=f"budget: {budget:g} JND"
+    )
     _write_names(axes, points)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.set_xlabel("cost (processor time, % of the scene as it is)")
     axes.set_ylabel("felt error (just noticeable differences)")
     axes.set_title(f"{name}: what could go without being felt", loc="left", fontsize=11)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(
-        handles=_legend(points, lean),
-        loc="outside lower center",
-        ncols=3,
-        fontsize=8,
-        frameon=False,
-    )
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
-
-
-def _error_of(trial: VariantVerdict) -> float:
-    return 0.0 if trial.error is None else trial.error.jnd
-
-
-def _cost(trial: VariantVerdict) -> float:
-    return 1.0 if trial.cost is None else trial.cost
-
-
-def _draw_path(axes: Axes, lean: Lean) -> None:
-    x = [100.0, *(100.0 * _cost(trial) for trial in lean.together)]
-    y = [0.0, *(_error_of(trial) for trial in lean.together)]
-    axes.plot(x, y, "-", color=_PATH, linewidth=1.5, zorder=1)
-    axes.plot(x, y, "D", color=_PATH, markersize=6, zorder=3)
 
 
 def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> None:
@@ -119,13 +109,12 @@ def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> N
 
     Names at the points would overlap, because many points coincide.
     """
-    order = sorted(points, key=lambda point: (_error_of(point[1]), -_cost(point[1])))
+    order = sorted(points, key=lambda point: (point[1].jnd, -point[1].percent))
     heights = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.array([0.5])
-    for height, (name, trial, kind) in zip(heights, order, strict=True):
-        colour = _PATH if kind else _COLOURS[trial.verdict]
+    for height, (name, trial, colour) in zip(heights, order, strict=True):
         axes.annotate(
             name,
-            xy=(100.0 * _cost(trial), _error_of(trial)),
+            xy=(trial.percent, trial.jnd),
             xytext=(NAMES, float(height)),
             textcoords="axes fraction",
             fontsize=8,
@@ -135,85 +124,51 @@ def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> N
         )
 
 
-def _legend(points: list[tuple[str, VariantVerdict, str]], lean: Lean) -> list[Line2D]:
-    from matplotlib.lines import Line2D  # noqa: PLC0415 - for a picture alone
-
-    verdicts = list(dict.fromkeys(trial.verdict for _, trial, kind in points if not kind))
-    handles = [
-        Line2D(
-            [],
-            [],
-            marker=_MARKERS[verdict],
-            color=_COLOURS[verdict],
-            linestyle="",
-            label=f"alone: {verdict}",
-        )
-        for verdict in verdicts
-    ]
-    if lean.together:
-        handles.append(Line2D([], [], marker="D", color=_PATH, label="taken together, in order"))
-    budget = f"budget: {lean.judge.budget:g} JND"
-    return [*handles, Line2D([], [], color="black", linestyle="--", label=budget)]
-
-
 # Results of a search as JSON facts and CSV
 
 TABLE_ENDING = ".csv"
 
-COLUMNS = (
-    "step",
-    "name",
-    "verdict",
-    "loses",
-    "cost_ratio",
-    "felt_jnd",
-    "peak_jnd",
-    "force_rms_n",
-    "force_peak_n",
-    "force_percent_of_jnd",
-    "torque_rms_nm",
-    "torque_peak_nm",
-    "torque_percent_of_jnd",
-    "position_peak_m",
-    "angle_peak_rad",
-    "environment",
-    "mujoco_warnings",
-    "needed_damping_ns_per_m",
-    "sentence",
-)
-"""Columns of the CSV table. ``step`` is empty for single trials and counts the combined ones."""
+Row = dict[str, str | float | int | None]
 
 
-def lean_rows(lean: Lean) -> list[dict[str, str | float | int | None]]:
-    """Returns one row per trial: each alone, those combined, and the final version."""
+def lean_rows(lean: Lean) -> list[Row]:
+    """Returns one row per trial: each alone, those combined, and the final version.
+
+    ``step`` is empty for single trials and counts the combined ones.
+    """
     steps = [("", trial) for trial in lean.alone]
-    steps += [(str(k + 1), trial) for k, trial in enumerate(lean.together)]
-    return [trial_facts(trial) | {"step": step} for step, trial in [*steps, ("all", lean.result)]]
+    steps += [(str(k), trial) for k, trial in enumerate(lean.together, 1)]
+    return [{"step": step, **trial_facts(trial)} for step, trial in [*steps, ("all", lean.result)]]
 
 
-def trial_facts(trial: VariantVerdict) -> dict[str, str | float | int | None]:
+def trial_facts(trial: VariantVerdict) -> Row:
     """Returns one trial as a dictionary; values that a failed trial lacks are None."""
     error = trial.error
     return {
         "name": trial.name,
-        "sentence": trial.sentence,
         "verdict": trial.verdict,
         "loses": trial.loses,
         "cost_ratio": trial.cost,
-        "felt_jnd": None if error is None else error.jnd,
-        "peak_jnd": None if error is None else error.peak,
-        "force_rms_n": None if error is None else error.force_rms,
-        "force_peak_n": None if error is None else error.force_peak,
-        "force_percent_of_jnd": None if error is None else 100.0 * error.force,
-        "torque_rms_nm": None if error is None else error.torque_rms,
-        "torque_peak_nm": None if error is None else error.torque_peak,
-        "torque_percent_of_jnd": None if error is None else 100.0 * error.torque,
-        "position_peak_m": None if error is None else error.position_peak,
-        "angle_peak_rad": None if error is None else error.angle_peak,
+        **{n: None if error is None else felt(error) for n, felt in _FELT.items()},
         "environment": trial.environment,
         "mujoco_warnings": trial.warnings,
         "needed_damping_ns_per_m": trial.needed_damping,
+        "sentence": trial.sentence,
     }
+
+
+_FELT: dict[str, Callable[[FeltError], float]] = {
+    "felt_jnd": attrgetter("jnd"),
+    "peak_jnd": attrgetter("peak"),
+    "force_rms_n": attrgetter("force_rms"),
+    "force_peak_n": attrgetter("force_peak"),
+    "force_percent_of_jnd": lambda error: 100.0 * error.force,
+    "torque_rms_nm": attrgetter("torque_rms"),
+    "torque_peak_nm": attrgetter("torque_peak"),
+    "torque_percent_of_jnd": lambda error: 100.0 * error.torque,
+    "position_peak_m": attrgetter("position_peak"),
+    "angle_peak_rad": attrgetter("angle_peak"),
+}
 
 
 def lean_facts(lean: Lean, written: VariantVerdict | None = None) -> dict[str, object]:
@@ -265,9 +220,10 @@ def write_table(lean: Lean, path: Path) -> None:
     """
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
+            rows = lean_rows(lean)
+            writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
-            writer.writerows(lean_rows(lean))
+            writer.writerows(rows)
     except OSError as error:
         raise SceneError(f"cannot write the table to '{path}': {error.strerror}") from None
 
@@ -328,10 +284,8 @@ def write_lean(lean: Lean, path: Path, *, overwrite: bool = False) -> VariantVer
 
 def _files(source: SceneSource) -> list[Path]:
     """Returns the paths of a scene's files; the first is the main one."""
-    main = source.path.absolute()
-    root = main
-    for _ in PurePath(source.sources[0].name).parts:
-        root = root.parent
+    depth = len(PurePath(source.sources[0].name).parts)
+    root = source.path.absolute().parents[depth - 1]
     return [root / file.name for file in source.sources]
 
 
@@ -359,9 +313,8 @@ def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> 
         for element in elements:
             element.file = moved(str(element.file), str(directory))
     for texture in spec.textures:
-        sides = [moved(str(side), str(spec.texturedir)) for side in texture.cubefiles]
-        for k, side in enumerate(sides):
-            texture.cubefiles[k] = side
+        for k, side in enumerate(list(texture.cubefiles)):
+            texture.cubefiles[k] = moved(str(side), str(spec.texturedir))
     spec.modelfiledir = str(folder)
     spec.meshdir = spec.texturedir = ""
     spec.strippath = False
@@ -370,13 +323,13 @@ def _point_to_assets(spec: mujoco.MjSpec, source: SceneSource, folder: Path) -> 
 def _comment(lean: Lean, before: str) -> str:
     """Returns the list of changes; XML forbids two dashes in a row within a comment."""
     source, setting, result = lean.draft.source, lean.draft.setting, lean.result
-    error = 0.0 if result.error is None else result.error.jnd
-    judge, cost = lean.judge, 100.0 * (result.cost or 1.0)
+    judge = lean.judge
     lines = [
         "",
         f"  Made leaner from {source.path.name} by 'hapticbridge check': in a motion of "
-        f"{judge.motion.duration:g} s it costs {cost:.0f} % of that scene,",
-        f"  and differs by {error:.2g} just noticeable differences (allowed: {judge.budget:g}).",
+        f"{judge.motion.duration:g} s it costs {result.percent:.0f} % of that scene,",
+        f"  and differs by {result.jnd:.2g} just noticeable differences "
+        f"(allowed: {judge.budget:g}).",
         *(f"  Taken: {trial.name} ({trial.sentence})." for trial in lean.together),
     ]
     if any(trial.loses == OTHER_MOTIONS for trial in lean.together):

@@ -18,6 +18,7 @@ from hapticbridge.check.physics import (
     constraint_stiffness,
     depth_under,
     joint_inertia,
+    mesh_of,
 )
 from hapticbridge.check.source_map import Place
 from hapticbridge.scene.contacts import (
@@ -252,16 +253,6 @@ def _dented_meshes(case: SceneUnderCheck) -> Iterator[Fault]:
             f"hole {length(dent)} deep is closed{more}",
             'contype="0" conaffinity="0", and convex pieces or primitives that collide instead',
         )
-
-
-def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns the vertices in m, shape (n, 3), and triangles, shape (m, 3), of a compiled mesh."""
-    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-    return (
-        np.asarray(model.mesh_vert[first : first + count], dtype=np.float64),
-        np.asarray(model.mesh_face[start : start + faces], dtype=np.int64),
-    )
 
 
 def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[float, float]:

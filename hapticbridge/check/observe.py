@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.certificate import required_damping
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
@@ -34,7 +35,8 @@ OPPOSITE = -0.95
 """Cosine between the directions to two walls below which they count as opposite; 18 degrees from
 straight."""
 
-_WITHOUT_DISTANCE = [int(mujoco.mjtGeom.mjGEOM_HFIELD), int(mujoco.mjtGeom.mjGEOM_SDF)]
+WITHOUT_DISTANCE = (mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
+"""Geom types without a distance function in MuJoCo."""
 
 _NO_DIRECTION = 1e-9  # m; two points nearer than this have no direction between them
 
@@ -61,14 +63,14 @@ def clearances(
         Clearance by pair; pairs that form no clearance are absent.
     """
     data, segment = mujoco.MjData(model), np.zeros(6)
-    known = ~np.isin(model.geom_type, _WITHOUT_DISTANCE)
+    known = ~np.isin(model.geom_type, WITHOUT_DISTANCE)
     candidates = np.array([p for p in pairs if known[list(p)].all()], np.int64).reshape(-1, 2)
     rooms: dict[tuple[tuple[int, int], tuple[int, int]], float] = {}
     for posture in postures:
         data.qpos[:] = posture
         mujoco.mj_kinematics(model, data)
         near: list[tuple[tuple[int, int], float, NDArray[np.float64]]] = []
-        for first, second in candidates[_may_be_near(model, data, candidates)].tolist():
+        for first, second in candidates[may_be_near(data, candidates, FARTHEST)].tolist():
             distance = mujoco.mj_geomDistance(model, data, first, second, FARTHEST, segment)
             direction = segment[3:] - segment[:3]
             length = float(np.linalg.norm(direction))
@@ -89,13 +91,15 @@ def clearances(
     return found
 
 
-def _may_be_near(
-    model: mujoco.MjModel, data: mujoco.MjData, pairs: NDArray[np.int64]
+def may_be_near(
+    data: mujoco.MjData, pairs: NDArray[np.int64], distance: float
 ) -> NDArray[np.bool_]:
+    """Returns True for each pair of geoms with bounding spheres nearer than a distance in m."""
     first, second = pairs.T
-    reach = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, np.inf, model.geom_rbound)
+    radius = data.model.geom_rbound
+    reach = np.where(radius > 0.0, radius, np.inf)  # planes and height fields have no sphere
     apart = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
-    return np.asarray(apart <= reach[first] + reach[second] + FARTHEST, dtype=bool)
+    return np.asarray(apart <= reach[first] + reach[second] + distance, dtype=bool)
 
 
 # Kinematic trees joined to the tool
@@ -184,9 +188,29 @@ class Playback:
     seconds: float
 
 
-def rehearse(
-    scene: Scene, samples: NDArray[np.void], coupling: Coupling, period: float, substeps: int = 1
-) -> Playback:
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Coupling and rate at which a scene is run.
+
+    Attributes:
+        coupling: Requested K and B.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+    """
+
+    coupling: Coupling
+    period: float = 1e-3
+    substeps: int = 1
+
+    @property
+    def needed_damping(self) -> float:
+        """Device damping in N s/m required by the default method."""
+        method = default_method(self.substeps)
+        used = method.law_coupling(self.coupling, self.period / self.substeps)
+        return required_damping(used, self.period, method.law_evaluations(self.substeps))
+
+
+def rehearse(scene: Scene, samples: NDArray[np.void], setting: Setting) -> Playback:
     """Runs the scene from its start as the bridge would, one tick per sample.
 
     The hand does not yield: the handle follows the motion at any force. Two versions of a scene can
@@ -195,15 +219,12 @@ def rehearse(
     Args:
         scene: Changed in place: reset, with the coupling's gains and the time step set.
         samples: Poses relative to the first, ``SAMPLE_DTYPE``, from ``samples_of``.
-        coupling: Requested K and B.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
+        setting: Coupling and rate.
 
     Raises:
         SceneError: A value is out of range, or a result is not finite; the message names the tick.
     """
-    parameters = rehearsal_parameters(scene, coupling, period, substeps)
-    binding = BoundKernel(scene.model, scene.data, parameters)
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     rows = np.zeros(samples.size, TICK_DTYPE)
     start = time.thread_time()
     done = simulate(binding.state, samples, binding.row, rows)
@@ -228,14 +249,13 @@ def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
     )
 
 
-def rehearsal_parameters(
-    scene: Scene, coupling: Coupling, period: float, substeps: int = 1
-) -> RunParameters:
+def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
     """Resets a scene for the default method with its own contacts, and returns the parameters.
 
     Raises:
         SceneError: A value is out of range.
     """
+    coupling, period, substeps = setting.coupling, setting.period, setting.substeps
     method = default_method(substeps).with_contact("scene")  # these are what is examined
     prepare(scene, coupling, period, substeps, method, warns=False)
     # an error inside the C function would end the process; the first step in Python raises instead
@@ -332,8 +352,7 @@ class Observation:
 def observe(
     scene: Scene,
     samples: NDArray[np.void],
-    coupling: Coupling,
-    period: float,
+    setting: Setting,
     progress: Callable[[int, int], None] | None = None,
 ) -> Observation:
     """Leads a scene through a motion, as ``rehearse`` does, and inspects every step.
@@ -344,7 +363,8 @@ def observe(
     Raises:
         SceneError: A value is out of range, or a result is not finite; the message names the tick.
     """
-    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, coupling, period))
+    period = setting.period
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     model, data, state, row = scene.model, scene.data, binding.state, binding.row
     before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)

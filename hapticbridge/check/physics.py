@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from hapticbridge.scene.contacts import impedance_at
 
@@ -28,18 +29,13 @@ def matrix_of(quaternion: ArrayLike) -> Array:
 
 def quaternion_of(matrix: Array) -> Array:
     """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(matrix).ravel())
-    return quaternion
+    return np.asarray(Rotation.from_matrix(matrix).as_quat(scalar_first=True))
 
 
 def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
     """Returns the rotation vector in rad from one orientation to another."""
-    inverse, turn, vector = np.zeros(4), np.zeros(4), np.zeros(3)
-    mujoco.mju_negQuat(inverse, np.asarray(start, dtype=np.float64))
-    mujoco.mju_mulQuat(turn, np.asarray(now, dtype=np.float64), inverse)
-    mujoco.mju_quat2Vel(vector, turn, 1.0)
-    return vector
+    before, after = (Rotation.from_quat(each, scalar_first=True) for each in (start, now))
+    return np.asarray((after * before.inv()).as_rotvec())
 
 
 def pose_in(frame: Array, pose: Array) -> Array:
@@ -51,6 +47,16 @@ def pose_in(frame: Array, pose: Array) -> Array:
     mujoco.mju_negPose(position, turn, frame[:3], frame[3:])
     mujoco.mju_mulPose(found[:3], found[3:], position, turn, pose[:3], pose[3:])
     return found
+
+
+def mesh_of(model: mujoco.MjModel, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Returns the vertices in m, shape (n, 3), and triangles, shape (m, 3), of a compiled mesh."""
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    return (
+        np.asarray(model.mesh_vert[first : first + count], dtype=np.float64),
+        np.asarray(model.mesh_face[start : start + faces], dtype=np.int64),
+    )
 
 
 # Effective inertia of joints and bodies

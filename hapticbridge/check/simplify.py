@@ -360,17 +360,11 @@ def _edit_joints(draft: SceneVariant, change: Callable[[mujoco.MjSpec, Keys], bo
 
 
 def _read_keys(model: mujoco.MjModel) -> Keys:
-    ends = [*model.jnt_qposadr[1:], model.nq], [*model.jnt_dofadr[1:], model.nv]
-    return [
-        {
-            model.joint(j).name: (
-                model.key_qpos[k, model.jnt_qposadr[j] : ends[0][j]].copy(),
-                model.key_qvel[k, model.jnt_dofadr[j] : ends[1][j]].copy(),
-            )
-            for j in range(model.njnt)
-        }
-        for k in range(model.nkey)
-    ]
+    names = [model.joint(j).name for j in range(model.njnt)]
+    places, dofs = model.jnt_qposadr[1:], model.jnt_dofadr[1:]
+    keys = zip(model.key_qpos.copy(), model.key_qvel.copy(), strict=True)
+    parts = (zip(np.split(q, places), np.split(v, dofs), strict=True) for q, v in keys)
+    return [dict(zip(names, each, strict=False)) for each in parts]
 
 
 # Primitive shapes fitted to a mesh

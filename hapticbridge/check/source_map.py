@@ -11,8 +11,15 @@ import mujoco
 from hapticbridge.scene import SceneSource
 from hapticbridge.scene.source import Element, read_elements
 
-_JOINTS = ("joint", "freejoint")
-_EQUALITIES = ("connect", "weld", "joint", "tendon", "flex", "flexvert", "flexstrain")
+_TAGS = {
+    "joint": ("joint", "freejoint"),
+    "equality": ("connect", "weld", "joint", "tendon", "flex", "flexvert", "flexstrain"),
+    "tendon": ("spatial", "fixed"),
+}
+"""Tags of a kind of element where they differ from its name."""
+
+_LISTS = {"body": "bodies", "equality": "equalities", "mesh": "meshes"}
+"""Lists of an MjSpec that are not called after their kind and an s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,40 +64,35 @@ class Places:
 
     def geom(self, geom_id: int) -> Place:
         """Returns the place of a geom."""
-        owner = self._owner(int(self._model.geom_bodyid[geom_id]))
-        return self._find(("geom",), self._spec.geoms, geom_id, self._model.geom, owner)
+        return self._find("geom", geom_id, self._owner(int(self._model.geom_bodyid[geom_id])))
 
     def body(self, body_id: int) -> Place:
         """Returns the place of a body."""
-        return self._find(("body",), self._spec.bodies, body_id, self._model.body)
+        return self._find("body", body_id)
 
     def joint(self, joint_id: int) -> Place:
         """Returns the place of a joint."""
-        owner = self._owner(int(self._model.jnt_bodyid[joint_id]))
-        return self._find(_JOINTS, self._spec.joints, joint_id, self._model.joint, owner)
+        return self._find("joint", joint_id, self._owner(int(self._model.jnt_bodyid[joint_id])))
 
     def site(self, site_id: int) -> Place:
         """Returns the place of a site."""
-        return self._find(("site",), self._spec.sites, site_id, self._model.site)
+        return self._find("site", site_id)
 
     def equality(self, equality_id: int) -> Place:
         """Returns the place of an equality constraint."""
-        return self._find(
-            _EQUALITIES, self._spec.equalities, equality_id, self._model.equality, kind="equality"
-        )
+        return self._find("equality", equality_id)
 
     def tendon(self, tendon_id: int) -> Place:
         """Returns the place of a tendon."""
-        kinds = ("spatial", "fixed")
-        return self._find(kinds, self._spec.tendons, tendon_id, self._model.tendon, kind="tendon")
+        return self._find("tendon", tendon_id)
 
     def pair(self, pair_id: int) -> Place:
         """Returns the place of an explicit pair of geoms."""
-        return self._find(("pair",), self._spec.pairs, pair_id, self._model.pair)
+        return self._find("pair", pair_id)
 
     def mesh(self, mesh_id: int) -> Place:
         """Returns the place of a mesh; an unnamed mesh has the name of its file."""
-        return self._find(("mesh",), self._spec.meshes, mesh_id, self._model.mesh)
+        return self._find("mesh", mesh_id)
 
     def named(self, tag: str, name: str) -> Place:
         """Returns the place of an element by its tag and name."""
@@ -118,11 +120,7 @@ class Places:
 
     def with_attribute(self, attribute: str) -> Place | None:
         """Returns the first element of any tag that has an attribute."""
-        for file, elements in self._files:
-            for element in elements:
-                if attribute in element.attributes:
-                    return Place(file, element.line, _describe(element))
-        return None
+        return self._first((), lambda element: attribute in element.attributes)
 
     def attributes_at(self, place: Place) -> dict[str, str]:
         """Returns the attributes written at a place, without inherited defaults."""
@@ -140,21 +138,13 @@ class Places:
         name = self._model.body(body_id).name
         return f" of body '{name}'" if name else f" of body {body_id}"
 
-    def _find(
-        self,
-        tags: tuple[str, ...],
-        written: Any,
-        index: int,
-        compiled: Callable[[int], Any],
-        owner: str = "",
-        kind: str = "",
-    ) -> Place:
+    def _find(self, kind: str, index: int, owner: str = "") -> Place:
         """Finds an element by its name, its line, or its position among unnamed elements."""
-        kind, name = kind or tags[0], str(compiled(index).name)
+        tags, name = _TAGS.get(kind, (kind,)), str(getattr(self._model, kind)(index).name)
         label = f"{kind} '{name}'" if name else f"{kind} {index}{owner}"
         if name and (found := self._first(tags, lambda e: e.attributes.get("name") == name)):
             return Place(found.file, found.line, label)
-        elements = list(written)
+        elements = list(getattr(self._spec, _LISTS.get(kind, f"{kind}s")))
         if index >= len(elements) or str(elements[index].name) != name:
             return Place(self._main, 0, label)
         line = _line(elements[index])
@@ -172,9 +162,10 @@ class Places:
         return Place(self._main, 0, label)
 
     def _first(self, tags: tuple[str, ...], fits: Callable[[Element], bool]) -> Place | None:
+        """Returns the first element with one of some tags, or with any if there are none."""
         for file, elements in self._files:
             for element in elements:
-                if element.tag in tags and fits(element):
+                if (not tags or element.tag in tags) and fits(element):
                     return Place(file, element.line, _describe(element))
         return None
 

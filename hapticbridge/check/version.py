@@ -1,4 +1,4 @@
-"""A version of a scene under simplification, and its run settings."""
+"""A version of a scene under simplification."""
 
 from __future__ import annotations
 
@@ -9,35 +9,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import required_damping
 from hapticbridge.check.case import samples_of
-from hapticbridge.check.observe import Playback, rehearse
-from hapticbridge.coupling import Coupling
+from hapticbridge.check.observe import Playback, Setting, rehearse
 from hapticbridge.device import Motion
-from hapticbridge.rendering import default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
-
-
-@dataclass(frozen=True, slots=True)
-class Setting:
-    """Coupling and rate at which a scene is run.
-
-    Attributes:
-        coupling: Requested K and B.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
-    """
-
-    coupling: Coupling
-    period: float = 1e-3
-    substeps: int = 1
-
-    @property
-    def needed_damping(self) -> float:
-        """Device damping in N s/m required by the default method."""
-        method = default_method(self.substeps)
-        used = method.law_coupling(self.coupling, self.period / self.substeps)
-        return required_damping(used, self.period, method.law_evaluations(self.substeps))
 
 
 @dataclass(slots=True)
@@ -85,14 +60,7 @@ class SceneVariant:
         Raises:
             SceneError: It does not compile, or a result is not finite.
         """
-        setting = self.setting
-        return rehearse(
-            self.compiled(),
-            self.samples(motion),
-            setting.coupling,
-            setting.period,
-            setting.substeps,
-        )
+        return rehearse(self.compiled(), self.samples(motion), self.setting)
 
 
 def name_everything(spec: mujoco.MjSpec) -> None:
@@ -106,15 +74,10 @@ def name_everything(spec: mujoco.MjSpec) -> None:
         for number, element in enumerate(elements):
             if not element.name:
                 stem = f"{kind}_{number}" if kind == "body" else f"{element.parent.name}_{kind}"
-                name = (
-                    stem
-                    if stem not in taken
-                    else next(
-                        f"{stem}_{k}" for k in itertools.count(2) if f"{stem}_{k}" not in taken
-                    )
-                )
-                element.name = name
-                taken.add(name)
+                numbered = (f"{stem}_{k}" for k in itertools.count(2))
+                free = (name for name in itertools.chain([stem], numbered) if name not in taken)
+                element.name = next(free)
+                taken.add(element.name)
 
 
 def model_of(spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -8,7 +8,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import not_finite, rehearsal_parameters
+from hapticbridge.check.observe import (
+    WITHOUT_DISTANCE,
+    may_be_near,
+    not_finite,
+    rehearsal_parameters,
+)
 from hapticbridge.check.physics import pose_in, rotation_vector
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.device import Motion
@@ -24,9 +29,6 @@ simplifies less, and the result holds for motions that differ more."""
 LOOK_EVERY = 5e-3
 """Time in s between distance checks; contacts are checked in every tick. A tool that crosses
 ``CLEARANCE`` unseen would have to move at 0.4 m/s or more."""
-
-_UNMEASURED = (mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)
-"""Geom types without a distance function in MuJoCo; they count as near everything."""
 
 Pair = frozenset[str]
 
@@ -69,12 +71,11 @@ def witness(draft: SceneVariant, motion: Motion) -> MotionTrace:
     """
     scene, setting = draft.compiled(), draft.setting
     model, data = scene.model, scene.data
-    parameters = rehearsal_parameters(scene, setting.coupling, setting.period, setting.substeps)
-    binding = BoundKernel(model, data, parameters)
+    binding = BoundKernel(model, data, rehearsal_parameters(scene, setting))
     samples = draft.samples(motion)
     row = np.zeros(1, TICK_DTYPE)
     seen = MotionTrace(start=_joint_values(model, data), pose=_poses(model, data))
-    pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.intp).reshape(-1, 2)
+    pairs = np.array([pair[:2] for pair in meeting_pairs(model)], np.int64).reshape(-1, 2)
     names = [model.geom(g).name for g in range(model.ngeom)]
     seen.possible = {frozenset((names[a], names[b])) for a, b in pairs}
     if model.nflex:  # distances to a flex are not measured: every geom counts as near to it
@@ -99,22 +100,14 @@ def witness(draft: SceneVariant, motion: Motion) -> MotionTrace:
 def _look_at_pairs(
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    pairs: NDArray[np.intp],
+    pairs: NDArray[np.int64],
     names: list[str],
     near: set[Pair],
-) -> NDArray[np.intp]:
+) -> NDArray[np.int64]:
     """Adds the pairs that are near each other now; returns those that never were."""
-    if not pairs.size:
-        return pairs
-    first, second = pairs[:, 0], pairs[:, 1]
-    radius = model.geom_rbound
-    gap = np.linalg.norm(data.geom_xpos[first] - data.geom_xpos[second], axis=1)
-    gap -= radius[first] + radius[second]
-    # planes and height fields have no bounding sphere
-    is_close = (gap < CLEARANCE) | (radius[first] == 0.0) | (radius[second] == 0.0)
     is_far = np.ones(len(pairs), dtype=bool)
-    for i in np.flatnonzero(is_close).tolist():
-        a, b = int(first[i]), int(second[i])
+    for i in np.flatnonzero(may_be_near(data, pairs, CLEARANCE)).tolist():
+        a, b = pairs[i].tolist()
         pair = frozenset((names[a], names[b]))
         if pair in near or _distance(model, data, a, b) < CLEARANCE:
             near.add(pair)
@@ -123,16 +116,16 @@ def _look_at_pairs(
 
 
 def _distance(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> float:
-    if any(model.geom_type[geom] in _UNMEASURED for geom in (a, b)):
+    """Returns the distance of two geoms in m; 0 where MuJoCo has no function for it."""
+    if any(model.geom_type[geom] in WITHOUT_DISTANCE for geom in (a, b)):
         return 0.0
     return float(mujoco.mj_geomDistance(model, data, a, b, 2.0 * CLEARANCE, None))
 
 
 def _joint_values(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
-    return {
-        model.joint(j).name: np.array(data.qpos[model.joint(j).qposadr[0] :][: _width(model, j)])
-        for j in range(model.njnt)
-    }
+    names = [model.joint(j).name for j in range(model.njnt)]
+    values = np.split(data.qpos.copy(), model.jnt_qposadr[1:])
+    return dict(zip(names, values[: len(names)], strict=True))
 
 
 def _poses(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.float64]]:
@@ -141,12 +134,6 @@ def _poses(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, NDArray[np.f
         model.body(b).name: pose_in(world[model.body_parentid[b]], world[b])
         for b in range(1, model.nbody)
     }
-
-
-def _width(model: mujoco.MjModel, joint: int) -> int:
-    return {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}.get(
-        mujoco.mjtJoint(model.jnt_type[joint]), 1
-    )
 
 
 def _way(start: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,14 +23,13 @@ from hapticbridge.audit.batch import (
     worst_exit_code,
     write_audits,
 )
-from hapticbridge.cli.terminal import err, out, plain, progress
+from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.sweep.results import Interrupted, Table
-from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
@@ -59,11 +58,13 @@ def print_audits(table: Table) -> None:
         name = plain(file) + (" [yellow](cut)[/]" if cut[row] == 1 else "")
         out.print(f"{margin:>8}  {coloured} {duration:>8}  {name}")
         if codes[row]:
-            out.print(f"{'':>10}{_why(verdict, reason, str(table.texts('certified')[row]))}")
+            out.print(f"{'':>10}{plain(' '.join(reason.splitlines()))}")
     counts = Counter(verdicts)
     counted = ", ".join(
         f"{counts[verdict]} {verdict}" for verdict in _VERDICT_COLOURS if counts[verdict]
     )
+    if refused := list(table.texts("certified")).count("no"):
+        counted += f"; {refused} on a device that is not certified"
     out.print(f"{len(table)} recording{'s' if len(table) > 1 else ''}: {counted}")
 
 
@@ -71,13 +72,7 @@ def print_unreadable(table: Table) -> None:
     """Names on stderr what was passed over."""
     for verdict, reason in zip(table.texts("verdict"), table.texts("reason"), strict=True):
         if verdict == UNREADABLE:
-            err.print(f"[red]error:[/red] {plain(' '.join(str(reason).splitlines()))}")
-
-
-def _why(verdict: str, reason: str, certified: str) -> str:
-    if verdict == "passive" and certified == "no" and NOT_KEPT not in reason:
-        return "the device has less damping than the coupling needs"
-    return plain(" ".join(reason.splitlines()))
+            print_error(reason)
 
 
 def print_what_if(found: WhatIf) -> None:
@@ -104,7 +99,6 @@ SCENE_SIZE = 640, 400
 """Width and height of a page's picture in pixels. It takes 150 kB; a larger one delays the page."""
 
 _USUAL_EVENTS = ("start", "stop", "input")
-_COLOURS = {"passive": "green", "active": "red", "invalid": "magenta"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +148,7 @@ class Audit:
         """Audits; returns the exit code."""
         if not self.files:
             raise RecordingError("audit needs at least one recording")
-        if self.plot is not None:
-            check_ending(self.plot)
+        check_ending(self.plot)
         if self.report is not None:
             check_page_name(self.report)
         if self.table is not None:
@@ -169,7 +162,8 @@ class Audit:
             err.print("note: --jobs and --scheduler are for several recordings; here is one")
         if self.what_if:
             return self._ask(files[0])
-        with err.status(f"auditing {plain(str(files[0]))} …"):
+        first = "the first audit on a machine compiles for about 20 s"
+        with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
             report = audit(files[0], strict=self.strict)
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json())]))
@@ -209,7 +203,7 @@ class Audit:
             print_audits(table)
         if self.table is not None:
             write_audits(table, self.table)
-            err.print(f"wrote {plain(str(self.table))}")
+            print_written(self.table)
 
     def _ask(self, file: Path) -> int:
         with progress("what if") as show:
@@ -225,7 +219,7 @@ class Audit:
             with err.status("drawing …"):
                 scene = _scene_picture(before.recording, before.report)
                 write_what_if(found, self.report, scene)
-        self._name_written()
+        print_written(self.plot, self.report)
         return found.exit_code
 
     def _draw(self, report: AuditReport) -> None:
@@ -235,12 +229,7 @@ class Audit:
                 plot_recording(recording, self.plot)
             if self.report is not None:
                 write_report(recording, report, self.report, _scene_picture(recording, report))
-        self._name_written()
-
-    def _name_written(self) -> None:
-        for written in (self.plot, self.report):
-            if written is not None:
-                err.print(f"wrote {plain(str(written))}")
+        print_written(self.plot, self.report)
 
 
 def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
@@ -254,8 +243,9 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 
 def _print_report(report: AuditReport) -> None:
-    colour = _COLOURS[report.verdict]
-    out.print(f"{plain(str(report.path))}: [bold {colour}]{report.words}[/]")
+    colour = _VERDICT_COLOURS[report.verdict]
+    judged = "environment " if report.verdict == "passive" else ""
+    out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
@@ -269,10 +259,8 @@ def _print_report(report: AuditReport) -> None:
             "damping unknown"
         )
     kept = report.timekeeping
-    if kept is not None and report.certified:
-        out.print(f"  device certified{kept.clause}")
-    elif kept is not None and kept.fault:
-        out.print(f"  device not certified: {NOT_KEPT}")
+    if kept is not None and report.conditions:
+        out.print(f"  {kept.device_words(report.certified)}")
     if report.is_cut:
         out.print(
             "  the file is cut: the verdict is on what it holds; "

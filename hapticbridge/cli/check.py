@@ -17,8 +17,8 @@ from rich.table import Table
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, SceneUnderCheck, open_case
-from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, TimingStats, draw_cost, measure_cost
-from hapticbridge.check.fault import Fault, length
+from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
+from hapticbridge.check.fault import Fault, length, others, weight
 from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,
@@ -36,10 +36,9 @@ from hapticbridge.check.lean_output import (
     write_lean,
     write_table,
 )
-from hapticbridge.check.observe import quiet
+from hapticbridge.check.observe import Setting, quiet
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
-from hapticbridge.check.version import Setting
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
@@ -58,25 +57,6 @@ _HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RM
 """Headings of the table of trials. JND is the felt error in just noticeable differences."""
 
 _ROUNDING = 1e-9  # N and N m; what is below is how the computer adds
-
-
-def look_for_lean(case: SceneUnderCheck, budget: float) -> Lean:
-    """Tries what could go, with progress on stderr.
-
-    Raises:
-        SceneError: The scene cannot be run as it is, or the budget is out of range.
-    """
-    with progress("leaner") as show:
-        damping = case.info.damping or 0.0
-        return find_lean(
-            case.source,
-            case.scene.grip,
-            case.motion,
-            Setting(case.coupling, case.period),
-            budget=budget,
-            device_damping=damping / case.scale**2,
-            progress=show,
-        )
 
 
 def print_lean(lean: Lean) -> None:
@@ -113,16 +93,15 @@ def print_lean(lean: Lean) -> None:
             f"  at {1 / setting.period:.4g} Hz, {setting.substeps} substep(s) a tick: the device "
             f"needs {lean.result.needed_damping:.3g} N s/m of damping"
         )
-    cost = lean.result.cost or 1.0
-    out.print(f"  all together: {100 * cost:.0f} % of the cost, {1 / cost:.2g} times as fast")
+    cost = lean.result.percent
+    out.print(f"  all together: {cost:.0f} % of the cost, {100 / cost:.2g} times as fast")
 
 
 def print_written(lean: Lean, written: VariantVerdict, path: Path, *, is_quiet: bool) -> None:
     """Prints what the written scene is like, read back, and how to run it."""
-    error = 0.0 if written.error is None else written.error.jnd
-    cost = written.cost or 1.0
     err.print(
-        f"wrote {plain(str(path))}: read back, {100 * cost:.0f} % of the cost, felt {error:.2g} JND"
+        f"wrote {plain(str(path))}: read back, {written.percent:.0f} % of the cost, felt "
+        f"{written.jnd:.2g} JND"
     )
     if is_quiet:
         return
@@ -184,13 +163,11 @@ def print_case(case: SceneUnderCheck) -> None:
 def print_inventory(inventory: Inventory) -> None:
     """Prints what the scene models."""
     out.print("\n[bold]What it models[/]")
-    mass = inventory.tool_mass
     uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
     lines = {
         "bodies": f"{inventory.bodies}, {inventory.moving_bodies} of them moving",
         "degrees of freedom": f"{inventory.degrees_of_freedom}, "
-        f"{inventory.tool_degrees_of_freedom} of them the tool's "
-        + (f"({mass:.3g} kg)" if mass >= 0.1 else f"({1e3 * mass:.3g} g)"),
+        f"{inventory.tool_degrees_of_freedom} of them the tool's ({weight(inventory.tool_mass)})",
         "geoms": ": ".join(filter(None, (str(sum(inventory.geoms.values())), uses))),
     }
     if inventory.triangles:
@@ -222,7 +199,7 @@ def print_inventory(inventory: Inventory) -> None:
     if reasons:
         out.print("  cannot be felt")
     for reason, names in reasons.items():
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        more = others(len(names) - MAX_NAMED)
         out.print(f"    {reason}: {plain(', '.join(names[:MAX_NAMED]))}{more}")
 
 
@@ -237,8 +214,10 @@ def print_cost(cost: Cost | None) -> None:
         column.justify = "right"
     table.add_row("  whole tick, median", _micro(cost.free.median), _micro(cost.contact.median))
     table.add_row("  99 of 100 below", _micro(cost.free.p99), _micro(cost.contact.p99))
+    medians = cost.free.median, cost.contact.median
     for name, times in cost.stages.items():
-        if any(t >= _SHOWN * whole for t, whole in zip(times, _medians(cost), strict=True)):
+        # without a tick of the kind both are nan
+        if any(t >= _SHOWN * whole for t, whole in zip(times, medians, strict=True)):
             table.add_row(f"    {name}", *map(_micro, times))
     out.print(table)
     for unit, growth in (("contact", cost.by_contacts), ("constraint row", cost.by_rows)):
@@ -270,14 +249,6 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
     for kind, count in seen.items():
         if count > MAX_NAMED:
             out.print(f"  and {count - MAX_NAMED} more of '{plain(kind)}': --json lists all")
-
-
-def _medians(cost: Cost) -> tuple[float, float]:
-    return tuple(_known(spread) for spread in (cost.free, cost.contact))  # type: ignore[return-value] # two
-
-
-def _known(spread: TimingStats) -> float:
-    return spread.median if spread.ticks else math.inf
 
 
 def _micro(seconds: float) -> str:
@@ -358,8 +329,7 @@ class Check:
 
     def execute(self) -> int:
         """Checks and prints; returns the exit code."""
-        if self.plot is not None:
-            check_ending(self.plot)
+        check_ending(self.plot)
         wants_lean = self.lean or self.write is not None or self.table is not None
         if self.budget is not None and not wants_lean:
             raise SceneError("--budget goes with --lean")
@@ -389,9 +359,8 @@ class Check:
         faults, cost = find_faults(case), None
         if case.observation is not None:
             with progress("timing it") as show, quiet():
-                cost = measure_cost(
-                    case.scene, case.samples, case.coupling, case.period, progress=show
-                )
+                setting = Setting(case.coupling, case.period)
+                cost = measure_cost(case.scene, case.samples, setting, progress=show)
             slow = cost.fault(case)
             faults = faults if slow is None else (*faults, slow)
         if not self.as_json:
@@ -416,7 +385,16 @@ class Check:
     def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""
         try:
-            return look_for_lean(case, budget)
+            with progress("leaner") as show:
+                return find_lean(
+                    case.source,
+                    case.scene.grip,
+                    case.motion,
+                    Setting(case.coupling, case.period),
+                    budget=budget,
+                    device_damping=(case.info.damping or 0.0) / case.scale**2,
+                    progress=show,
+                )
         except SceneError as error:
             err.print(f"what could go cannot be said: {plain(str(error))}")
             return None
@@ -439,12 +417,9 @@ class Check:
 
     def _coupling(self, period: float) -> Coupling:
         info = SimulatedDevice().info
-        coupling = default_coupling(info, period, self.scale, self.scale)
-        if self.stiffness is not None:
-            coupling = replace(coupling, stiffness=self.stiffness)
-        if self.damping is not None:
-            coupling = replace(coupling, damping=self.damping)
-        return coupling
+        asked = {"stiffness": self.stiffness, "damping": self.damping}
+        gains = {name: gain for name, gain in asked.items() if gain is not None}
+        return replace(default_coupling(info, period, self.scale, self.scale), **gains)
 
 
 def _picture(case: SceneUnderCheck, cost: Cost | None, lean: Lean | None) -> Figure | None:

@@ -77,17 +77,14 @@ def _specification(first: FoundDevice, plugged: list[FoundDevice]) -> str:
     return first.driver if is_only else f"{first.driver}:serial={first.serial or first.path}"
 
 
+_FACTS = ("name", "about", "transport", "axes", "force", "rate", "on_stall")
+
+
 def _facts(plugged: list[FoundDevice], unseen: list[str]) -> dict[str, Any]:
     return {
         "supported": [
             {
-                "name": driver.name,
-                "about": driver.about,
-                "transport": driver.transport,
-                "axes": driver.axes,
-                "force": driver.force,
-                "rate": driver.rate,
-                "on_stall": driver.on_stall,
+                **{name: getattr(driver, name) for name in _FACTS},
                 "options": list(driver.options),
                 "medium": None if driver.medium is None else driver.medium(),
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in driver.ids],

@@ -166,9 +166,8 @@ class Identify:
 
     def execute(self) -> int:
         """Measures and prints; returns the exit code."""
-        for path in (self.plot, self.zwidth):
-            if path is not None:
-                check_ending(path)
+        check_ending(self.plot)
+        check_ending(self.zwidth)
         period = period_of(self.rate)
         duration = duration_at(period) if self.duration is None else self.duration
         self._check(duration)
@@ -211,13 +210,11 @@ class Identify:
         if path is not None:
             _write(profile, path)
             notify(f"wrote {path}")
-        for target, figure in (
-            (self.plot, draw_identification(result) if self.plot else None),
-            (self.zwidth, draw_z_width(z) if self.zwidth and z else None),
-        ):
-            if target is not None and figure is not None:
-                write_figure(figure, target)
-        if self.zwidth is not None and z is None:
+        if self.plot is not None:
+            write_figure(draw_identification(result), self.plot)
+        if self.zwidth is not None and z is not None:
+            write_figure(draw_z_width(z), self.zwidth)
+        elif self.zwidth is not None:
             notify(f"'{self.zwidth}' is not drawn: {why_none(result)}")
         return 0
 

@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.signals import leaving_on_interrupt
@@ -20,53 +20,32 @@ from hapticbridge.signals import leaving_on_interrupt
 DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP, INTERRUPTED = 0, 1, 2, 3, 130
 
 
-class Entry(NamedTuple):
-    """One command: its class has the command's name with a capital.
-
-    Attributes:
-        group: Heading in the top-level help.
-        module: Module in ``hapticbridge.cli`` that holds the command's class.
-        summary: First line of the class's docstring, without importing it.
-    """
-
-    group: str
-    module: str
-    summary: str
-
-
 COMMANDS = {
-    "run": Entry("Scenes", "run", "Put a scene behind a haptic device and feel it."),
-    "scenes": Entry("Scenes", "scenes", "List the scenes, or the parameters of one."),
-    "check": Entry(
-        "Scenes", "check", "Find what is wrong with a scene, and what a tick of it costs."
-    ),
-    "audit": Entry(
-        "Recordings", "audit", "Judge recorded runs offline: passive, active or invalid, and why."
-    ),
-    "view": Entry("Recordings", "view", "Show a recorded run in a browser."),
-    "render": Entry("Recordings", "render", "Draw a recorded run: a picture, or a film of it."),
-    "compare": Entry(
-        "Recordings", "recordings", "Find the first tick and field where two runs differ."
-    ),
-    "export": Entry("Recordings", "recordings", "Write a recording as Parquet, CSV or HDF5."),
-    "repair": Entry("Recordings", "audit", "Make a whole file of a recording that a crash cut."),
-    "devices": Entry("Devices", "devices", "List the haptic devices plugged in and supported."),
-    "identify": Entry(
-        "Devices", "identify", "Measure a device's mass, damping, friction, resolution and delay."
-    ),
-    "doctor": Entry("Devices", "doctor", "Measure whether this machine holds the loop's rate."),
-    "bound": Entry("Theory", "bound", "Compute the device damping that a coupling needs."),
-    "zwidth": Entry(
-        "Theory", "zwidth", "Compute the stiffness and damping that a device can show."
-    ),
-    "stability": Entry(
-        "Theory", "stability", "Map where ways to render a tool lose passivity or stability."
-    ),
-    "chart": Entry(
-        "Theory", "chart", "Chart the cost of ways to simulate a scene against their error."
-    ),
+    "run": "Put a scene behind a haptic device and feel it.",
+    "scenes": "List the scenes, or the parameters of one.",
+    "check": "Find what is wrong with a scene, and what a tick of it costs.",
+    "audit": "Judge recorded runs offline: passive, active or invalid, and why.",
+    "view": "Show a recorded run in a browser.",
+    "render": "Draw a recorded run: a picture, or a film of it.",
+    "compare": "Find the first tick and field where two runs differ.",
+    "export": "Write a recording as Parquet, CSV or HDF5.",
+    "repair": "Make a whole file of a recording that a crash cut.",
+    "devices": "List the haptic devices plugged in and supported.",
+    "identify": "Measure a device's mass, damping, friction, resolution and delay.",
+    "doctor": "Measure whether this machine holds the loop's rate.",
+    "bound": "Compute the device damping that a coupling needs.",
+    "zwidth": "Compute the stiffness and damping that a device can show.",
+    "stability": "Map where ways to render a tool lose passivity or stability.",
+    "chart": "Chart the cost of ways to simulate a scene against their error.",
 }
-"""Commands by name, in the order of the top-level help."""
+"""Summary of each command, in the order of the top-level help: the first line of the command's
+class, without importing it. The class has the command's name with a capital."""
+
+_HEADINGS = {"run": "Scenes", "audit": "Recordings", "devices": "Devices", "bound": "Theory"}
+"""Headings of the top-level help, by the command below."""
+
+_MODULES = {"compare": "recordings", "export": "recordings", "repair": "audit", "bound": "zwidth"}
+"""Modules of commands that share one; any other command has a module of its name."""
 
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 """Errors of a full disk, a file over its limit, a user over quota. They name no file."""
@@ -114,18 +93,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _execute(name: str, words: list[str]) -> int:
-    command = _parsed(_command_class(name), name, words)
+    command = _parsed(command_class(name), name, words)
     from hapticbridge.cli.terminal import warnings_in_a_sentence  # noqa: PLC0415 - imports rich
 
     with warnings_in_a_sentence():
         return int(command.execute())
 
 
-def _command_class(name: str) -> type[Any]:
+def command_class(name: str) -> type[Any]:
     """Imports the command's module and returns its class."""
     try:
         with leaving_on_interrupt(INTERRUPTED):
-            module = importlib.import_module(f"hapticbridge.cli.{COMMANDS[name].module}")
+            module = importlib.import_module(f"hapticbridge.cli.{_MODULES.get(name, name)}")
     except RuntimeError as error:
         if "MUJOCO_GL" not in str(error):
             raise
@@ -180,14 +159,11 @@ def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any
     changed: list[tuple[str, Any, Any]] = []
     for field in fields(command):
         if field.name not in first:
-            changed.append((field.name, Annotated[hints[field.name], tyro.conf.Suppress], field))
-            continue
-        text = descriptions[field.name]
-        if field.default in (None, -math.inf, math.inf):
-            help_argument = tyro.conf.arg(help=text, help_behavior_hint="")
+            marker: Any = tyro.conf.Suppress
         else:
-            help_argument = tyro.conf.arg(help=text)
-        changed.append((field.name, Annotated[hints[field.name], help_argument], field))
+            hint = "" if field.default in (None, -math.inf, math.inf) else None
+            marker = tyro.conf.arg(help=descriptions[field.name], help_behavior_hint=hint)
+        changed.append((field.name, Annotated[hints[field.name], marker], field))
     count = sum(field.name not in first for field in fields(command))
     return make_dataclass(command.__name__, changed, bases=(command,), frozen=True), count
 
@@ -237,12 +213,10 @@ def _print_version() -> int:
 
 def _top_level_help() -> str:
     lines = ["Feel a MuJoCo scene through a haptic device: hapticbridge COMMAND [OPTIONS]"]
-    group = ""
-    for name, entry in COMMANDS.items():
-        if entry.group != group:
-            group = entry.group
-            lines.append(group)
-        lines.append(f"  {name:<11}{entry.summary}")
+    for name, summary in COMMANDS.items():
+        if name in _HEADINGS:
+            lines.append(_HEADINGS[name])
+        lines.append(f"  {name:<11}{summary}")
     return "\n".join([*lines, "Options of a command, with an example: hapticbridge COMMAND --help"])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.cli.terminal import err, out, plain, print_json
 from hapticbridge.compare import Comparison, Difference, compare
 from hapticbridge.export import export, time_of
 from hapticbridge.units import format_si
@@ -54,7 +53,7 @@ class Export:
         if self.as_json:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
             facts |= {"marks": marks, "is_cut": found.is_cut, "damage": done.damage}
-            out.print_json(json.dumps(facts))
+            print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
             out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")

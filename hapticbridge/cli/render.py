@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -54,16 +54,7 @@ class Render:
         """Draws; returns the exit code."""
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
-        shot = Shot(
-            at=self.at,
-            start=self.start,
-            stop=self.stop,
-            speed=self.speed,
-            camera=self.camera,
-            width=self.width,
-            height=self.height,
-            fps=self.fps,
-        )
+        shot = Shot(**{field.name: getattr(self, field.name) for field in fields(Shot)})
         with err.status("drawing …"), progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
-from hapticbridge.cli.terminal import err, notify, out
+from hapticbridge.cli.terminal import err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -133,12 +132,11 @@ def announce_measured(bridge: Bridge) -> None:
 _WELD = "the weld in its stiffest directions at the start"
 
 
-def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = True) -> None:
+def print_summary(summary: Summary, *, has_hand: bool = True) -> None:
     """Prints what a run was, whether the device bears it, and what to do next.
 
     Args:
         summary: Of the run.
-        law_evaluations: How often per tick the wrench was computed.
         has_hand: True if a hand holds the device.
     """
     table = Table(show_header=False, box=None, pad_edge=False)
@@ -151,7 +149,9 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
         (summary.peak_force, summary.peak_torque),
         (summary.peak_tool_force, summary.peak_tool_torque),
     )
-    table.add_row("peak", format_wrenches(hand if has_hand else None, tool))
+    reached = " and ".join(f"{name} limit" for name in summary.limits_reached)
+    reached = f" ({reached} reached)" if reached else ""
+    table.add_row("peak", format_wrenches(hand if has_hand else None, tool) + reached)
     if summary.reach is not None:
         table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
     for name, joules in summary.energies.items():
@@ -161,49 +161,35 @@ def print_summary(summary: Summary, law_evaluations: int, *, has_hand: bool = Tr
     tick, port = summary.fault or (0, "")
     used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
     since = f", from tick {tick} on" if port else ""
-    words = f"[bold]{summary.verdict}[/bold] ({port or summary.environment})"
+    judged = "" if port else "environment "  # the device has a line of its own
+    words = f"{judged}[bold]{summary.verdict}[/bold] ({port or summary.environment})"
     out.print(f"{words}{since}{used}")
-    if summary.watch:
-        out.print(f"[yellow]{escape(summary.watch)}[/yellow]")
     if summary.method != default_method().name:
         out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
     _print_coupling(summary.coupling)
-    _print_certificate(summary, law_evaluations, has_hand=has_hand)
+    _print_certificate(summary, has_hand=has_hand)
     if hint := summary.timekeeping.hint:
         out.print(hint)
     if summary.recording is not None:
         out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
 
 
-def _print_certificate(summary: Summary, law_evaluations: int, *, has_hand: bool) -> None:
+def _print_certificate(summary: Summary, *, has_hand: bool) -> None:
     """Prints if the device bears the coupling at the time that the run kept."""
     kept = summary.timekeeping
-    if summary.is_certified is None and summary.conditions:
-        for sentence in summary.conditions:
-            out.print(escape(sentence))
-        out.print("nothing proves that the device bears this")
-        return
     if not has_hand:
         out.print("the device feels no force: there is nothing to certify")
         return
-    if kept.fault:
-        out.print(f"device not certified: {kept.fault}")
+    if summary.is_certified is False and kept.fault:
+        out.print(escape(f"device not certified: {kept.fault}"))
         return
-    bound = "KT/2 + B_law" if law_evaluations == 1 else f"what {law_evaluations} substeps need"
-    certified = {
-        True: f"device certified{kept.clause}: b >= {bound}",
-        False: f"device not certified: b < {bound}",
-        None: f"device unknown: b >= {bound} not checked",
-    }
-    out.print(certified[summary.is_certified])
-    if (
-        summary.is_certified is False
-        and method_named(summary.method).has_law
-        and law_evaluations == 1
-    ):
-        judge = "the audit judges" if summary.recording else "with --record FILE the audit judges"
-        out.print("no verdict is given on the device's port during the run; only the energy limit")
-        out.print(f"watches it; {judge} it")
+    out.print(kept.device_words(summary.is_certified))
+    if not summary.is_certified:
+        for sentence in summary.conditions:
+            out.print(escape(sentence))
+    if summary.is_certified is False and method_named(summary.method).has_law:
+        judge = "the audit" if summary.recording else "with --record FILE the audit"
+        out.print(f"{judge} counts if the hand got energy; the run has only --energy-limit for it")
 
 
 def _print_coupling(coupling: RunCoupling) -> None:
@@ -284,7 +270,8 @@ class Run:
     fast: bool = False
     """Run in simulated time: as fast as possible, with equal results in every run."""
     stiffness: float | None = None
-    """Coupling stiffness K in N/m; by default the stiffest that is safe on the device."""
+    """Coupling stiffness K in N/m; by default the stiffest that leaves 15 % of the device's
+    damping unused."""
     damping: float | None = None
     """Requested damping B of the coupling in N s/m. The law uses B - KT/2 with 'lossless', B - KT
     with 'compensated', at least 0; B with all others. The device needs b >= KT/2 + B_law."""
@@ -315,11 +302,11 @@ class Run:
     """Port of the view on this machine, by default 8080; 0 takes any free port. Only the printed
     address opens it. From another machine: ssh -L 8080:localhost:8080 MACHINE."""
     controller: Literal["damper", "environment", "off"] | None = None
-    """Passivity controller. 'damper' acts when the device has received more energy than it
-    dissipated and the scene released, 'environment' when the scene has created more than the
+    """Passivity controller, damping added against energy that came from nowhere. 'damper' acts when
+    the hand got more than it put in, 'environment' when the scene has created more than the
     coupling's slack. By default 'environment', or 'damper' if the device condition fails."""
     clutch: int | None = None
-    """Button of the device, from 0: while it is held the device moves without the handle."""
+    """Button of the device, from 0: while it is held the device moves without handle and force."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
     mark: int | None = None
@@ -332,8 +319,8 @@ class Run:
     moves without handle and force. By default the reach of its data sheet, else inf. A smaller
     limit keeps force away from its mechanical stops."""
     energy_limit: float = USUAL_ENERGY
-    """Largest energy in J given to the device beyond the hand's own work; beyond it the run is
-    stopped. inf for scenes whose motors are meant to push the hand."""
+    """Largest energy in J that the hand may get beyond what it put in; a wrench that would pass it
+    is not sent and the run is stopped. inf for scenes whose motors are meant to push the hand."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the summary as JSON."""
 
@@ -389,11 +376,9 @@ class Run:
         stack.close()
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
-            out.print_json(json.dumps(values | {"recording": str(self.record or "") or None}))
+            print_json(values | {"recording": str(self.record or "") or None})
         else:
-            print_summary(
-                summary, bridge.setup.law_evaluations, has_hand=not device.info.is_prescribed
-            )
+            print_summary(summary, has_hand=not device.info.is_prescribed)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from hapticbridge.cli.terminal import err, out, plain
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
 
@@ -57,22 +56,11 @@ class Stability:
             if not self.as_json:
                 _print(each, files)
         if self.as_json:
-            out.print_json(json.dumps(facts))
+            print_json(facts)
         return 0
 
     def _computed(self, each: StabilityMap) -> MapFiles:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed}/{task.total}"),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-            task = bar.add_task(f"map {each.name}", total=None)
-
-            def show(done: int, total: int) -> None:
-                bar.update(task, completed=done, total=total)
-
+        with progress(f"map {each.name}", is_counted=True) as show:
             return run_map(
                 each,
                 self.out,

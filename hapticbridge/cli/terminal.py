@@ -7,12 +7,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
 
-from hapticbridge.files import finite_or_null
+from hapticbridge.files import finite_or_null, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ def plain(text: str) -> str:
 
     What it holds is taken neither as the console's markup nor as control codes of the terminal.
     """
-    return escape("".join(letter if letter.isprintable() else "�" for letter in text))
+    return escape(printable(text))
 
 
 def notify(sentence: str) -> None:
@@ -61,26 +61,20 @@ def _print_mujoco_warning(message: str) -> None:
     err.print(f"[yellow]MuJoCo warns:[/yellow] {escape(message)}")
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    _filename: str,
-    _lineno: int,
-    _file: TextIO | None = None,
-    _line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:
     if issubclass(category, UserWarning):
         err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
 
 
 @contextmanager
-def progress(words: str) -> Iterator[Callable[..., None]]:
+def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., None]]:
     """Shows a bar on stderr; yields a function of the work done, the whole work and a name.
 
     Without a terminal there is no bar, because rich would leave an empty line of it in a file.
 
     Args:
         words: Description of the work.
+        is_counted: True shows the work done and the whole work as numbers, too.
     """
     from rich.progress import (  # noqa: PLC0415 - a run shows none
         BarColumn,
@@ -89,7 +83,8 @@ def progress(words: str) -> Iterator[Callable[..., None]]:
         TimeRemainingColumn,
     )
 
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
+    count = [TextColumn("{task.completed}/{task.total}")] if is_counted else []
+    columns = TextColumn("{task.description}"), BarColumn(), *count, TimeRemainingColumn()
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(words, total=None)
 
@@ -106,7 +101,13 @@ def write_figure(figure: Figure, path: Path) -> None:
 
     with err.status("drawing …"):
         write_picture(figure, path)
-    err.print(f"wrote {plain(str(path))}")
+    print_written(path)
+
+
+def print_written(*paths: Path | None) -> None:
+    """Names files that were written, on stderr; None is left out."""
+    for path in filter(None, paths):
+        err.print(f"wrote {plain(str(path))}")
 
 
 def print_json(facts: object) -> None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,7 @@ _POINTS, _HIGHEST = 40, 1e3
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class AxisCouplingLimits:
     """Limits of stiffness and damping along one kind of axis.
 
@@ -49,27 +49,12 @@ class AxisCouplingLimits:
 
     Attributes:
         axis: ``translation`` or ``rotation``.
-        info: The device; unknown damping is replaced by ``certificate.assumed_damping``.
-        method: The rendering method.
-        start: Requested coupling at the start of the run.
-        period: T in s.
-        scale: s_h, handle motion per device motion.
-        force_scale: s_f, force on the device per force on the tool.
-        substeps: MuJoCo steps per tick.
-        effort: Force limit in N, or torque limit in N m.
-        reach: Stretch limit in m, or angle limit in rad.
+        run: Limits of the run in both kinds of axis. Unknown damping of its device is replaced by
+            ``certificate.assumed_damping``.
     """
 
     axis: Literal["translation", "rotation"]
-    info: DeviceInfo
-    method: Method
-    start: Coupling
-    period: float
-    scale: float
-    force_scale: float
-    substeps: int
-    effort: float
-    reach: float
+    run: CouplingLimits
 
     @property
     def names(self) -> tuple[str, str]:
@@ -81,13 +66,13 @@ class AxisCouplingLimits:
     def leverage(self) -> float:
         """Factor s from the tool's to the device's coupling."""
         if self.axis == "translation":
-            return self.scale * self.force_scale
-        return self.force_scale / self.scale
+            return self.run.scale * self.run.force_scale
+        return self.run.force_scale / self.run.scale
 
     @property
     def damping(self) -> float:
         """Device damping b in N s/m or N m s/rad, or the assumed one."""
-        return assumed_damping(self.info)[self.axis == "rotation"]
+        return assumed_damping(self.run.info)[self.axis == "rotation"]
 
     def gains(self, coupling: Coupling) -> tuple[float, float]:
         """Returns the stiffness and damping of a coupling along these axes."""
@@ -105,19 +90,19 @@ class AxisCouplingLimits:
         The requirement is convex and homogeneous in (K, B'), so linear interpolation never
         underestimates it.
         """
-        linear, angular = assumed_damping(self.info)
-        known = replace(self.info, damping=linear, rotational_damping=angular)
-        law_evaluations = self.method.law_evaluations(self.substeps)
-        is_linear = law_evaluations == 1 and not delay_ticks(known, self.period)
+        run, (linear, angular) = self.run, assumed_damping(self.run.info)
+        known = replace(run.info, damping=linear, rotational_damping=angular)
+        law_evaluations = run.method.law_evaluations(run.substeps)
+        is_linear = law_evaluations == 1 and not delay_ticks(known, run.period)
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
-        ratios = self.period * np.array([0.0, *inner, _HIGHEST])
+        ratios = run.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
         for ratio in ratios.tolist():
-            requested = self.put(self.start, 1.0, ratio)
-            scales = self.scale, self.force_scale
+            requested = self.put(run.start, 1.0, ratio)
+            scales = run.scale, run.force_scale
             try:
                 need = required_axis_damping(
-                    known, requested, self.period, *scales, law_evaluations, self.method
+                    known, requested, run.period, *scales, law_evaluations, run.method
                 )
                 needs.append(need[self.axis == "rotation"])
             except CouplingError:  # no damping compensates this delay
@@ -129,10 +114,8 @@ class AxisCouplingLimits:
 
         It takes microseconds after the first call, because a refusal must not slow the loop.
         """
-        requested = self.put(self.start, stiffness, damping)
-        stiffness, damping = self.gains(
-            self.method.law_coupling(requested, self.period / self.substeps)
-        )
+        requested = self.put(self.run.start, stiffness, damping)
+        stiffness, damping = self.gains(self.run.law(requested))
         ratios, needs = self._table
         highest = float(ratios[-1])
         ratio = min(damping / stiffness, highest) if stiffness > 0.0 else highest
@@ -143,7 +126,7 @@ class AxisCouplingLimits:
 
     def max_stiffness(self, damping: float) -> float:
         """Returns the largest stiffness for a damping; 0 if there is none."""
-        most = 4.0 * self.damping / (self.period * self.leverage)
+        most = 4.0 * self.damping / (self.run.period * self.leverage)
         return _largest(most, lambda stiffness: self.needed(stiffness, damping), self.damping)
 
     def max_damping(self, stiffness: float) -> float:
@@ -159,11 +142,13 @@ class AxisCouplingLimits:
         force is full; and K >= ``SOFTEST`` of the largest. If it exceeded the start's stiffness, a
         change of the damping alone would stiffen the coupling.
         """
-        reach = self.leverage * self.reach
-        softest = SOFTEST * self.max_stiffness(0.0)
-        if math.isfinite(reach):
-            softest = min(max(softest, self.effort / reach), self.max_stiffness(0.0))
-        return min(softest, self.gains(self.start)[0])
+        limits = self.run.limits
+        is_linear = self.axis == "translation"
+        effort = limits.force if is_linear else limits.torque
+        reach = self.leverage * (limits.stretch if is_linear else limits.angle)
+        stiffest = self.max_stiffness(0.0)
+        softest = min(max(SOFTEST * stiffest, effort / reach), stiffest)
+        return min(softest, self.gains(self.run.start)[0])
 
     def check(self, stiffness: float, damping: float) -> None:
         """Refuses gains that the device does not allow.
@@ -224,25 +209,12 @@ class CouplingLimits:
     @cached_property
     def translation(self) -> AxisCouplingLimits:
         """Limits in translation."""
-        limits = self.limits
-        return AxisCouplingLimits(
-            axis="translation", effort=limits.force, reach=limits.stretch, **self._common
-        )
+        return AxisCouplingLimits("translation", self)
 
     @cached_property
     def rotation(self) -> AxisCouplingLimits | None:
         """Limits in rotation; None for a device without torque."""
-        if not self.info.turns:
-            return None
-        limits = self.limits
-        return AxisCouplingLimits(
-            axis="rotation", effort=limits.torque, reach=limits.angle, **self._common
-        )
-
-    @property
-    def _common(self) -> dict[str, Any]:
-        names = ("info", "method", "start", "period", "scale", "force_scale", "substeps")
-        return {name: getattr(self, name) for name in names}
+        return AxisCouplingLimits("rotation", self) if self.info.turns else None
 
     @property
     def spans(self) -> tuple[AxisCouplingLimits, ...]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol
@@ -15,6 +16,17 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
+
+
+@contextmanager
+def calling_on_error(close: Callable[[], None]) -> Iterator[None]:
+    """Calls a function if the block fails, such as ``close`` of a device or of its link."""
+    try:
+        yield
+    except BaseException:
+        close()
+        raise
+
 
 # Data sheet of a haptic device
 
@@ -79,7 +91,7 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
-_LATER = {"serial", "reach"}
+_LATER = {"serial", "reach", "buttons"}
 """Fields that the first recordings lack."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
@@ -126,6 +138,7 @@ class DeviceInfo:
             runs on a real clock only, and waits for the hand to be still.
         duration: Time in s after which the motion ends by itself, >= 0; None if it does not.
         serial: The unit's serial number; empty if it has none.
+        buttons: Number of buttons; None if unknown.
         reach: Largest possible distance in m from the origin of its frame, > 0; beyond it are only
             the stops. None if unknown.
 
@@ -151,6 +164,7 @@ class DeviceInfo:
     duration: float | None = None
     serial: str = ""
     reach: float | None = None
+    buttons: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -168,6 +182,9 @@ class DeviceInfo:
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
+        is_count = isinstance(self.buttons, int) and not isinstance(self.buttons, bool)
+        if self.buttons is not None and not (is_count and self.buttons >= 0):
+            raise DeviceError(f"buttons = {self.buttons!r}: must be a whole number >= 0")
         for name in DATA_SHEET_UNITS:
             value = getattr(self, name)
             if value is not None or name in _NEVER_UNKNOWN:
@@ -210,8 +227,8 @@ class DeviceInfo:
         """Returns the sheet from the text of ``to_json``.
 
         Raises:
-            DeviceError: The text is not a JSON object with these keys (``serial`` and ``reach`` are
-                optional), or a value is invalid.
+            DeviceError: The text is not a JSON object with these keys (those of
+                ``_LATER`` are optional), or a value is invalid.
         """
         try:
             values = read_json(text)

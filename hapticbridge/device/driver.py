@@ -104,9 +104,9 @@ class FoundDevice:
         name: Name that the device reports, else the model's name; printable, as is the serial.
         serial: Serial number; empty if it has none or does not report it.
         path: Device node by which it is opened.
+        transport: Transport of the driver.
         vendor: USB vendor id; 0 if unknown.
         product: USB product id; 0 if unknown.
-        transport: Transport of the driver.
         problem: Reason why it cannot be opened, with the remedy, in one sentence; None if it can.
     """
 
@@ -114,10 +114,10 @@ class FoundDevice:
     name: str
     serial: str
     path: str
-    vendor: int
-    product: int
     transport: str
-    problem: str | None
+    vendor: int = 0
+    product: int = 0
+    problem: str | None = None
 
     def __post_init__(self) -> None:
         for field in ("name", "serial"):

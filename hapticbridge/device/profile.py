@@ -129,13 +129,7 @@ class Profile:
             plain["models"] = list(self.models)
         for name, quantity in self.quantities.items():
             value = quantity.value
-            table: dict[str, object] = {
-                "value": "unknown"
-                if value is None
-                else list(value)
-                if isinstance(value, tuple)
-                else value
-            }
+            table: dict[str, object] = {"value": "unknown" if value is None else value}
             if quantity.interval is not None:
                 table["interval"] = list(quantity.interval)
             plain[name] = table | {"unit": UNITS[name], "source": quantity.source}

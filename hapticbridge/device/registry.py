@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hapticbridge.device.base import Device
+from hapticbridge.device.base import Device, calling_on_error
 from hapticbridge.device.driver import Driver, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
@@ -95,6 +95,7 @@ _HAND_OPTIONS = tuple(_HAND_PREFIX + name for name in inspect.signature(Hand).pa
 _SIMULATED_OPTIONS: Options = {
     **dict.fromkeys((*inspect.signature(SimulatedDevice).parameters, *_HAND_OPTIONS), float),
     "delay": int,
+    "dof": int,
     "hand": str,
     "path": Path,
 }
@@ -146,7 +147,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
             requested.pop("profile", None)
         profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
         device = driver.open(requested, notify)
-        try:
+        with calling_on_error(device.close):
             if profile_option is None:
                 model = device.info.name
                 profile = profile_of(name, device.info.serial, model)
@@ -154,9 +155,6 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
                     notify(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if profile is not None:
                 device.info = profile.fill(device.info)
-        except BaseException:
-            device.close()
-            raise
         return device
     if name not in _OPENERS:
         names = choices([*_OPENERS, *DRIVERS])

@@ -20,9 +20,8 @@ from hapticbridge.device.base import (
     checked_number,
     checked_period,
 )
-from hapticbridge.device.driver import Driver, Notify, UsbId, select_device
-from hapticbridge.device.transport.hid import HidApi, HidLink, Link, find
-from hapticbridge.device.transport.trace import HexLog
+from hapticbridge.device.driver import Driver, Notify, UsbId
+from hapticbridge.device.transport.hid import HidApi, HidLink, opened
 from hapticbridge.errors import DeviceError
 from hapticbridge.pose import Quaternion, canonical, product, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE
@@ -183,7 +182,7 @@ class SpaceMouseDevice:
 
     def __init__(
         self,
-        link: Link,
+        link: HidLink,
         name: str = "spacemouse",
         *,
         speed: float = SPEED,
@@ -202,20 +201,11 @@ class SpaceMouseDevice:
         self.info = DeviceInfo(
             name=name,
             axes=AXES,
-            mass=None,
-            damping=None,
-            rotational_inertia=None,
-            rotational_damping=None,
-            friction=None,
-            resolution=None,
             force_limit=force_limit,
             torque_limit=torque_limit,
             speed_limit=math.sqrt(3.0) * speed,  # all three axes at full deflection
-            rate=None,
-            delay=None,
             is_prescribed=True,
             is_real=False,
-            duration=None,
         )
         self._period = 0.0
         self._is_open, self._has_begun = True, False
@@ -294,19 +284,14 @@ def open_spacemouse(
     options: Mapping[str, object], _notify: Notify, api: HidApi | None = None
 ) -> SpaceMouseDevice:
     """Finds and opens a SpaceMouse; options are ``serial``, ``log`` and numbers of the device."""
-    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
-    # not overlapped: reports are written only before and after the loop
-    link = HidLink.open(plugged, api, is_overlapped=False, log=HexLog.from_options(options))
     numbers: dict[str, float] = {
         key: value  # type: ignore[misc] # checked by the device
         for key, value in options.items()
         if key in _NUMBERS
     }
-    try:
+    # not overlapped: reports are written only before and after the loop
+    with opened(DRIVER, options, api, is_overlapped=False) as (plugged, link):
         device = SpaceMouseDevice(link, plugged.name, **numbers)
-    except BaseException:
-        link.close()
-        raise
     device.info = replace(device.info, serial=plugged.serial)
     return device
 

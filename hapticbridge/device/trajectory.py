@@ -6,6 +6,7 @@ import math
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -363,32 +364,17 @@ def _next_sample(
     sample.buttons = 0
 
 
-def _prescribed(
-    *,
-    duration: float,
-    rate: float | None,
-    force_limit: float,
-    torque_limit: float,
-    speed_limit: float,
-) -> DeviceInfo:
+def _prescribed(duration: float, rate: float | None, **limits: Any) -> DeviceInfo:
     """Returns the data sheet of a device that no force moves."""
     return DeviceInfo(
         name="trajectory",
         axes=AXES,
-        mass=None,
-        damping=None,
-        rotational_inertia=None,
-        rotational_damping=None,
-        friction=None,
-        resolution=None,
-        force_limit=force_limit,
-        torque_limit=torque_limit,
-        speed_limit=speed_limit,
         rate=rate,
         delay=0.0,
         is_prescribed=True,
         is_real=False,
         duration=duration,
+        **limits,
     )
 
 

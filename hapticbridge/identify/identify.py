@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,16 +142,9 @@ def move_axis(
             if progress is not None and k % report_every == 0:
                 progress(k / ticks)
     finally:
-        _silence(device)
+        with suppress(DeviceError):  # the error of a lost device has been raised already
+            device.write(np.zeros(6))
     return AxisRun(axis, period, position, force, 1e-9 * np.diff(wakes), stale / ticks)
-
-
-def _silence(device: Device) -> None:
-    """Commands zero force; the error of a lost device has been raised already."""
-    try:
-        device.write(np.zeros(6))
-    except DeviceError:
-        return
 
 
 def _fault_message(code: int, s: np.void) -> str:
@@ -325,7 +320,7 @@ def identify(
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
     for axis in chosen:
-        report = None if progress is None else _for_axis(progress, axis)
+        report = None if progress is None else partial(progress, axis)
         runs[axis] = run = move_axis(
             device,
             clock,
@@ -352,10 +347,6 @@ def identify(
 def duration_at(period: float) -> float:
     """Returns the default time per axis in s for a period in s: 12, and more below 333 Hz."""
     return DURATION * stretch(period)
-
-
-def _for_axis(progress: Callable[[str, float], None], axis: str) -> Callable[[float], None]:
-    return lambda share: progress(axis, share)
 
 
 def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:

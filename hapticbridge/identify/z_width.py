@@ -12,6 +12,7 @@ then bisected.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,56 +62,6 @@ class Trial:
     peak: float
 
 
-def judged(
-    position: Array,
-    applied: Array,
-    push: int,
-    period: float,
-    *,
-    stiffness: float,
-    damping: float,
-    force: float,
-    resolution: float,
-) -> Trial:
-    """Classifies a swing as decaying or not.
-
-    Its squared amplitude is x² + (x'/ω)². For a swing of one frequency ω it does not depend on the
-    phase at which a third of the trial begins. The centre of the swing is the mean of the last
-    third. A weight pulls the device away from the wall's position, and a slow return without
-    swinging is closest to its end there.
-
-    Args:
-        position: x − x_0 in m, shape (n,).
-        applied: Force on the device in N, shape (n,).
-        push: Length of the push in ticks.
-        period: T in s.
-        stiffness: K in N/m.
-        damping: B in N s/m.
-        force: Largest allowed force in N.
-        resolution: Step of the position in m.
-    """
-    after = position[push:] - np.array_split(position[push:], 3)[2].mean()
-    speed = np.diff(after, append=after[-1])
-    fastest = float(np.std(speed))
-    ratio = float(np.std(after)) / fastest if fastest > 0.0 else 0.0
-    thirds = np.array_split(after, 3)
-    amplitude = np.array_split(after**2 + (ratio * speed) ** 2, 3)
-    middle, last = (float(np.sqrt(np.mean(part))) for part in amplitude[1:])
-    peak = float(np.abs(applied[push:]).max())
-    is_quiet = last <= max(NOISE_STEPS * resolution, DIED_DOWN * float(np.abs(after).max()))
-    growth = 0.0 if is_quiet or middle == 0.0 else last / middle
-    is_saturated = np.abs(applied[-len(thirds[2]) :]) >= HALTED * force
-    return Trial(
-        stiffness=stiffness,
-        damping=damping,
-        is_borne=growth < 1.0 and not is_saturated.any(),
-        growth=growth,
-        swing=2.0 * np.pi * ratio * period,
-        energy=float(applied[push:-1] @ np.diff(position[push:])),
-        peak=peak,
-    )
-
-
 Array = NDArray[np.float64]
 
 PUSH = 0.003
@@ -129,6 +80,9 @@ SWINGS = 15
 
 REST = 0.4
 """Time in s between trials, in which soft springs bring the device back."""
+
+PRECISION = 0.02
+"""Relative width of the interval of K at which its bisection ends, without unit."""
 
 STEP_UP = 1.25
 """Factor between the first trial stiffnesses, without unit. Larger steps are quicker and shake the
@@ -158,151 +112,152 @@ class MeasuredLimit:
         return self.borne if self.not_borne is None else 0.5 * (self.borne + self.not_borne)
 
 
-def measure_limit(
-    device: Device,
-    clock: Clock,
-    *,
-    damping: float,
-    period: float,
-    force: float,
-    axis: str = "x",
-    first_stiffness: float,
-    max_stiffness: float,
-    precision: float = 0.02,
-    progress: Callable[[float], None] | None = None,
-) -> MeasuredLimit:
-    """Finds the stiffest wall that a started device bears at one damping.
+@dataclass(frozen=True, slots=True)
+class WallBench:
+    """A started device that renders virtual walls along one axis.
 
-    Args:
+    Attributes:
         device: Device, started at this period.
         clock: Started clock.
-        damping: B in N s/m.
         period: T in s.
         force: Largest force in N.
         axis: One of x, y, z that the device has.
-        first_stiffness: First trial K in N/m, > 0.
-        max_stiffness: Largest trial K in N/m.
-        precision: Relative width at which the bisection of K ends.
-        progress: Called before each trial with its stiffness.
-
-    Raises:
-        IdentificationError: The pose is not finite.
-        DeviceError: The device failed.
     """
-    trials: list[Trial] = []
 
-    def is_borne(stiffness: float) -> bool:
-        if progress is not None:
-            progress(stiffness)
-        swing = trials[-1].swing if trials else 0.0
-        trials.append(
-            try_wall(
-                device,
-                clock,
-                stiffness,
-                damping,
-                period=period,
-                force=force,
-                axis=axis,
-                duration=min(max(TRIAL, SWINGS * swing), LONGEST_TRIAL),
-            )
+    device: Device
+    clock: Clock
+    period: float
+    force: float
+    axis: str = "x"
+
+    def limit(
+        self,
+        damping: float,
+        first_stiffness: float,
+        max_stiffness: float,
+        progress: Callable[[float], None] | None = None,
+    ) -> MeasuredLimit:
+        """Finds the stiffest wall that the device bears at one damping.
+
+        Args:
+            damping: B in N s/m.
+            first_stiffness: First trial K in N/m, > 0.
+            max_stiffness: Largest trial K in N/m.
+            progress: Called before each trial with its stiffness.
+
+        Raises:
+            IdentificationError: The pose is not finite.
+            DeviceError: The device failed.
+        """
+        trials: list[Trial] = []
+
+        def is_borne(stiffness: float) -> bool:
+            if progress is not None:
+                progress(stiffness)
+            swing = trials[-1].swing if trials else 0.0
+            duration = min(max(TRIAL, SWINGS * swing), LONGEST_TRIAL)
+            trials.append(self.try_wall(stiffness, damping, duration))
+            return trials[-1].is_borne
+
+        borne, stiffness = 0.0, first_stiffness
+        while is_borne(stiffness):
+            borne = stiffness
+            if stiffness >= max_stiffness:
+                return MeasuredLimit(damping, borne, None, tuple(trials))
+            stiffness = min(STEP_UP * stiffness, max_stiffness)
+        not_borne = stiffness
+        # if even the first wall is too stiff, search down to a hundredth of it
+        while not_borne - borne > PRECISION * not_borne and not_borne > 0.01 * first_stiffness:
+            middle = 0.5 * (borne + not_borne)
+            if is_borne(middle):
+                borne = middle
+            else:
+                not_borne = middle
+        return MeasuredLimit(damping, borne, not_borne, tuple(trials))
+
+    def try_wall(self, stiffness: float, damping: float, duration: float = TRIAL) -> Trial:
+        """Renders one wall after a rest; always ends with zero force."""
+        device, period, force, index = self.device, self.period, self.force, AXES.index(self.axis)
+        sample, wrench = np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
+        place = sample["position"][0]
+        try:
+            centre = self._rest(sample, wrench)
+            origin = before = float(place[index])
+            push, ticks = round(PUSH / period), round(duration / period)
+            position, applied = np.empty(ticks), np.empty(ticks)
+            for k in range(ticks):
+                self.clock.wait()
+                device.read(sample)
+                x = float(place[index])
+                if not np.isfinite(place).all():
+                    raise IdentificationError(
+                        "the device's pose is not finite; check its encoders and its connection"
+                    )
+                wall = -stiffness * (x - origin) - damping / period * (x - before)
+                before = x
+                requested = wall + (PUSH_SHARE * force if k < push else 0.0)
+                wrench[:3] = CENTRING[0] * (centre - place)
+                wrench[index] = min(max(requested, -force), force)
+                device.write(wrench)
+                position[k], applied[k] = x - origin, wrench[index]
+        finally:
+            with suppress(DeviceError):  # the error of a lost device has been raised already
+                device.write(np.zeros(6))
+        return self._judged(position, applied, push, stiffness, damping)
+
+    def _rest(self, sample: NDArray[np.void], wrench: Array) -> Array:
+        """Holds the device softly for ``REST``; returns its initial position."""
+        self.device.read(sample)
+        place, limit = sample["position"][0], self.force
+        centre = place.copy()
+        before = np.tile(place, (10, 1))
+        for k in range(round(REST / self.period)):
+            self.clock.wait()
+            self.device.read(sample)
+            speed = (place - before[k % 10]) / (10 * self.period)
+            before[k % 10] = place
+            pull = CENTRING[0] * (centre - place) - CALMING[0] * speed
+            wrench[:3] = np.clip(pull, -limit, limit)
+            self.device.write(wrench)
+        return np.asarray(centre)
+
+    def _judged(
+        self, position: Array, applied: Array, push: int, stiffness: float, damping: float
+    ) -> Trial:
+        """Classifies a swing as decaying or not.
+
+        Its squared amplitude is x² + (x'/ω)². For a swing of one frequency ω it does not depend on
+        the phase at which a third of the trial begins. The centre of the swing is the mean of the
+        last third. A weight pulls the device away from the wall's position, and a slow return
+        without swinging is closest to its end there.
+
+        Args:
+            position: x − x_0 in m, shape (n,).
+            applied: Force on the device in N, shape (n,).
+            push: Length of the push in ticks.
+            stiffness: K in N/m.
+            damping: B in N s/m.
+        """
+        resolution = self.device.info.resolution or 0.0
+        after = position[push:] - np.array_split(position[push:], 3)[2].mean()
+        speed = np.diff(after, append=after[-1])
+        fastest = float(np.std(speed))
+        ratio = float(np.std(after)) / fastest if fastest > 0.0 else 0.0
+        thirds = np.array_split(after, 3)
+        amplitude = np.array_split(after**2 + (ratio * speed) ** 2, 3)
+        middle, last = (float(np.sqrt(np.mean(part))) for part in amplitude[1:])
+        is_quiet = last <= max(NOISE_STEPS * resolution, DIED_DOWN * float(np.abs(after).max()))
+        growth = 0.0 if is_quiet or middle == 0.0 else last / middle
+        is_saturated = np.abs(applied[-len(thirds[2]) :]) >= HALTED * self.force
+        return Trial(
+            stiffness=stiffness,
+            damping=damping,
+            is_borne=growth < 1.0 and not is_saturated.any(),
+            growth=growth,
+            swing=2.0 * np.pi * ratio * self.period,
+            energy=float(applied[push:-1] @ np.diff(position[push:])),
+            peak=float(np.abs(applied[push:]).max()),
         )
-        return trials[-1].is_borne
-
-    borne, stiffness = 0.0, first_stiffness
-    while is_borne(stiffness):
-        borne = stiffness
-        if stiffness >= max_stiffness:
-            return MeasuredLimit(damping, borne, None, tuple(trials))
-        stiffness = min(STEP_UP * stiffness, max_stiffness)
-    not_borne = stiffness
-    # if even the first wall is too stiff, search down to a hundredth of it
-    while not_borne - borne > precision * not_borne and not_borne > 0.01 * first_stiffness:
-        middle = 0.5 * (borne + not_borne)
-        if is_borne(middle):
-            borne = middle
-        else:
-            not_borne = middle
-    return MeasuredLimit(damping, borne, not_borne, tuple(trials))
-
-
-def try_wall(
-    device: Device,
-    clock: Clock,
-    stiffness: float,
-    damping: float,
-    *,
-    period: float,
-    force: float,
-    axis: str = "x",
-    duration: float = TRIAL,
-) -> Trial:
-    """Renders one wall after a rest, as for ``measure_limit``; always ends with zero force."""
-    index = AXES.index(axis)
-    sample, wrench = np.zeros(1, SAMPLE_DTYPE), np.zeros(6)
-    place = sample["position"][0]
-    try:
-        centre = _rest(device, clock, sample, wrench, period, force)
-        origin = before = float(place[index])
-        push, ticks = round(PUSH / period), round(duration / period)
-        position, applied = np.empty(ticks), np.empty(ticks)
-        for k in range(ticks):
-            clock.wait()
-            device.read(sample)
-            x = float(place[index])
-            if not np.isfinite(place).all():
-                raise IdentificationError(
-                    "the device's pose is not finite; check its encoders and its connection"
-                )
-            wall = -stiffness * (x - origin) - damping / period * (x - before)
-            before = x
-            requested = wall + (PUSH_SHARE * force if k < push else 0.0)
-            wrench[:3] = CENTRING[0] * (centre - place)
-            wrench[index] = min(max(requested, -force), force)
-            device.write(wrench)
-            position[k], applied[k] = x - origin, wrench[index]
-    finally:
-        _silence(device)
-    return judged(
-        position,
-        applied,
-        push,
-        period,
-        stiffness=stiffness,
-        damping=damping,
-        force=force,
-        resolution=device.info.resolution or 0.0,
-    )
-
-
-def _rest(
-    device: Device,
-    clock: Clock,
-    sample: NDArray[np.void],
-    wrench: Array,
-    period: float,
-    force: float,
-) -> Array:
-    """Holds the device softly for ``REST``; returns its initial position."""
-    device.read(sample)
-    place = sample["position"][0]
-    centre = place.copy()
-    before = np.tile(place, (10, 1))
-    for k in range(round(REST / period)):
-        clock.wait()
-        device.read(sample)
-        speed = (place - before[k % 10]) / (10 * period)
-        before[k % 10] = place
-        wrench[:3] = np.clip(CENTRING[0] * (centre - place) - CALMING[0] * speed, -force, force)
-        device.write(wrench)
-    return np.asarray(centre)
-
-
-def _silence(device: Device) -> None:
-    try:
-        device.write(np.zeros(6))
-    except DeviceError:
-        return
 
 
 # Measured and predicted Z-width of a device
@@ -339,7 +294,6 @@ def measure_width(
     z: ZWidth,
     *,
     axis: str = "x",
-    force_share: float = FORCE_SHARE,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> MeasuredWidth:
     """Finds the stiffest wall at several dampings; starts the device and leaves it open.
@@ -349,7 +303,6 @@ def measure_width(
         clock: Clock that is not started.
         z: Predicted Z-width of the device at the trial rate.
         axis: One of x, y, z that the device has.
-        force_share: Share of the device's force limit that may be used.
         progress: Called with the completed count, the total count and a description of the trial.
 
     Raises:
@@ -363,6 +316,7 @@ def measure_width(
     clock.start(round(z.period * 1e9))
     largest = next(line for line in z.lines if line.is_required).largest_damping
     dampings = [share * largest for share in SHARES]
+    bench = WallBench(device, clock, z.period, FORCE_SHARE * device.info.force_limit, axis)
     limits = []
     for k, damping in enumerate(dampings):
 
@@ -370,19 +324,8 @@ def measure_width(
             if progress is not None:
                 progress(k, len(dampings), f"B = {damping:.3g}, K = {stiffness:.4g}")
 
-        limits.append(
-            measure_limit(
-                device,
-                clock,
-                damping=damping,
-                period=z.period,
-                force=force_share * device.info.force_limit,
-                axis=axis,
-                first_stiffness=FIRST_SHARE * float(z.limit[0]),
-                max_stiffness=MAX_SHARE * float(z.limit[0]),
-                progress=report,
-            )
-        )
+        first, most = (share * float(z.limit[0]) for share in (FIRST_SHARE, MAX_SHARE))
+        limits.append(bench.limit(damping, first, most, report))
     unheld = [line for line in z.lines if line.name == WITHOUT_HAND]
     return MeasuredWidth(
         limits=tuple(limits),

@@ -352,6 +352,18 @@ def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[f
 
 
 @compiled
+def felt(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Returns the parts of a wrench on the device along the axes that have a motor."""
+    if not s.coupling.lacks_motors:
+        return force, torque
+    k = s.coupling.lacks_motor
+    return (
+        (force[0] * (1.0 - k[0]), force[1] * (1.0 - k[1]), force[2] * (1.0 - k[2])),
+        (torque[0] * (1.0 - k[3]), torque[1] * (1.0 - k[4]), torque[2] * (1.0 - k[5])),
+    )
+
+
+@compiled
 def slip(s: State, max_stretch: float, max_twist: float) -> bool:
     """Slips the handle toward the tool, where the spring holds more than it may.
 

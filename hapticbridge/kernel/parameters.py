@@ -38,6 +38,7 @@ _POSITIVE = (
 )
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
+    "full_speed",
     "assumed_damping",
     "assumed_rotational_damping",
     "max_damping",
@@ -78,6 +79,8 @@ class GuardParameters:
         energy: Energy in J given to the device beyond the hand's above which the run is stopped.
         reach: Distance in m from the origin of the device's frame beyond which the device moves
             without the handle and without force.
+        full_speed: Largest speed in m/s in the data sheet, at which the energy limit still holds;
+            0 if unknown.
         motors: Mask of the device's axes with a motor, in the order x, y, z, rx, ry, rz.
         hold_force: Largest force in N along axes without motor; beyond it the handle slips.
         hold_torque: Largest torque in N m about axes without motor.
@@ -108,6 +111,7 @@ class GuardParameters:
     angle: float = math.inf
     energy: float = math.inf
     reach: float = math.inf
+    full_speed: float = 0.0
     motors: int = ALL_MOTORS
     hold_force: float = math.inf
     hold_torque: float = math.inf

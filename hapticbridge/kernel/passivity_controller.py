@@ -6,12 +6,14 @@ w_{k−1}·δp_k on the device, for any motion in between.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
-from hapticbridge.pose import Vector, scaled
+from hapticbridge.pose import Vector, norm, scaled
 
 THRESHOLD = 1e-5
 """Energy debt in J above which the controller acts. Rounding and the first-order error of turning
@@ -31,6 +33,13 @@ BOUND = 1.6
 """Largest change of the force per device motion, as a multiple of b/T; no unit. At 2, a damper
 alone held by the worst-case hand swings forever; at 1.6 a swing loses 40 % per tick. A smaller
 value makes walls soft for longer."""
+
+FULL_TURN = 30.0
+"""Largest angular velocity in rad/s of a hand that turns a stylus."""
+
+AT_FULL_SPEED = 1.25
+"""Energy that a jump to full speed may bring within one tick, as a multiple of the energy limit; no
+unit. At 1, a force of 10 N would be cut at 5 m/s and 1 kHz before any energy was given."""
 
 OBSERVER_DTYPE = np.dtype(
     [
@@ -106,6 +115,37 @@ def foreseen_excess(s: State) -> float:
         b = observer.assumed_damping if i < 3 else observer.assumed_rotational_damping
         work += (w[i] - b * u) * u
     return float(observer.guarded_energy + s.run.period * work)
+
+
+@compiled
+def _largest_power(size: float, damping: float, full_speed: float) -> float:
+    """Returns the largest (w − b u) u in W for 0 <= u <= ``full_speed``."""
+    u = full_speed
+    if size < 2.0 * damping * full_speed:
+        u = size / (2.0 * damping)
+    return (size - damping * u) * u
+
+
+@compiled
+def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
+    """Scales the wrench down to what a jump to full speed may take out of the next tick.
+
+        G + T max_u (w − b u) u <= 1.25 G_max,    |u| <= the data sheet's speed; 30 rad/s
+
+    G is ``guarded_energy`` and G_max the energy limit, in J. A passive coupling never meets it: the
+    hand has paid for the force before.
+    """
+    guard, observer = s.guard, s.observer
+    if not math.isfinite(guard.max_energy):
+        return force, torque
+    power = _largest_power(norm(force), observer.assumed_damping, guard.full_speed)
+    power += _largest_power(norm(torque), observer.assumed_rotational_damping, FULL_TURN)
+    allowed = AT_FULL_SPEED * guard.max_energy - observer.guarded_energy
+    if s.run.period * power <= allowed:
+        return force, torque
+    observer.flags = CONTROLLER_ACTIVE
+    share = max(allowed, 0.0) / (s.run.period * power)
+    return scaled(share, force), scaled(share, torque)
 
 
 @compiled

@@ -53,6 +53,7 @@ from hapticbridge.kernel.handle import (
 from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
+    felt,
     retune,
     slip,
 )
@@ -88,7 +89,12 @@ from hapticbridge.kernel.mujoco_c import (
     pointer_at,
     release_fence,
 )
-from hapticbridge.kernel.passivity_controller import control, foreseen_excess, observe_energy
+from hapticbridge.kernel.passivity_controller import (
+    control,
+    foreseen_excess,
+    observe_energy,
+    within_energy_limit,
+)
 from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
@@ -436,17 +442,20 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
 def _render(s: State, force: Vector, torque: Vector) -> None:
     """Turns the wrench on the tool into the wrench on the device.
 
-    In this order: scale, share of the lever, and of the passivity controller's damping what fits.
+    In this order: scale, axes with a motor, share of the lever, of the passivity controller's
+    damping what fits, and the energy limit at full speed.
     """
     run = s.run
     if not run.has_law:  # nothing limits the wrench on the tool, so the device alone is spared
         force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
+    force, torque = felt(s, force, torque)
     share = s.guard.share
     if share != 1.0:
         force, torque = scaled(share, force), scaled(share, torque)
     force, torque = send_within(s, (force, torque), control(s, force, torque))
+    force, torque = within_energy_limit(s, force, torque)
     store_vector(s.loop.wrench_on_device[0:3], force)
     store_vector(s.loop.wrench_on_device[3:6], torque)
 

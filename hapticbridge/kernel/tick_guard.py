@@ -52,6 +52,7 @@ _FROM_PARAMETERS = (
     "dead_man",
     "has_hand",
     "reach",
+    "full_speed",
 )
 _THRESHOLDS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
@@ -59,10 +60,12 @@ GUARD_DTYPE = np.dtype(
     [
         *((name, "<i8") for name in _FROM_PARAMETERS[:5]),
         ("reach", "<f8"),
+        ("full_speed", "<f8"),
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),
         ("consecutive_stale", "<i8"),
+        ("fresh", "<i8"),
         ("time_since_sample", "<f8"),
         ("start_tick", "<i8"),
         ("rise_ticks", "<i8"),
@@ -73,8 +76,13 @@ GUARD_DTYPE = np.dtype(
 
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
-``time_since_sample`` in s; ``share`` is r, the ratio of the lever between device and handle;
+``time_since_sample`` in s; ``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
+of the lever between device and handle;
 ``rise_ticks`` its time from 0 to 1."""
+
+FARTHEST = 2.0
+"""Largest plausible distance in m of a device from the origin of its frame, where its data sheet
+names no reach. No desk is larger."""
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that belong to the device; bits above them are commands."""
@@ -120,10 +128,12 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     is_first = s.loop.tick == guard.start_tick
     if elapsed < 0.0 and not is_first:
         return BACKWARDS
-    # the device moves on while its samples are old, and between a start and the first tick
+    # the device moves on while its samples are old
     time = max(elapsed, s.run.period) + guard.time_since_sample
     is_fast = norm(moved) > guard.max_speed * time or norm(turned) > guard.max_turn_speed * time
-    if is_fast and not is_first:
+    # between a start and the first tick the device moves for an unknown time
+    is_astray = bool(guard.has_hand) and norm(moved) > FARTHEST
+    if is_astray if is_first else is_fast:
         return JUMPED
     stretch = subtract(vector_of(pose.handle_position), vector_of(pose.tool_position))
     if norm(stretch) > guard.max_stretch:
@@ -151,6 +161,7 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     guard, flags = s.guard, s.loop.external_flags
     guard.flags = 0
     is_stale = (flags & STALE_SAMPLE) != 0
+    guard.fresh += 0 if is_stale else 1
     guard.consecutive_stale = guard.consecutive_stale + 1 if is_stale else 0
     waited = guard.time_since_sample + max(elapsed, s.run.period)
     guard.time_since_sample = waited if is_stale else 0.0

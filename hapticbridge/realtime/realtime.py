@@ -199,16 +199,6 @@ FILTER = (
 """Remedy for a process whose system call filter refuses pinning; Linux itself allows it."""
 
 
-def way_to_pin(core: int, reason: int | None) -> str:
-    """Returns the remedy for a refused core.
-
-    ``reason`` is the ``errno`` of the refusal; None if the number is out of range.
-    """
-    if not 0 <= core < (os.cpu_count() or 1):
-        return f"choose a core from 0 to {(os.cpu_count() or 1) - 1}"
-    return CORES if reason == errno.EINVAL else FILTER
-
-
 def is_administrator() -> bool:
     """Returns True if the process runs as root, even if root has few rights here."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
@@ -277,18 +267,18 @@ def memory_at_rest() -> Iterator[tuple[Grant, ...]]:
 
 
 @contextmanager
-def real_time(core: int | None = None) -> Iterator[tuple[Grant, ...]]:
+def real_time() -> Iterator[tuple[Grant, ...]]:
     """Requests real time for the calling thread; undone at the end.
 
-    Threads and processes started meanwhile do not inherit the priority. Without ``core`` it takes
-    an isolated core, or else the last allowed one, because the first serves most interrupts.
+    Threads and processes started meanwhile do not inherit the priority. It takes an isolated
+    core, or else the last allowed one, because the first serves most interrupts.
 
     Yields:
         One result per request.
     """
     with ExitStack() as restore:
         # the priority comes last, so that no other request runs under it
-        yield _timer(restore), _core(restore, core), _scheduling(restore)
+        yield _timer(restore), _core(restore), _scheduling(restore)
 
 
 def current_priority() -> int:
@@ -391,20 +381,18 @@ def _timer(restore: ExitStack) -> Grant:
     return Grant(name, True, f"timer slack {TIMER_SLACK_NS} ns instead of {before * 1e-3:g} µs")
 
 
-def _core(restore: ExitStack, core: int | None) -> Grant:
+def _core(restore: ExitStack) -> Grant:
     name = "core"
     if not hasattr(os, "sched_setaffinity"):
         return Grant(name, False, f"{sys.platform} pins no thread to a core; only Linux does")
     allowed, isolated = os.sched_getaffinity(0), _isolated_cores()
-    chosen = loop_core() if core is None else core
+    chosen = loop_core()
     try:
         os.sched_setaffinity(0, {chosen})
-    except (OSError, ValueError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        sentence = (
-            f"the loop could not be pinned to core {chosen} ({reason}): migrations make ticks late"
-        )
-        return Grant(name, False, sentence, way_to_pin(chosen, getattr(error, "errno", None)))
+    except OSError as error:
+        sentence = f"the loop could not be pinned to core {chosen} ({error.strerror})"
+        remedy = CORES if error.errno == errno.EINVAL else FILTER
+        return Grant(name, False, f"{sentence}: migrations make ticks late", remedy)
     restore.callback(os.sched_setaffinity, 0, allowed)
     kind = "isolated core" if chosen in isolated else "core"
     return Grant(name, True, f"pinned to {kind} {chosen} of {len(allowed | isolated)}")

@@ -28,8 +28,9 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_with_attachments
+from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
-from hapticbridge.recording.writer import RecordingWriter, check_contents
+from hapticbridge.recording.writer import check_contents
 
 # Second reader of a run
 
@@ -81,23 +82,16 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
         rest = rows[rows["tick"] > last]
         if rest.size and int(rest["tick"][0]) != last + 1:
             return "the records after it are lost"
-        epoch = recording.meta.get(layout.EPOCH_KEY, "0")
-        writer = RecordingWriter(beside, recording.meta, attachments, int(epoch))
-        writer.write_ticks(ticks)
-        writer.write_ticks(rest)
         known = {_key(event) for event in recording.events}
         kept = [*recording.events, *(event for event in events if _key(event) not in known)]
-        for event in kept:
-            time = event.get("time_ns")
-            writer.write_event(event, time if isinstance(time, int) else 0)
-        writer.close()
+        ticks = np.concatenate([ticks, rest])
+        rewrite(recording, attachments, beside, ticks, kept)
         beside.replace(path)
     except (RecordingError, OSError, ValueError):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
         return "the records after it could not be written"
-    total = ticks.size + rest.size
-    return f"the bridge has repaired it: all {total} records are there"
+    return f"the bridge has repaired it: all {ticks.size} records are there"
 
 
 def _key(event: Mapping[str, object]) -> tuple[object, ...]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
+from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import Recording, read_recording, read_with_attachments
 from hapticbridge.recording.writer import RecordingWriter
 
@@ -31,40 +35,53 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     recording, attachments = read_with_attachments(path)
     if not recording.is_cut:
         raise RecordingError(f"{path} is not cut, so there is nothing to repair")
+    deadlines = recording.ticks["deadline_ns"][-1:].tolist()
+    made = {
+        "event": "repaired",
+        "source": path.name,
+        "ticks": int(recording.ticks.size),
+        "problems": list(recording.problems),
+        "time_ns": max([*deadlines, *map(_time, recording.events)], default=0),
+    }
+    events = [*recording.events, made]
+    rewrite(recording, attachments, output, recording.ticks, events, exclusive=True)
+    return read_recording(output)
+
+
+def rewrite(
+    recording: Recording,
+    attachments: Sequence[Attachment],
+    output: Path,
+    ticks: NDArray[np.void],
+    events: Sequence[Mapping[str, object]],
+    *,
+    exclusive: bool = False,
+) -> None:
+    """Writes a recording's metadata and attachments again, with these records and events.
+
+    Raises:
+        RecordingError: The file cannot be written, or exists and the access is ``exclusive``.
+    """
     epoch = recording.meta.get(layout.EPOCH_KEY, "")
     writer = RecordingWriter(
         output,
         recording.meta,
         attachments,
         int(epoch) if epoch.isascii() and epoch.isdigit() and len(epoch) < 20 else 0,
-        exclusive=True,
+        exclusive=exclusive,
         record=recording.record,
     )
     try:
-        _rewrite(writer, recording)
+        for start in range(0, ticks.size, _BATCH):
+            writer.write_ticks(ticks[start : start + _BATCH])
+        for event in events:
+            writer.write_event(event, _time(event))
+        writer.close()
     except RecordingError:
         output.unlink(missing_ok=True)
         raise
-    return read_recording(output)
 
 
-def _rewrite(writer: RecordingWriter, recording: Recording) -> None:
-    for start in range(0, recording.ticks.size, _BATCH):
-        writer.write_ticks(recording.ticks[start : start + _BATCH])
-    for event in recording.events:
-        writer.write_event(event, _time(event))
-    deadlines = recording.ticks["deadline_ns"][-1:].tolist()
-    last = max([*deadlines, *map(_time, recording.events)], default=0)
-    made = {
-        "event": "repaired",
-        "source": recording.path.name,
-        "ticks": int(recording.ticks.size),
-        "problems": list(recording.problems),
-    }
-    writer.write_event(made, last)
-    writer.close()
-
-
-def _time(event: dict[str, Any]) -> int:
+def _time(event: Mapping[str, object]) -> int:
     time = event.get("time_ns")
     return time if isinstance(time, int) and abs(time) < 2**63 else 0

@@ -37,15 +37,45 @@ def memory_folder() -> Path:
     return memory if usable else Path(tempfile.gettempdir())
 
 
-def created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
-    """Creates zeroed shared memory under a unique name.
+def created(content: str, size: int) -> tuple[mmap.mmap, str]:
+    """Creates zeroed shared memory of ``size`` bytes for a content in words; returns its name too.
 
-    Segments left by killed processes are removed. ``size`` is in bytes.
+    Segments left by killed processes are removed.
 
     Raises:
-        OSError: Memory is insufficient.
+        RecordingError: Memory is insufficient.
     """
-    _sweep(folder)
+    folder = memory_folder()
+    try:
+        _sweep(folder)
+        memory, path = _created(folder, size)
+    except OSError as error:
+        raise RecordingError(
+            f"no room for {content} ({size} bytes) in {folder}: {error.strerror}"
+        ) from error
+    return memory, str(path)
+
+
+def removed(name: str | None) -> None:
+    """Removes the name of shared memory, if it has one; its arrays stay valid."""
+    if name is not None:
+        with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
+            Path(name).unlink()
+
+
+_ORDER = threading.Lock()
+
+
+def fence() -> None:
+    """Orders the accesses to shared memory before and after it.
+
+    Python has no memory fence; acquiring and releasing a lock acts as one.
+    """
+    with _ORDER:
+        pass
+
+
+def _created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
     path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}"
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
@@ -148,7 +178,6 @@ class Ring:
         self.cursors = cursors
         self.name = name
         self._is_owner = is_owner
-        self._order = threading.Lock()
 
     @classmethod
     def local(cls, capacity: int) -> Ring:
@@ -171,19 +200,12 @@ class Ring:
         """
         _check_capacity(capacity)
         size = _ROWS_OFFSET + capacity * TICK_DTYPE.itemsize
-        folder = memory_folder()
-        try:
-            memory, path = created(folder, size)
-        except OSError as error:
-            raise RecordingError(
-                f"no room for a ring of {capacity} records ({size} bytes) in {folder}: "
-                f"{error.strerror}"
-            ) from error
+        memory, name = created(f"a ring of {capacity} records", size)
         header = np.frombuffer(memory, _HEADER, count=1)
         header["record_size"] = TICK_DTYPE.itemsize
         header["capacity"] = capacity
         header["magic"] = _MAGIC
-        return cls._mapped(memory, capacity, str(path), is_owner=True)
+        return cls._mapped(memory, capacity, name, is_owner=True)
 
     @classmethod
     def attach(cls, name: str) -> Ring:
@@ -226,7 +248,7 @@ class Ring:
         head = int(self.cursors[HEAD])
         taken = min(int(rows.size), self.capacity - self.pending())
         self.rows[(head + np.arange(taken)) % self.capacity] = rows[:taken]
-        self._fence()
+        fence()
         self.cursors[HEAD] = head + taken
         return taken
 
@@ -238,9 +260,9 @@ class Ring:
         """
         tail = int(self.cursors[TAIL])
         count = min(self.pending(), limit)
-        self._fence()
+        fence()
         taken = self._copy(tail, tail + count)
-        self._fence()
+        fence()
         self.cursors[TAIL] = tail + count
         return taken
 
@@ -254,10 +276,10 @@ class Ring:
             The records, oldest first.
         """
         head = int(self.cursors[HEAD])
-        self._fence()
+        fence()
         start = max(0, head - self.capacity, head - count)
         copied = self._copy(start, head)
-        self._fence()
+        fence()
         # drop the records that the producer has overwritten meanwhile
         overwritten = int(self.cursors[HEAD]) - self.capacity - start
         return copied[overwritten:] if overwritten > 0 else copied
@@ -271,11 +293,11 @@ class Ring:
             Number of the first available record, and the records, oldest first.
         """
         head = int(self.cursors[HEAD])
-        self._fence()
+        fence()
         # the oldest place of a full ring is written next
         start = max(min(number, head), head - self.capacity + 1)
         copied = self._copy(start, head)
-        self._fence()
+        fence()
         overwritten = max(int(self.cursors[HEAD]) - self.capacity + 1 - start, 0)
         return start + overwritten, copied[overwritten:]
 
@@ -286,20 +308,13 @@ class Ring:
 
     def unlink(self) -> None:
         """Removes the shared memory's name, also for an owner that died."""
-        if self.name is not None:
-            with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
-                Path(self.name).unlink()
+        removed(self.name)
 
     def _copy(self, start: int, stop: int) -> NDArray[np.void]:
         first, count = start % self.capacity, stop - start
         if first + count <= self.capacity:
             return self.rows[first : first + count].copy()
         return np.concatenate((self.rows[first:], self.rows[: first + count - self.capacity]))
-
-    def _fence(self) -> None:
-        # Python has no memory fence; acquiring and releasing a lock acts as one
-        with self._order:
-            pass
 
 
 def _check_capacity(capacity: int) -> None:

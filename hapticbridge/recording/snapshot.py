@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -13,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.recording.ring import attached, created, memory_folder
+from hapticbridge.recording.ring import attached, created, fence, removed
 
 SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
 """Indices into ``Snapshot.head``. The sequence is odd while the loop writes. The number is that
@@ -84,7 +81,7 @@ class Snapshot:
         offset = self.head.nbytes
         self.numbers = np.frombuffer(memory, np.float64, layout.itemsize // 8, offset)
         self.name = name
-        self._layout, self._is_owner, self._order = layout, is_owner, threading.Lock()
+        self._layout, self._is_owner = layout, is_owner
 
     @classmethod
     def shared(cls, model: mujoco.MjModel) -> Snapshot:
@@ -93,16 +90,8 @@ class Snapshot:
         Raises:
             RecordingError: Memory is insufficient.
         """
-        size = size_of(model)
-        folder = memory_folder()
-        try:
-            memory, path = created(folder, size)
-        except OSError as error:
-            raise RecordingError(
-                f"no room for the positions of the scene ({size} bytes) in {folder}: "
-                f"{error.strerror}"
-            ) from error
-        return cls(memory, model, str(path), is_owner=True)
+        memory, name = created("the positions of the scene", size_of(model))
+        return cls(memory, model, name, is_owner=True)
 
     @classmethod
     def attach(cls, name: str, model: mujoco.MjModel) -> Snapshot:
@@ -120,10 +109,10 @@ class Snapshot:
         """Returns the newest picture; None before the first, or if each read met a write."""
         for _ in range(_ATTEMPTS):
             sequence = int(self.head[SEQUENCE])
-            self._fence()
+            fence()
             number, count = int(self.head[NUMBER]), int(self.head[CONTACTS])
             numbers = self.numbers.copy()
-            self._fence()
+            fence()
             if sequence == 0:
                 return None
             if sequence % 2 == 0 and sequence == int(self.head[SEQUENCE]):
@@ -140,14 +129,8 @@ class Snapshot:
 
     def close(self) -> None:
         """Removes the shared memory's name if this object created it; its arrays stay valid."""
-        if self._is_owner and self.name is not None:
-            with contextlib.suppress(OSError):  # already gone, or Windows: still mapped
-                Path(self.name).unlink()
-
-    def _fence(self) -> None:
-        # Python has no memory fence; acquiring and releasing a lock acts as one
-        with self._order:
-            pass
+        if self._is_owner:
+            removed(self.name)
 
 
 def size_of(model: mujoco.MjModel) -> int:

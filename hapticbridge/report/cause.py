@@ -25,6 +25,7 @@ from hapticbridge.certificate import (
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TickFlag
 from hapticbridge.recording.reader import BLOCK
+from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.contacts import check_contacts, geom_name
 
@@ -91,13 +92,15 @@ def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
             share = _largest(partial(_holds, evidence, axis, part))
             if share:
                 value = share * getattr(evidence.requested, f"{name}{part}")
-                found.append(f"lower the {axis}{part} to {_round_down(value)} {unit}")
+                limit = _three_digits((1 + _ROUNDING) * value, math.floor)
+                found.append(f"lower the {axis}{part} to {limit} {unit}")
     period = evidence.parameters.period
     slowest = period * FASTEST
     if not is_late and evidence.info.rate is None and slowest > 1:
         share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _SETTING_UNITS)
         if share and 1 / share < slowest:
-            found.append(f"raise the rate to {_round_up(1 / (share * period))} Hz")
+            rate = _three_digits((1 - _ROUNDING) / (share * period), math.ceil)
+            found.append(f"raise the rate to {rate} Hz")
     return ", or ".join(found) or "lower stiffness and damping together"
 
 
@@ -134,17 +137,8 @@ def _largest(holds: Callable[[float], bool]) -> float:
     return low
 
 
-def _round_down(value: float) -> str:
-    """Formats a limit with three digits."""
-    return _three_digits(value * (1 + _ROUNDING), math.floor)
-
-
-def _round_up(value: float) -> str:
-    """Formats a limit with three digits."""
-    return _three_digits(value * (1 - _ROUNDING), math.ceil)
-
-
 def _three_digits(value: float, rounded: Callable[[float], int]) -> str:
+    """Formats a limit, rounded down or up."""
     digit = 10.0 ** (math.floor(math.log10(value)) - 2)
     return f"{rounded(value / digit) * digit:.6g}"
 
@@ -163,9 +157,8 @@ unit. One in fifty is jitter between two clocks."""
 def cause_at_device(evidence: Evidence, window: slice) -> Cause:
     """Returns the likely cause of unpaid energy at the device."""
     method = evidence.method
-    hazard = Cause("method", f"method '{method.name}': {method.hazard}", SAFE_METHOD)
     if not method.has_law:
-        return hazard
+        return _method_cause(method)
     conditions = run_conditions(evidence.info, evidence.worst, method)
     failing = [condition for condition in conditions if condition.holds is False]
     if found := _delay_cause(evidence, failing):
@@ -177,7 +170,11 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
         return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
     if failing:
         return _overload_cause(evidence, failing)
-    return hazard if method.hazard else _unknown_cause(evidence)
+    return _method_cause(method) if method.hazard else _unknown_cause(evidence)
+
+
+def _method_cause(method: Method, where: str = "") -> Cause:
+    return Cause("method", f"{where}method '{method.name}': {method.hazard}", SAFE_METHOD)
 
 
 def _failing_words(failing: list[DampingCondition]) -> str:
@@ -282,7 +279,9 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
         return ""
     span = slice(window.start, max(window.stop, int(np.argmax(evidence.excess)) + 1))
     gained = np.diff(evidence.excess, prepend=0.0)[span].clip(min=0.0)
-    steps = _largest_steps(evidence.ticks["device_position"], span) / info.resolution
+    position = evidence.ticks["device_position"]
+    moved = np.abs(np.diff(position, axis=0, prepend=position[:1])).max(axis=1)
+    steps = moved[span] / info.resolution
     total = float(gained.sum())
     share = float(gained[steps <= COUNTED].sum()) / total if total > 0 else 0.0
     if share < MOST or not math.isfinite(share):
@@ -293,14 +292,6 @@ def _quantisation_words(evidence: Evidence, window: slice) -> str:
         f"device's resolution ({info.resolution:g} m) or less; to hold still between steps takes a "
         f"friction of K D/2 + B_law D/T = {rub:.3g} N, the device's is {has}"
     )
-
-
-def _largest_steps(position: NDArray[np.float64], span: slice) -> NDArray[np.float64]:
-    """Returns the largest step of any axis into each tick, in m; 0 for the first tick."""
-    before = position[max(span.start - 1, 0) : span.stop]
-    steps = np.abs(np.diff(before, axis=0)).max(axis=1, initial=0.0)
-    missing = span.stop - span.start - len(steps)
-    return np.concatenate([np.zeros(missing), steps])
 
 
 # Geoms that touched while energy was created
@@ -369,11 +360,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         concern, _, remedy = concerns[0].rpartition("; write ")
         return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
-        return Cause(
-            "method",
-            f"{where}, whose setting is as recommended; method '{method.name}': {method.hazard}",
-            SAFE_METHOD,
-        )
+        return _method_cause(method, f"{where}, whose setting is as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
@@ -381,7 +368,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
     method, turned = evidence.method, _largest_turn(evidence, window)
     if method.hazard:
-        return Cause("method", f"{where}; method '{method.name}': {method.hazard}", SAFE_METHOD)
+        return _method_cause(method, f"{where}; ")
     if turned > FAST_TURN:
         return Cause(
             "rate",

@@ -18,6 +18,7 @@ from hapticbridge.audit.state import AuditState
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import printable
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.record import force_on_hand
@@ -150,11 +151,7 @@ def draw_recording(recording: Recording) -> Figure:
         is_always_implicit=was_always_implicit(ticks),
     )
     title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
-    # a control character would break the SVG
-    title = (
-        "".join(letter if letter.isprintable() else "�" for letter in title)
-        + f"\n{coupling.sentences()[0]}"
-    )
+    title = f"{printable(title)}\n{coupling.sentences()[0]}"
     figure.suptitle(title, fontsize="medium", parse_math=False)
     for axes in (force_axes, position_axes, energy_axes):
         finish(axes)

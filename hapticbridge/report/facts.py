@@ -65,7 +65,6 @@ _WITHOUT = {"rate": "the loop's", "duration": "without end"}
 """Meaning of a missing value in the data sheet; any other missing value is unknown."""
 
 _GUARD = {
-    "controller": "",
     "energy_credit_limit": "J",
     "assumed_damping": "N s/m",
     "max_damping": "N s/m",
@@ -76,6 +75,7 @@ _GUARD = {
     "has_hand": "",
     "stretch": "m",
     "angle": "rad",
+    "full_speed": "m/s",
     "speed": "m/s",
     "turn_speed": "rad/s",
     "energy": "J",
@@ -139,7 +139,7 @@ def guard_facts(evidence: Evidence) -> Facts:
     facts = [("controller", controller_of(evidence))]
     for name, unit in _GUARD.items():
         value = guarding[name]
-        if name != "controller" and value not in (0, math.inf):
+        if value not in (0, math.inf):
             facts.append((_with_spaces(name), _format_value(value, unit)))
     return facts
 

@@ -116,13 +116,13 @@ def draw_moment(evidence: Evidence, report: AuditReport) -> Figure:
     label = "given to the device, unpaid" if report.port == "device" else "created in the scene"
     bounded(energy, numbers, judged[around], allowed[around], label)
     stretch = evidence.ticks["handle_position"] - evidence.ticks["tool_position"]
-    forces = force_on_hand(evidence.ticks, evidence.parameters.axes)
-    if evidence.info.is_prescribed:
-        forces = evidence.ticks["wrench_on_tool"][:, :3]
+    is_held = not evidence.info.is_prescribed
+    forces = evidence.ticks["wrench_on_tool"][:, :3]
+    if is_held:
+        forces = force_on_hand(evidence.ticks, evidence.parameters.axes)
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
         force.plot(numbers, forces[around, i], color=colour, marker=".", ms=3, lw=1, label=axis)
         apart.plot(numbers, 1e3 * stretch[around, i], color=colour, lw=1, label=axis)
-    is_held = not evidence.info.is_prescribed
     force.set_ylabel("force on\nthe hand (N)" if is_held else "force on\nthe tool (N)")
     apart.set_ylabel("spring: handle\n− tool (mm)")
     for axes in (energy, force, apart):

@@ -24,7 +24,6 @@ from hapticbridge.theory.impact import Impact as Impact
 from hapticbridge.theory.impact import ImpactBody as ImpactBody
 from hapticbridge.theory.impact import Mode as Mode
 from hapticbridge.theory.impact import resolve_impact as resolve_impact
-from hapticbridge.theory.rigid_body import CoupledMotion as CoupledMotion
 from hapticbridge.theory.rigid_body import ParticleMotion as ParticleMotion
 from hapticbridge.theory.rigid_body import Rotation as Rotation
 from hapticbridge.theory.rigid_body import drive_mass as drive_mass

@@ -36,7 +36,6 @@ def worst_frequency(
     discretization: Discretization = "backward",
     delay: int = 0,
     filter_time: float = 0.0,
-    axis: Axis = "translation",
 ) -> float | NDArray[np.float64]:
     """Returns the frequency at which ``damping_spectrum`` reaches its supremum.
 
@@ -50,7 +49,7 @@ def worst_frequency(
         is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
         is flat at its top. Of several equal maxima any one.
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time)
     k, b, period, samples, tau, is_ringing = law
     if samples == 0:
         return plain(np.full(k.shape, np.pi / period))

@@ -53,11 +53,7 @@ def law_damping(stiffness: float, effective: float, period: float, share: float)
     K, B and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
     raised.
     """
-    stiffness, effective = (
-        scalar("stiffness", stiffness, "N/m"),
-        scalar("damping", effective, "N s/m"),
-    )
-    return max(effective - scalar("share", share, "") * stiffness * _period(period), 0.0)
+    return max(scalar("damping", effective, "N s/m") - _added(stiffness, period, share), 0.0)
 
 
 def effective_damping(stiffness: float, damping: float, period: float, share: float) -> float:
@@ -66,8 +62,7 @@ def effective_damping(stiffness: float, damping: float, period: float, share: fl
     K, B' and λ must be finite and >= 0, the integration period T > 0; otherwise CouplingError is
     raised.
     """
-    stiffness, damping = scalar("stiffness", stiffness, "N/m"), scalar("damping", damping, "N s/m")
-    return damping + scalar("share", share, "") * stiffness * _period(period)
+    return scalar("damping", damping, "N s/m") + _added(stiffness, period, share)
 
 
 def largest_effective_damping(
@@ -84,6 +79,10 @@ def largest_effective_damping(
     if per_tick > 2 * available:
         return 0.0
     return available + (scalar("share", share, "") - 0.5) * per_tick
+
+
+def _added(stiffness: float, period: float, share: float) -> float:
+    return scalar("share", share) * scalar("stiffness", stiffness, "N/m") * _period(period)
 
 
 def _period(period: float) -> float:

@@ -13,35 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import CouplingError
 from hapticbridge.theory.transfer import checked, delayed_by, plain, scalar, single, together
 
 # Stiffness limits from position resolution and Coulomb friction
 
 Region = Literal["passive", "locally stable", "bounded limit cycle", "unstable"]
 """Regions of (β, σ) after Diolaiti et al. 2006."""
-
-
-class Mechanism(Protocol):
-    """Mechanics and encoder of one device axis, as the quantization limit requires them."""
-
-    @property
-    def damping(self) -> float | None:
-        """Physical damping b in N s/m."""
-
-    @property
-    def friction(self) -> float | None:
-        """Coulomb friction f_c in N."""
-
-    @property
-    def resolution(self) -> float | None:
-        """Position quantum Δ in m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +50,9 @@ class QuantizationLimit:
     friction_needed: float
 
 
-def quantization_limit(device: Mechanism, coupling: Coupling, period: float) -> QuantizationLimit:
+def quantization_limit(
+    damping: float, friction: float, resolution: float, coupling: Coupling, period: float
+) -> QuantizationLimit:
     """Returns the stiffness that friction and resolution allow, and the region of a coupling.
 
         K <= min( 2(b − B)/T,  2(f_c/Δ − B/T) ),      f_c >= K Δ/2 + B Δ/T
@@ -75,30 +60,25 @@ def quantization_limit(device: Mechanism, coupling: Coupling, period: float) -> 
     Friction sets a line of its own, because motion over one quantum may be arbitrarily slow.
 
     Args:
-        device: Damping, friction and resolution of one axis, none of them None.
+        damping: Damping b of one axis of the device in N s/m, >= 0.
+        friction: Its Coulomb friction f_c in N, >= 0.
+        resolution: Its position quantum Δ in m, >= 0.
         coupling: K and B in translation.
         period: T in s, finite and > 0.
 
     Raises:
-        CouplingError: A value is unknown, not finite or out of range.
+        CouplingError: A value is not finite or out of range.
 
     References:
         Abbott & Okamura 2005 (friction and damping bounds); Diolaiti et al. 2006 (regions).
     """
     period = scalar("period", period, "s", positive=True)
-    values = []
-    for name, value, unit in (
-        ("damping", getattr(device, "damping", None), "N s/m"),
-        ("friction", getattr(device, "friction", None), "N"),
-        ("resolution", getattr(device, "resolution", None), "m"),
-    ):
-        if value is None:
-            raise CouplingError(f"device {name} is not known; give it in {unit}")
-        values.append(scalar(f"device {name}", value, unit))
-    b, friction, quantum = values
-    k, damping = single(coupling)
-    by_damping = 2 * (b - damping) / period
-    by_friction = 2 * (friction / quantum - damping / period) if quantum else float("inf")
+    b = scalar("device damping", damping, "N s/m")
+    friction = scalar("device friction", friction, "N")
+    quantum = scalar("device resolution", resolution, "m")
+    k, law_damping = single(coupling)
+    by_damping = 2 * (b - law_damping) / period
+    by_friction = 2 * (friction / quantum - law_damping / period) if quantum else float("inf")
     beta = b / (k * period)
     sigma = friction / (k * quantum) if quantum else float("inf")
     region: Region
@@ -112,7 +92,7 @@ def quantization_limit(device: Mechanism, coupling: Coupling, period: float) -> 
         beta=beta,
         sigma=sigma,
         region=region,
-        friction_needed=k * quantum / 2 + damping * quantum / period,
+        friction_needed=k * quantum / 2 + law_damping * quantum / period,
     )
 
 

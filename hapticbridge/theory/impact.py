@@ -1,4 +1,4 @@
-"""Planar impact of one or two rigid bodies with Coulomb friction, after Routh."""
+"""Planar impact of a rigid body on the ground with Coulomb friction, after Routh."""
 
 from __future__ import annotations
 
@@ -115,10 +115,8 @@ class ImpactBody:
         arm = CHECK.numbers("arm", self.arm, "m")
         if arm.shape[-1:] != (2,):
             raise MechanicsError(f"arm has shape {arm.shape}; it must be (..., 2): r_t, r_n in m")
-        mass, inertia = (
-            CHECK.numbers("mass", self.mass, "kg", least=0, is_open=True),
-            CHECK.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True),
-        )
+        mass = CHECK.numbers("mass", self.mass, "kg", least=0, is_open=True)
+        inertia = CHECK.numbers("inertia", self.inertia, "kg m²", least=0, is_open=True)
         CHECK.shape(mass=mass, inertia=inertia, arm=arm[..., 0])
         object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "inertia", inertia)
@@ -163,7 +161,7 @@ class Impact:
     """Outcome of an impact, in the contact frame.
 
     Attributes:
-        impulse: (P_t, P_n) on the first body in N s, shape (..., 2); the second receives −P.
+        impulse: (P_t, P_n) on the body in N s, shape (..., 2).
         velocity: Relative velocity (v_t, v_n) at the contact after the impact in m/s, shape (...,
             2).
         compression: P_n at the end of compression in N s, shape (...).
@@ -184,9 +182,8 @@ def resolve_impact(
     friction: ArrayLike,
     restitution: ArrayLike,
     law: Law = "stronge",
-    other: ImpactBody | None = None,
 ) -> Impact:
-    """Returns the impact of two bodies, or of a body and the ground, at one point.
+    """Returns the impact of a body on the ground, at one point.
 
     As the normal impulse P_n grows, with s = sgn(v_t⁻), Routh's path is
 
@@ -200,21 +197,20 @@ def resolve_impact(
         poisson    P_n = (1 + e) P_c
         stronge    work of P_n after P_c = −e² · work until P_c
 
-    In a jam (D + μsG <= 0) sliding drives the bodies together. The path then continues through P_s,
-    where the jam always ends. Poisson and Stronge never gain energy. Newton gains energy in about 1
-    % of random impacts and is included for comparison.
+    In a jam (D + μsG <= 0) sliding drives the body into the ground. The path then continues through
+    P_s, where the jam always ends. Poisson and Stronge never gain energy. Newton gains energy in
+    about 1 % of random impacts and is included for comparison.
 
     Valid for one contact point, no change of pose during the impact, and dry friction with one
     coefficient.
 
     Args:
-        body: The first body; n points into it.
-        velocity: Relative velocity (v_t, v_n) of the contact points, first minus second, in m/s,
-            shape (..., 2), approaching: v_n < 0.
+        body: The body; n points into it.
+        velocity: Velocity (v_t, v_n) of the contact point in m/s, shape (..., 2), approaching:
+            v_n < 0.
         friction: μ, finite and >= 0, shape (...).
         restitution: e in [0, 1], shape (...).
         law: One of ``LAWS``.
-        other: The second body, its arm from its own centre of mass; None for the ground.
 
     Raises:
         MechanicsError: An argument is not finite, out of range or mis-shaped, or the arguments
@@ -236,14 +232,10 @@ def resolve_impact(
         )
     mu = CHECK.numbers("friction", friction, "(no unit)", least=0)
     e = CHECK.numbers("restitution", restitution, "(no unit)", least=0, most=1)
-    for name, one in (("body", body), ("other", other)):
-        if not isinstance(one, ImpactBody) and not (name == "other" and one is None):
-            raise MechanicsError(f"{name} is {shown(one)}; it must be an ImpactBody")
+    if not isinstance(body, ImpactBody):
+        raise MechanicsError(f"body is {shown(body)}; it must be an ImpactBody")
     a, d, g = body.compliance()
-    if other is not None:
-        CHECK.shape(body=a, other=other.compliance()[0])
-        a, d, g = (left + right for left, right in zip((a, d, g), other.compliance(), strict=True))
-    CHECK.shape(bodies=a, velocity=v_t, friction=mu, restitution=e)
+    CHECK.shape(body=a, velocity=v_t, friction=mu, restitution=e)
 
     # overflow is refused below, and results of a division by zero are not used
     with np.errstate(all="ignore"):
@@ -257,7 +249,7 @@ def resolve_impact(
         first = d + mu * side * g  # dv_n/dP_n while sliding
         # dv_n/dP_n afterwards: D − G²/A = (A D − G²)/A, plus a term for sliding back. Both terms
         # are >= 0, so nothing cancels.
-        second = _determinant(body, other) / a
+        second = _determinant(body) / a
         second = second + np.where(sticks, 0.0, np.abs(g) * (np.abs(g) / a - mu))
         path = NormalPath(v_n, first, second, slide_end)
 
@@ -286,18 +278,7 @@ def resolve_impact(
     return Impact(impulse, after, compression, energy, mode.astype(np.int8))
 
 
-def _determinant(body: ImpactBody, other: ImpactBody | None) -> Array:
-    """Returns A D − G² in 1/kg² without cancellation; it is > 0 for every pair of bodies."""
-    bodies = [body] if other is None else [body, other]
-    masses, inertias, arms = (
-        [np.asarray(getattr(one, name)) for one in bodies] for name in ("mass", "inertia", "arm")
-    )
-    free = sum(1 / mass for mass in masses)
-    turning = sum(
-        (arm**2).sum(axis=-1) / inertia for arm, inertia in zip(arms, inertias, strict=True)
-    )
-    determinant = free**2 + free * turning
-    if other is not None:
-        across = arms[0][..., 0] * arms[1][..., 1] - arms[0][..., 1] * arms[1][..., 0]
-        determinant = determinant + across**2 / inertias[0] / inertias[1]
-    return np.asarray(determinant)
+def _determinant(body: ImpactBody) -> Array:
+    """Returns A D − G² in 1/kg² without cancellation; it is > 0 for every body."""
+    mass, inertia, arm = (np.asarray(a) for a in (body.mass, body.inertia, body.arm))
+    return np.asarray((1 / mass + (arm**2).sum(axis=-1) / inertia) / mass)

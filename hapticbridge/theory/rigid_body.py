@@ -12,7 +12,21 @@ from hapticbridge.arguments import LARGEST, Arguments, Array
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import MechanicsError
 from hapticbridge.jit import compiled
-from hapticbridge.pose import Quaternion, Vector, cross, norm, product, quaternion_exp, scaled
+from hapticbridge.pose import (
+    Vector,
+    add,
+    cross,
+    dot,
+    norm,
+    product,
+    quaternion_exp,
+    quaternion_of,
+    scaled,
+    store_quaternion,
+    store_vector,
+    subtract,
+    vector_of,
+)
 from hapticbridge.theory.transfer import spring_and_damper
 
 MAX_STEPS = 10**8
@@ -80,10 +94,9 @@ def integrate_particle(
     period: float,
     rule: StepRule,
     *,
-    position: ArrayLike = 0.0,
     velocity: ArrayLike = 0.0,
 ) -> ParticleMotion:
-    """Moves a point mass through a force sequence.
+    """Moves a point mass from the origin through a force sequence.
 
         explicit        v_k = v_{k−1} + (T/m) f_{k−1},   x_k = x_{k−1} + T v_{k−1}           (17)
         semi_implicit   v_k = v_{k−1} + (T/m) f_{k−1},   x_k = x_{k−1} + T v_k
@@ -98,7 +111,6 @@ def integrate_particle(
         force: f_0 … f_N in N, finite, time first: shape (N + 1, ...), N >= 1.
         period: T in s, finite and > 0.
         rule: One of ``STEP_RULES``.
-        position: x_0 in m, shape (...).
         velocity: v_0 in m/s, shape (...).
 
     Raises:
@@ -108,25 +120,20 @@ def integrate_particle(
         Brown & Colgate 1997, eqs. (15), (17).
     """
     CHECK.one_of("rule", rule, STEP_RULES)
-    mass, period = (
-        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
-        CHECK.number("period", period, "s", least=0, is_open=True),
-    )
-    position, velocity = (
-        CHECK.numbers("position", position, "m"),
-        CHECK.numbers("velocity", velocity, "m/s"),
-    )
+    mass = CHECK.numbers("mass", mass, "kg", least=0, is_open=True)
+    period = CHECK.number("period", period, "s", least=0, is_open=True)
+    velocity = CHECK.numbers("velocity", velocity, "m/s")
     force = CHECK.numbers("force", force, "N")
     if force.ndim == 0 or len(force) < 2:
         raise MechanicsError(f"force has shape {force.shape}; it must be (N + 1, ...) with N >= 1")
-    shape = CHECK.shape(mass=mass, force=force[0], position=position, velocity=velocity)
+    shape = CHECK.shape(mass=mass, force=force[0], velocity=velocity)
     acting = force[1:] if rule in {"implicit", "midpoint"} else force[:-1]
     gained = np.cumsum(period / mass * acting, axis=0)
     v = np.empty((len(force), *shape))
     v[0], v[1:] = velocity, velocity + gained
     mover = {"explicit": v[:-1], "midpoint": (v[:-1] + v[1:]) / 2}.get(rule, v[1:])
-    x = np.empty_like(v)
-    x[0], x[1:] = position, position + period * np.cumsum(mover, axis=0)
+    x = np.zeros_like(v)
+    x[1:] = period * np.cumsum(mover, axis=0)
     return ParticleMotion(mass, np.broadcast_to(force, v.shape), x, v)
 
 
@@ -136,28 +143,18 @@ CoupledStepRule = Literal["held", "implicit", "compensated", "midpoint"]
 COUPLED_STEP_RULES = ("held", "implicit", "compensated", "midpoint")
 
 
-class CoupledMotion(ParticleMotion):
-    """Motion of a mass behind a coupling at the samples 0 … N.
-
-    ``force`` acts on the mass; the device receives −f_k. f_0 acts only in the ``held`` rule.
-    ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})² under ``implicit`` and
-    ``compensated``.
-    """
-
-    __slots__ = ()
-
-
 def drive_mass(
     coupling: Coupling,
     mass: ArrayLike,
     handle: ArrayLike,
     period: float,
     rule: CoupledStepRule,
-    *,
-    position: ArrayLike | None = None,
-    velocity: ArrayLike = 0.0,
-) -> CoupledMotion:
-    """Moves a free mass by the translational coupling to a handle with prescribed motion.
+) -> ParticleMotion:
+    """Moves a free mass, at first at rest at h_0, by the coupling to a handle with given motion.
+
+    In the result ``force`` acts on the mass; the device receives −f_k. f_0 acts only in the rule
+    ``held``. ``energy_gain`` is 0 under ``midpoint``, and −½ m (v_k − v_{k−1})² under ``implicit``
+    and ``compensated``.
 
     With e = h − x and M for the mass:
 
@@ -190,8 +187,6 @@ def drive_mass(
         handle: h_0 … h_N in m, finite, time first: shape (N + 1, ...), N >= 1.
         period: T in s, finite and > 0.
         rule: One of ``COUPLED_STEP_RULES``.
-        position: x_0 in m, shape (...); h_0 by default.
-        velocity: v_0 in m/s, shape (...).
 
     Raises:
         MechanicsError: An argument is not finite, out of range or mis-shaped.
@@ -201,22 +196,17 @@ def drive_mass(
         interactive simulation using passive midpoint integration", Int. J. Robotics Research 36.
     """
     CHECK.one_of("rule", rule, COUPLED_STEP_RULES)
-    mass, period = (
-        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
-        CHECK.number("period", period, "s", least=0, is_open=True),
-    )
+    mass = CHECK.numbers("mass", mass, "kg", least=0, is_open=True)
+    period = CHECK.number("period", period, "s", least=0, is_open=True)
     h = CHECK.numbers("handle position", handle, "m")
     if h.ndim == 0 or len(h) < 2:
         raise MechanicsError(f"handle has shape {h.shape}; it must be (N + 1, ...) with N >= 1")
-    start = h[0] if position is None else CHECK.numbers("position", position, "m")
-    velocity = CHECK.numbers("velocity", velocity, "m/s")
     k, b = spring_and_damper(coupling)
-    shape = CHECK.shape(mass=mass, handle=h[0], position=start, velocity=velocity, coupling=k + b)
+    shape = CHECK.shape(mass=mass, handle=h[0], coupling=k + b)
     if rule == "compensated":
         b = np.maximum(b - k * period, 0)
-    f, x, v = (np.empty((len(h), *shape)) for _ in range(3))
-    x[0], v[0] = start, velocity
-    f[0] = k * (h[0] - x[0])
+    f, x, v = np.zeros((3, len(h), *shape))
+    x[0] = h[0]
     # weight of the step's end in the spring's mean stretch
     end_weight = 0.5 if rule == "midpoint" else 1.0
     # f = idle − loss · (x_k − x_{k−1})/T, with idle the force on a mass that stays where it is
@@ -236,7 +226,7 @@ def drive_mass(
                 mean = v[i]
             x[i] = x[i - 1] + period * mean
             f[i] = idle - loss * mean
-    return CoupledMotion(mass, f, x, v)
+    return ParticleMotion(mass, f, x, v)
 
 
 def exact_mass_response(
@@ -249,10 +239,8 @@ def exact_mass_response(
     Mass in kg and frequency in Hz must be finite and > 0, and broadcast; otherwise MechanicsError
     is raised. At the resonance of an undamped mass X/H is inf.
     """
-    mass, frequency = (
-        CHECK.numbers("mass", mass, "kg", least=0, is_open=True),
-        CHECK.numbers("frequency", frequency, "Hz", least=0, is_open=True),
-    )
+    mass = CHECK.numbers("mass", mass, "kg", least=0, is_open=True)
+    frequency = CHECK.numbers("frequency", frequency, "Hz", least=0, is_open=True)
     CHECK.shape(mass=mass, frequency=frequency)
     omega = 2 * np.pi * frequency
     stiffness, damping = spring_and_damper(coupling)
@@ -275,12 +263,12 @@ exceeds it counts as too long."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rotation:
-    """Rotation of a rigid body at the samples 0 … N.
+    """Free rotation of a rigid body at the samples 0 … N.
 
     Attributes:
-        inertia: Principal moments in kg m², shape (..., 3).
-        angular_velocity: ω_k in the body's principal frame in rad/s, shape (N + 1, ..., 3).
-        orientation: q_k, body to world, (w, x, y, z), shape (N + 1, ..., 4).
+        inertia: Principal moments in kg m², shape (3,).
+        angular_velocity: ω_k in the body's principal frame in rad/s, shape (N + 1, 3).
+        orientation: q_k, body to world, (w, x, y, z), shape (N + 1, 4).
     """
 
     inertia: Array
@@ -289,50 +277,42 @@ class Rotation:
 
     @property
     def kinetic_energy(self) -> Array:
-        """½ ωᵀ I ω in J, shape (N + 1, ...)."""
-        return np.asarray(0.5 * np.sum(self.inertia * self.angular_velocity**2, axis=-1))
+        """½ ωᵀ I ω in J, shape (N + 1,)."""
+        return np.asarray(0.5 * self.angular_velocity**2 @ self.inertia)
 
     @property
     def angular_momentum(self) -> Array:
-        """R I ω in the world frame in kg m²/s, shape (N + 1, ..., 3)."""
+        """R I ω in the world frame in kg m²/s, shape (N + 1, 3)."""
         local = self.inertia * self.angular_velocity
-        w, u = self.orientation[..., :1], self.orientation[..., 1:]
+        w, u = self.orientation[:, :1], self.orientation[:, 1:]
         t = 2 * np.cross(u, local)
         return np.asarray(local + w * t + np.cross(u, t))
 
 
 def integrate_rotation(
-    inertia: ArrayLike,
-    angular_velocity: ArrayLike,
-    period: float,
-    steps: int,
-    rule: StepRule,
-    *,
-    torque: ArrayLike | None = None,
+    inertia: ArrayLike, angular_velocity: ArrayLike, period: float, steps: int, rule: StepRule
 ) -> Rotation:
-    """Turns a rigid body, free or under a torque in its own frame.
+    """Turns a free rigid body.
 
-    With a(ω, τ) = I⁻¹(τ − ω × Iω) and ω̄ = (ω_{k−1} + ω_k)/2:
+    With a(ω) = −I⁻¹(ω × Iω) and ω̄ = (ω_{k−1} + ω_k)/2:
 
-        explicit        ω_k = ω_{k−1} + T a(ω_{k−1}, τ_{k−1}),   q_k = q_{k−1} ⊗ exp(T ω_{k−1})
-        semi_implicit   ω_k as for explicit,                     q_k = q_{k−1} ⊗ exp(T ω_k)
-        implicit        ω_k = ω_{k−1} + T a(ω_k, τ_k),           q_k = q_{k−1} ⊗ exp(T ω_k)
-        midpoint        ω_k = ω_{k−1} + T a(ω̄, τ_k),             q_k = q_{k−1} ⊗ cay(T ω̄)
+        explicit        ω_k = ω_{k−1} + T a(ω_{k−1}),   q_k = q_{k−1} ⊗ exp(T ω_{k−1})
+        semi_implicit   ω_k as for explicit,            q_k = q_{k−1} ⊗ exp(T ω_k)
+        implicit        ω_k = ω_{k−1} + T a(ω_k),       q_k = q_{k−1} ⊗ exp(T ω_k)
+        midpoint        ω_k = ω_{k−1} + T a(ω̄),         q_k = q_{k−1} ⊗ cay(T ω̄)
 
-    cay is the Cayley map, rotation by 2 atan(|Tω̄|/2). Without torque ``explicit`` and
-    ``semi_implicit`` gain ½ T² aᵀ I a in every step, and ``implicit`` loses it. ``midpoint``
-    conserves the energy, and the momentum in the world frame, up to rounding. Under torque
-    ``midpoint`` gains precisely T τ_k · ω̄. Above T |ω| of about 1 rad per sample the implicit
+    cay is the Cayley map, rotation by 2 atan(|Tω̄|/2). ``explicit`` and ``semi_implicit`` gain ½ T²
+    aᵀ I a in every step, and ``implicit`` loses it. ``midpoint`` conserves the energy, and the
+    momentum in the world frame, up to rounding. Above T |ω| of about 1 rad per sample the implicit
     rules are inaccurate and Newton's method may fail, which raises an error.
 
     Args:
         inertia: Principal moments in kg m², finite, > 0, none larger than the sum of the other two,
-            shape (..., 3).
-        angular_velocity: ω_0 in the body's frame in rad/s, shape (..., 3).
+            shape (3,).
+        angular_velocity: ω_0 in the body's frame in rad/s, shape (3,).
         period: T in s, finite and > 0.
         steps: N >= 1.
         rule: One of ``STEP_RULES``.
-        torque: τ_0 … τ_N in the body's frame in N m, shape (N + 1, ..., 3); none by default.
 
     Raises:
         MechanicsError: An argument is not finite, out of range or mis-shaped, or a step is too long
@@ -343,113 +323,73 @@ def integrate_rotation(
         are Brown & Colgate's rules (15), (17) applied to Euler's equations.
     """
     CHECK.one_of("rule", rule, STEP_RULES)
-    inertia, period = (
-        CHECK.numbers("inertia", inertia, "kg m²", least=0, is_open=True),
-        CHECK.number("period", period, "s", least=0, is_open=True),
-    )
+    inertia = CHECK.numbers("inertia", inertia, "kg m²", least=0, is_open=True)
+    period = CHECK.number("period", period, "s", least=0, is_open=True)
     omega = CHECK.numbers("angular velocity", angular_velocity, "rad/s")
     steps = CHECK.whole("steps", steps, least=1, most=MAX_STEPS)
-    tau = np.zeros((steps + 1, 3)) if torque is None else CHECK.numbers("torque", torque, "N m")
-    if len(np.atleast_1d(tau)) != steps + 1:
-        raise MechanicsError(f"torque has shape {tau.shape}; it must be ({steps + 1}, ..., 3)")
-    for name, array in (("inertia", inertia), ("angular velocity", omega), ("torque", tau[0])):
-        if array.shape[-1:] != (3,):
-            raise MechanicsError(f"{name} has shape {array.shape}; it must be (..., 3)")
+    for name, array in (("inertia", inertia), ("angular velocity", omega)):
+        if array.shape != (3,):
+            raise MechanicsError(f"{name} has shape {array.shape}; it must be (3,)")
     # 1e-12 admits a flat body, whose largest moment equals the sum of the others up to rounding
-    if np.any(2 * inertia.max(axis=-1) > inertia.sum(axis=-1) * (1 + 1e-12)):
+    if 2 * inertia.max() > inertia.sum() * (1 + 1e-12):
         raise MechanicsError(
             "a principal moment exceeds the sum of the other two, which no rigid body has; "
             "correct the moments of inertia"
         )
-    shape = CHECK.shape(inertia=inertia, angular_velocity=omega, torque=tau[0])
-    tau = tau.reshape(len(tau), *(1,) * (len(shape) + 1 - tau.ndim), *tau.shape[1:])
-    rates = np.empty((steps + 1, *shape))
-    turns = np.empty((steps + 1, *shape[:-1], 4))
+    rates, turns = np.empty((steps + 1, 3)), np.empty((steps + 1, 4))
     rates[0], turns[0] = omega, (1.0, 0.0, 0.0, 0.0)
-    _integrate(
-        np.ascontiguousarray(np.broadcast_to(inertia, shape)).reshape(-1, 3),
-        np.ascontiguousarray(np.broadcast_to(tau, rates.shape)).reshape(steps + 1, -1, 3),
-        period,
-        STEP_RULES.index(rule),
-        rates.reshape(steps + 1, -1, 3),
-        turns.reshape(steps + 1, -1, 4),
-    )
+    _integrate(inertia, period, STEP_RULES.index(rule), rates, turns)
     # beyond this limit the energy would overflow
     if not (np.abs(rates).max() <= LARGEST**3 and np.isfinite(turns).all()):
-        turn = period * float(np.max(np.linalg.norm(omega, axis=-1)))
         raise MechanicsError(
-            f"the {rule} step has no finite solution: it began with {turn:g} rad per sample; "
-            "shorten the period"
+            f"the {rule} step has no finite solution: it began with "
+            f"{period * float(np.linalg.norm(omega)):g} rad per sample; shorten the period"
         )
     return Rotation(inertia, rates, turns)
 
 
 @compiled
-def _gyroscopic(inertia: Vector, omega: Vector) -> Vector:
-    momentum = (inertia[0] * omega[0], inertia[1] * omega[1], inertia[2] * omega[2])
-    return cross(omega, momentum)
-
-
-@compiled
-def _implicit_rate(inertia: Vector, before: Vector, torque: Vector, period: float) -> Vector:
-    """Solves I(ω − before) + T (ω × Iω − τ) = 0 by Newton's method; nan if it fails."""
+def _implicit_rate(inertia: Vector, before: Vector, period: float) -> Vector:
+    """Solves I(ω − before) + T ω × Iω = 0 by Newton's method; nan if it fails."""
     i0, i1, i2 = inertia
     # (ω × Iω)_x = p ω_y ω_z, and so on around
     p, q, r = period * (i2 - i1), period * (i0 - i2), period * (i1 - i0)
     x, y, z = before
     for _ in range(ITERATIONS):
-        fx = i0 * (x - before[0]) + p * y * z - period * torque[0]
-        fy = i1 * (y - before[1]) + q * z * x - period * torque[1]
-        fz = i2 * (z - before[2]) + r * x * y - period * torque[2]
+        fx = i0 * (x - before[0]) + p * y * z
+        fy = i1 * (y - before[1]) + q * z * x
+        fz = i2 * (z - before[2]) + r * x * y
         first, second, third = (i0, p * z, p * y), (q * z, i1, q * x), (r * y, r * x, i2)
         c0, c1, c2 = cross(second, third), cross(third, first), cross(first, second)
-        determinant = first[0] * c0[0] + first[1] * c0[1] + first[2] * c0[2]
-        dx = (c0[0] * fx + c1[0] * fy + c2[0] * fz) / determinant
-        dy = (c0[1] * fx + c1[1] * fy + c2[1] * fz) / determinant
-        dz = (c0[2] * fx + c1[2] * fy + c2[2] * fz) / determinant
-        x, y, z = x - dx, y - dy, z - dz
-        if norm((dx, dy, dz)) <= TOLERANCE * norm((x, y, z)):
+        sums = add(add(scaled(fx, c0), scaled(fy, c1)), scaled(fz, c2))
+        step = scaled(1.0 / dot(first, c0), sums)
+        x, y, z = x - step[0], y - step[1], z - step[2]
+        if norm(step) <= TOLERANCE * norm((x, y, z)):
             return x, y, z
     return np.nan, np.nan, np.nan
 
 
 @compiled
-def _turned(q: Quaternion, turn: Quaternion) -> Quaternion:
-    """Returns q ⊗ turn, normalised so that rounding does not let the length drift."""
-    w, x, y, z = product(q, turn)
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    return w / length, x / length, y / length, z / length
-
-
-@compiled
-def _integrate(
-    inertia: Array, torque: Array, period: float, rule: int, rates: Array, turns: Array
-) -> None:
-    """Fills rates (N + 1, n, 3) and turns (N + 1, n, 4) from their first rows."""
-    for j in range(inertia.shape[0]):
-        moments = (inertia[j, 0], inertia[j, 1], inertia[j, 2])
-        omega = (rates[0, j, 0], rates[0, j, 1], rates[0, j, 2])
-        q = (turns[0, j, 0], turns[0, j, 1], turns[0, j, 2], turns[0, j, 3])
-        for k in range(1, rates.shape[0]):
-            i = k - 1 if rule <= 1 else k
-            tau = (torque[i, j, 0], torque[i, j, 1], torque[i, j, 2])
-            old = omega
-            if rule <= 1:
-                g = _gyroscopic(moments, old)
-                omega = (
-                    old[0] + period * (tau[0] - g[0]) / moments[0],
-                    old[1] + period * (tau[1] - g[1]) / moments[1],
-                    old[2] + period * (tau[2] - g[2]) / moments[2],
-                )
-                turn = quaternion_exp(scaled(period, old if rule == 0 else omega))
-            elif rule == 2:
-                omega = _implicit_rate(moments, old, tau, period)
-                turn = quaternion_exp(scaled(period, omega))
-            else:
-                # the midpoint rule is an implicit half step, extrapolated to the end
-                m = _implicit_rate(moments, old, tau, period / 2)
-                omega = (2 * m[0] - old[0], 2 * m[1] - old[1], 2 * m[2] - old[2])
-                turn = (1.0, period / 2 * m[0], period / 2 * m[1], period / 2 * m[2])
-            q = _turned(q, turn)
-            rates[k, j, 0], rates[k, j, 1], rates[k, j, 2] = omega
-            turns[k, j, 0], turns[k, j, 1], turns[k, j, 2], turns[k, j, 3] = q
+def _integrate(inertia: Array, period: float, rule: int, rates: Array, turns: Array) -> None:
+    """Fills rates (N + 1, 3) and turns (N + 1, 4) from their first rows."""
+    moments, omega, q = vector_of(inertia), vector_of(rates[0]), quaternion_of(turns[0])
+    for k in range(1, rates.shape[0]):
+        old = omega
+        if rule <= 1:
+            g = cross(old, (moments[0] * old[0], moments[1] * old[1], moments[2] * old[2]))
+            rate = (g[0] / moments[0], g[1] / moments[1], g[2] / moments[2])
+            omega = subtract(old, scaled(period, rate))
+            turn = quaternion_exp(scaled(period, old if rule == 0 else omega))
+        elif rule == 2:
+            omega = _implicit_rate(moments, old, period)
+            turn = quaternion_exp(scaled(period, omega))
+        else:
+            # the midpoint rule is an implicit half step, extrapolated to the end
+            m = _implicit_rate(moments, old, period / 2)
+            omega = subtract(scaled(2.0, m), old)
+            turn = (1.0, period / 2 * m[0], period / 2 * m[1], period / 2 * m[2])
+        w, x, y, z = product(q, turn)
+        length = np.sqrt(w * w + x * x + y * y + z * z)  # rounding must not let it drift
+        q = w / length, x / length, y / length, z / length
+        store_vector(rates[k], omega)
+        store_quaternion(turns[k], q)

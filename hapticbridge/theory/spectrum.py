@@ -8,7 +8,7 @@ frequency.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,6 @@ from hapticbridge.arguments import LARGEST, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.transfer import (
-    Axis,
     CouplingGrid,
     Discretization,
     SampledLaw,
@@ -26,10 +25,6 @@ from hapticbridge.theory.transfer import (
     plain,
     scalar,
 )
-
-if TYPE_CHECKING:
-    from scipy import signal
-
 
 Transfer = Callable[[NDArray[np.complex128]], Any]
 """Transfer function of z, from the handle's position in m to the force in N."""
@@ -74,7 +69,6 @@ def damping_spectrum(
     discretization: Discretization = "backward",
     delay: int = 0,
     filter_time: float = 0.0,
-    axis: Axis = "translation",
 ) -> NDArray[np.float64]:
     """Returns the device damping that a coupling requires at each frequency.
 
@@ -87,13 +81,13 @@ def damping_spectrum(
     negative.
 
     Returns:
-        b in N s/m (rotation: N m s/rad), shape S + F for couplings of shape S and frequencies ω in
+        b in N s/m, shape S + F for couplings of shape S and frequencies ω in
         rad/s of shape F; inf where none suffices.
 
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    law = SampledLaw.of(coupling, period, discretization, delay, filter_time)
     period, delay, filter_time = law.period, law.delay, law.filter_time
     theta = angles(frequency, period)
     stiffness, damping = (
@@ -110,7 +104,7 @@ def damping_spectrum(
 
 
 def damping_spectrum_of(
-    transfer: Transfer | signal.dlti, period: float, frequency: ArrayLike
+    transfer: Transfer, period: float, frequency: ArrayLike
 ) -> float | NDArray[np.float64]:
     """Returns the device damping that any coupling requires at each frequency.
 
@@ -119,8 +113,9 @@ def damping_spectrum_of(
     The result holds for every passive hand and every discrete-time passive environment.
 
     Args:
-        transfer: C from h − x in m to the force on the tool in N: a callable of an array of complex
-            z, or a discrete ``scipy.signal`` system whose ``dt`` is the period or True.
+        transfer: C from h − x in m to the force on the tool in N: a function of an array of
+            complex z; of a ``scipy.signal`` system ``lambda z: np.polyval(num, z) / np.polyval(den,
+            z)``.
         period: T in s, finite and > 0.
         frequency: ω in rad/s, 0 < ω <= π/T, any shape.
 
@@ -128,16 +123,16 @@ def damping_spectrum_of(
         b in N s/m, shaped like the frequency; inf where no damping suffices.
 
     Raises:
-        CouplingError: An argument is out of range, the system is continuous or has another period,
-            or C is not finite at a frequency.
+        CouplingError: An argument is out of range, or C is not finite at a frequency.
 
     References:
         Brown & Colgate 1997, eq. (2).
     """
     period = scalar("period", period, "s", positive=True)
     theta = angles(frequency, period)
-    z = np.exp(1j * theta)
-    value = transfer(z) if callable(transfer) else _value_of_system(transfer, period, z)
+    if not callable(transfer):
+        raise CouplingError(f"transfer is {shown(transfer)}; it must be a callable of z")
+    value = transfer(np.exp(1j * theta))
     try:
         returned = np.asarray(value)
     except (TypeError, ValueError):  # for example rows of different lengths
@@ -152,31 +147,6 @@ def damping_spectrum_of(
     if not (np.abs(response) <= LARGEST**2).all():
         raise CouplingError("the transfer function is not finite at one of the frequencies")
     return plain(needed_for_any_environment(response, period, theta))
-
-
-def _value_of_system(
-    system: signal.dlti, period: float, z: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Returns the transfer function of a discrete ``scipy.signal`` system, evaluated at z."""
-    from scipy import signal  # noqa: PLC0415 - takes 0.6 s; who passes such a system has it
-
-    if isinstance(system, signal.lti):
-        raise CouplingError(
-            "the transfer function is continuous in time; discretise it, for example with "
-            "scipy.signal.cont2discrete"
-        )
-    if not isinstance(system, signal.dlti):
-        raise CouplingError(
-            f"transfer is {shown(system)}; it must be a callable of z or a scipy.signal system"
-        )
-    if system.dt is not True and not np.isclose(system.dt, period, rtol=1e-9, atol=0):
-        raise CouplingError(
-            f"the transfer function is sampled every {system.dt:g} s, not every {period:g} s"
-        )
-    rational = system.to_tf()
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # a pole is refused
-        value: NDArray[np.complex128] = np.polyval(rational.num, z) / np.polyval(rational.den, z)
-    return value
 
 
 # Supremum over frequency of the damping that a delayed coupling requires against a wall

@@ -75,7 +75,7 @@ def plain(array: NDArray[np.float64]) -> float | NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CouplingGrid:
-    """Couplings in arrays, for maps over thousands; the fields broadcast as in NumPy.
+    """Couplings in translation as arrays, for maps over thousands; the fields broadcast.
 
     The bounds of this package accept it in place of a ``Coupling``; a bridge does not. The fields
     are kept as read-only arrays.
@@ -83,8 +83,6 @@ class CouplingGrid:
     Attributes:
         stiffness: K in N/m, finite and > 0.
         damping: B in N s/m, finite and >= 0.
-        rotational_stiffness: K_r in N m/rad, finite and >= 0.
-        rotational_damping: B_r in N m s/rad, finite and >= 0.
 
     Raises:
         CouplingError: A value is not finite or out of range, or the shapes do not broadcast.
@@ -92,8 +90,6 @@ class CouplingGrid:
 
     stiffness: ArrayLike
     damping: ArrayLike = 0.0
-    rotational_stiffness: ArrayLike = 0.0
-    rotational_damping: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
         arrays = {}
@@ -113,26 +109,27 @@ _OF_ROTATION = ("rotational_stiffness", "rotational_damping")
 def spring_and_damper(
     coupling: Coupling | CouplingGrid, axis: Axis = "translation"
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns K and B of one kind of axis, broadcast to one shape.
+    """Returns K and B of one kind of axis, or of a grid, broadcast to one shape.
 
     Raises:
         CouplingError: The axis is unknown, the coupling has a wrong type, or a value is out of
             range.
     """
     is_translation = one_of("axis", axis, ("translation", "rotation")) == "translation"
-    if not isinstance(coupling, Coupling | CouplingGrid):
+    if isinstance(coupling, CouplingGrid):
+        arrays = {field.name: getattr(coupling, field.name) for field in fields(coupling)}
+        stiffness, damping = together(**arrays)
+        return stiffness, damping
+    if not isinstance(coupling, Coupling):
         raise CouplingError(
             f"coupling is {shown(coupling)}; it must be a Coupling or a CouplingGrid"
         )
     names = ("stiffness", "damping") if is_translation else _OF_ROTATION
-    if isinstance(coupling, Coupling):
-        # Coupling has no upper limit and accepts fractions.Fraction, so convert and check here
-        stiffness, damping = (
-            checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
-            for name, is_first in zip(names, (is_translation, False), strict=True)
-        )
-        return stiffness, damping
-    stiffness, damping = together(**{name: getattr(coupling, name) for name in names})
+    # Coupling has no upper limit and accepts fractions.Fraction, so convert and check here
+    stiffness, damping = (
+        checked(f"coupling {name}", float(getattr(coupling, name)), positive=is_first)
+        for name, is_first in zip(names, (is_translation, False), strict=True)
+    )
     return stiffness, damping
 
 
@@ -240,7 +237,7 @@ class SampledLaw(NamedTuple):
         discretization: Discretization,
         delay: int,
         filter_time: float,
-        axis: Axis,
+        axis: Axis = "translation",
     ) -> SampledLaw:
         """Validates the arguments of a bound.
 

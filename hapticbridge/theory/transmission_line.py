@@ -23,11 +23,6 @@ LONGEST_TRIP = 1_000_000
 """Largest round trip in samples. Beyond it rounding no longer separates nθ/2 from a pole."""
 
 
-def _checked(termination: Termination, round_trip: int) -> int:
-    one_of("termination", termination, ("software", "device"))
-    return whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
-
-
 def transmission_line_spectrum(
     impedance: ArrayLike,
     period: float,
@@ -69,7 +64,8 @@ def transmission_line_spectrum(
     """
     period = scalar("period", period, "s", positive=True)
     theta = angles(frequency, period)
-    trip = _checked(terminated_by, round_trip)
+    one_of("termination", terminated_by, ("software", "device"))
+    trip = whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
     z = checked("impedance", impedance, "N s/m", positive=True)
     z = z.reshape(z.shape + (1,) * theta.ndim)
     if terminated_by == "device":
@@ -85,15 +81,11 @@ def transmission_line_spectrum(
 
 
 def transmission_line_stiffness(
-    device_damping: ArrayLike,
-    period: float,
-    *,
-    terminated_by: Termination = "device",
-    round_trip: int = 2,
+    device_damping: ArrayLike, period: float, *, round_trip: int = 2
 ) -> float | NDArray[np.float64]:
-    """Returns the largest static stiffness in N/m of a passive line in front of a wall.
+    """Returns the largest static stiffness in N/m of a passive line that the device terminates.
 
-        K = 2 Z/(n T)  with  Z = b  (software, n = 1: Z = b/2; n > 2: none, 0)
+        K = 2 b/(n T),  in front of a wall
 
     With one sample each way K is b/T, **half** of the 2 b/T of a spring and damper. Only a line
     that returns within one sample, which is a plain spring, reaches 2 b/T. A line gains no
@@ -104,8 +96,6 @@ def transmission_line_stiffness(
         Brown & Colgate 1997, section 6 (future work).
     """
     period = scalar("period", period, "s", positive=True)
-    trip = _checked(terminated_by, round_trip)
+    trip = whole("round trip", round_trip, least=1, most=LONGEST_TRIP)
     impedance = checked("device damping", device_damping, "N s/m", positive=True)
-    if terminated_by == "software":
-        impedance = impedance * {1: 0.5, 2: 1.0}.get(trip, 0.0)
     return plain(np.asarray(2 * impedance / (trip * period)))

@@ -127,7 +127,7 @@ class Sliders:
         self, gui: viser.GuiApi, span: AxisCouplingLimits, want: Callable[[], None]
     ) -> None:
         self.span = span
-        stiffness, damping = span.gains(span.start)
+        stiffness, damping = span.gains(span.run.start)
         self._steps = (
             _step(max(span.max_stiffness(0.0), stiffness)),
             _step(max(span.max_damping(span.min_stiffness), damping)),
@@ -140,9 +140,10 @@ class Sliders:
                 _WORDS[span.axis], SYMBOLS[span.axis], UNITS[span.axis], strict=True
             )
         ]
-        shown = self._shown(stiffness, damping, (least, 0.0), most)
-        self._stiffness = gui.add_slider(labels[0], least, most[0], self._steps[0], shown[0])
-        self._damping = gui.add_slider(labels[1], 0.0, most[1], self._steps[1], shown[1])
+        steps, k = self._steps, _between(stiffness, self._steps[0], least, most[0])
+        self._stiffness = gui.add_slider(labels[0], least, most[0], steps[0], k)
+        b = _between(damping, steps[1], 0.0, most[1])
+        self._damping = gui.add_slider(labels[1], 0.0, most[1], steps[1], b)
         self._stiffness.on_update(by_hand(want))
         self._damping.on_update(by_hand(want))
 
@@ -154,9 +155,9 @@ class Sliders:
     def show(self, stiffness: float, damping: float) -> None:
         """Sets both sliders to a stiffness and damping."""
         self.bound(stiffness, damping)
-        most = self._stiffness.max, self._damping.max
-        shown = self._shown(stiffness, damping, (self._stiffness.min, 0.0), most)
-        self._stiffness.value, self._damping.value = shown
+        sliders = self._stiffness, self._damping
+        for slider, value, step in zip(sliders, (stiffness, damping), self._steps, strict=True):
+            slider.value = _between(value, step, slider.min, slider.max)
 
     def bound(self, stiffness: float, damping: float) -> None:
         """Sets the end of each slider to the limit at the other one's value."""
@@ -169,17 +170,6 @@ class Sliders:
             f"{symbols[0]} ends at {self._stiffness.max:g} {units[0]}, "
             f"{symbols[1]} at {self._damping.max:g} {units[1]}"
         )
-
-    def _shown(
-        self,
-        stiffness: float,
-        damping: float,
-        least: tuple[float, float],
-        most: tuple[float, float],
-    ) -> tuple[float, float]:
-        near = (_near(v, step) for v, step in zip((stiffness, damping), self._steps, strict=True))
-        first, second = (min(max(*pair), end) for *pair, end in zip(near, least, most, strict=True))
-        return first, second
 
     def _ends(self, stiffness: float, damping: float, least: float) -> tuple[float, float]:
         steps, span = self._steps, self.span
@@ -224,8 +214,8 @@ class Controls:
         # state of the run, now or after the waiting commands
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]
         self._is_forced, self._is_clutched = True, False
-        self._force.on_update(by_hand(self._switch_force))
-        self._clutch.on_update(by_hand(self._switch_clutch))
+        self._force.on_update(by_hand(lambda: self._switch(force=bool(self._force.value))))
+        self._clutch.on_update(by_hand(lambda: self._switch(clutch=bool(self._clutch.value))))
         reset.on_click(lambda _: ask(Reset()))
         mark.on_click(lambda _: ask(Mark()))
         stop.on_click(lambda _: ask(Stop()))
@@ -243,13 +233,9 @@ class Controls:
             except CommandError as error:
                 self._refuse(str(error))
 
-    def _switch_force(self) -> None:
+    def _switch(self, **state: bool) -> None:
         with self._turn:
-            self._ask(Switch(force=bool(self._force.value)))
-
-    def _switch_clutch(self) -> None:
-        with self._turn:
-            self._ask(Switch(clutch=bool(self._clutch.value)))
+            self._ask(Switch(**state))
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Handles an event; the controls then show the state of the run, not the request."""
@@ -321,8 +307,9 @@ def _step(most: float) -> float:
     return float(f"1e{math.floor(math.log10(FINENESS * most)):d}")
 
 
-def _near(value: float, step: float) -> float:
-    return float(f"{round(value / step) * step:.12g}")
+def _between(value: float, step: float, least: float, most: float) -> float:
+    """Returns the slider's position next to a value."""
+    return min(max(float(f"{round(value / step) * step:.12g}"), least), most)
 
 
 def _up(value: float, step: float) -> float:

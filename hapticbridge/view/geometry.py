@@ -13,6 +13,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from hapticbridge.check.physics import matrix_of, mesh_of
+
 Array = NDArray[np.float64]
 
 SHOWN_GROUPS = 3
@@ -116,10 +118,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float64], NDArr
         return corners, np.arange(len(corners)).reshape(-1, 3)
     if kind in (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_SDF):
         # MuJoCo also has a mesh of a signed distance field, at its zero level
-        mesh = int(model.geom_dataid[geom])
-        first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-        start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-        return model.mesh_vert[first : first + count], model.mesh_face[start : start + faces]
+        return mesh_of(model, int(model.geom_dataid[geom]))
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
         side = PLANE_SIDE * model.stat.extent
         x, y = (size[axis] or 0.5 * side for axis in (0, 1))
@@ -264,9 +263,7 @@ def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:
     for prop in props_of(model):
         if model.body_weldid[prop.body] != tool:
             continue
-        own = np.zeros(9)
-        mujoco.mju_quat2Mat(own, prop.turn)
-        local = prop.mesh.vertices @ own.reshape(3, 3).T + prop.place
+        local = prop.mesh.vertices @ matrix_of(prop.turn).T + prop.place
         world = local @ data.xmat[prop.body].reshape(3, 3).T + data.xpos[prop.body]
         part = trimesh.Trimesh((world - place) @ turn, prop.mesh.faces)
         part.merge_vertices(merge_norm=True, merge_tex=True)

@@ -12,6 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.check.physics import matrix_of
 from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import RunCoupling
@@ -248,10 +249,8 @@ class Ghost:
         # it begins on the ghost's surface, unless it truly ends at the tool
         start = sight.handle
         if self.times > 1 and stretch > 0.0:
-            turn = np.zeros(9)
-            mujoco.mju_quat2Mat(turn, sight.handle_turn)
             along = way / stretch
-            aside = self._surfaces.way_out(turn.reshape(3, 3).T @ along)
+            aside = self._surfaces.way_out(matrix_of(sight.handle_turn).T @ along)
             start = start + aside * along
         end = start + self.times * way
         self._spring.points = coil(start, end, 0.02 * self._extent).astype(np.float32)

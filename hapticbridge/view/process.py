@@ -26,7 +26,7 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
-from hapticbridge.summary import watch_sentence
+from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Tendons
 from hapticbridge.view.page import Page, Sight, Trace
@@ -132,8 +132,7 @@ def _listen(stream: IO[bytes], inbox: queue.SimpleQueue[dict[str, Any] | None]) 
 def _read_job(stream: IO[bytes]) -> tuple[dict[str, Any], RecordingFile]:
     job = json.loads(stream.readline())
     files = {name: stream.read(size) for name, size in job["attachments"]}
-    run = run_of(job["metadata"], files)
-    return job, run
+    return job, run_of(job["metadata"], files)
 
 
 def _calm() -> None:

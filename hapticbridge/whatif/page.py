@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import printable
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.recording.timeline import due_times
 from hapticbridge.report import DRAWABLE, decimated
-from hapticbridge.report.evidence import BINS, Evidence, is_motion_prescribed
+from hapticbridge.report.evidence import BINS, Evidence, finish, is_motion_prescribed
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
 from hapticbridge.units import format_si
@@ -131,18 +132,10 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     for axes in panels[2:]:
         axes.axhline(0.0, color="black", lw=0.6)
     panels[-1].set_xlabel("time (s)")
-    # above the curves, not on them
-    panels[0].legend(
-        loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=3, frameon=False
-    )
+    finish(panels[0])
     changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
     title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
-    figure.suptitle(
-        "".join(letter if letter.isprintable() else "�" for letter in title),
-        fontsize="medium",
-        parse_math=False,
-        wrap=True,
-    )
+    figure.suptitle(printable(title), fontsize="medium", parse_math=False, wrap=True)
     return figure
 
 

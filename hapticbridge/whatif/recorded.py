@@ -9,6 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import period_of
 from hapticbridge.device import DeviceInfo
@@ -144,6 +147,16 @@ class RecordedRun:
         return cls(recording, parameters, info, settings, unpack_scene(recording, folder))
 
     @property
+    def ticks(self) -> NDArray[np.void]:
+        """Records, ``TICK_DTYPE``."""
+        return self.recording.ticks
+
+    @property
+    def period(self) -> float:
+        """T in s."""
+        return self.parameters.period
+
+    @property
     def is_absolute(self) -> bool:
         """True if the device's poses were poses in the scene."""
         p = self.parameters
@@ -184,7 +197,7 @@ class RecordedRun:
         A device that moved before the first tick re-anchored the coupling, so its earlier motion
         does not appear in the scene.
         """
-        first = self.recording.ticks[0]
+        first = self.ticks[0]
         if not int(first["flags"]) & int(TickFlag.REANCHORED):
             return self.parameters.device_start
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())

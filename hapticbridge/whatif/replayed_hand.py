@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -86,19 +86,11 @@ class Outside:
     def __init__(self, ticks: NDArray[np.void], period: float) -> None:
         self._pressed, self._period = ticks["buttons"].copy(), period
         self._stale = ticks["flags"] & _STALE
-        self._rows: Iterator[int] = iter(())
+        self._tick, self._share = 0, 1.0
 
     def start(self, period: float) -> None:
         """Starts at the first tick of a loop with this period in s."""
-        share, last = period / self._period, len(self._pressed) - 1
-
-        def rows() -> Iterator[int]:
-            tick = 0
-            while True:
-                yield min(int(tick * share + 1e-9), last)  # a period in decimals is rounded
-                tick += 1
-
-        self._rows = rows()
+        self._tick, self._share = 0, period / self._period
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Puts the next tick's buttons into a sample; after the last tick they stay.
@@ -106,7 +98,9 @@ class Outside:
         Returns:
             ``STALE_SAMPLE`` for a stale sample, else 0.
         """
-        row = next(self._rows)
+        row = int(self._tick * self._share + 1e-9)  # a period in decimals is rounded
+        row = min(row, len(self._stale) - 1)
+        self._tick += 1
         sample["buttons"] = self._pressed[row]
         return int(self._stale[row])
 
@@ -117,25 +111,17 @@ class RecordedMotion(ReplayDevice):
     The motion is prescribed at any force, which is exact but no hand: it presses as deep into a
     stiffer wall as into the recorded one. The data sheet is the recorded device's, so that guard
     and controller act as with it. With recorded times and unchanged settings, the run equals the
-    recorded one in every bit. At least two rows are needed; ``start`` is the device pose (7,)
-    before them.
+    recorded one in every bit. At least two rows are needed.
 
     Raises:
         DeviceError: See ``ReplayDevice``.
     """
 
-    def __init__(
-        self,
-        ticks: NDArray[np.void],
-        clock: RecordedClock,
-        period: float,
-        start: tuple[float, ...],
-        info: DeviceInfo,
-    ) -> None:
-        super().__init__(ticks, period)
-        self.info = _replay_info(info, self.info)
-        self._clock, self._before = clock, start
-        self._news = iter((ticks["flags"] & _STALE).tolist())
+    def __init__(self, run: RecordedRun, clock: RecordedClock) -> None:
+        super().__init__(run.ticks, run.period)
+        self.info = _replay_info(run.info, self.info)
+        self._clock, self._before = clock, run.parameters.device_start
+        self._news = iter((run.ticks["flags"] & _STALE).tolist())
 
     def start(self, period: float) -> NDArray[np.void]:
         """Implements ``Device.start``."""
@@ -155,18 +141,15 @@ class RecordedMotion(ReplayDevice):
 class ResampledMotion(TrajectoryDevice):
     """Device that replays the recorded motion at another rate.
 
-    Positions are interpolated linearly, orientations by slerp. At least two rows are needed;
-    ``start`` is the device pose (7,) before them, ``period`` the recorded period in s.
+    Positions are interpolated linearly, orientations by slerp. At least two rows are needed.
     """
 
-    def __init__(
-        self, ticks: NDArray[np.void], period: float, start: tuple[float, ...], info: DeviceInfo
-    ) -> None:
-        times = period * np.arange(len(ticks))
+    def __init__(self, run: RecordedRun) -> None:
+        ticks, times = run.ticks, run.period * np.arange(len(run.ticks))
         super().__init__(Motion(times, ticks["device_position"], ticks["device_quaternion"]))
-        self.info = _replay_info(info, self.info)
-        self._before, self._last = start, b""
-        self._outside = Outside(ticks, period)
+        self.info = _replay_info(run.info, self.info)
+        self._before, self._last = run.parameters.device_start, b""
+        self._outside = Outside(ticks, run.period)
 
     def start(self, period: float) -> NDArray[np.void]:
         """Implements ``Device.start``."""
@@ -345,7 +328,7 @@ class Repetition:
             clutch=run.clutch,
             dead_man=run.dead_man,
         )
-        self._per_tick = run.parameters.period / bridge.period
+        self._per_tick = run.period / bridge.period
         trip = ""
         with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
             warnings.simplefilter("always", UserWarning)
@@ -390,10 +373,10 @@ class Repetition:
         """Returns the ticks at which the recorded run paused, and the end."""
         events = self._run.recording.events
         pauses = [int(e["tick"]) for e in events if e.get("event") == "resume"]
-        return [*pauses, len(self._run.recording.ticks)]
+        return [*pauses, len(self._run.ticks)]
 
     def _was_tripped_by_state(self) -> bool:
-        last = len(self._run.recording.ticks)
+        last = len(self._run.ticks)
         return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
 
     def _action_for(self, event: Event) -> Event | None:
@@ -423,7 +406,7 @@ class Repetition:
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event
         law = coupling_in(event, self._run.parameters)
-        requested = old.method.requested_coupling(law, self._run.parameters.period / old.substeps)
+        requested = old.method.requested_coupling(law, self._run.period / old.substeps)
         kept = {name: getattr(new.coupling, name) for name in GAINS[2:]}
         law = new.method.law_coupling(replace(requested, **kept), period / new.substeps)
         return {**event, **asdict(law), "ticks": tuning_ticks(period)}
@@ -452,18 +435,12 @@ class IdentifiedDevice(SimulatedDevice):
     """The recorded device by its data sheet, in a model hand with the recorded hand's intent.
 
     Unlike a prescribed motion (``again``), the hand yields to the force. It needs mass and damping
-    (``missing_for_closed_loop``) and at least three rows. The device is held at the pose ``start``
-    (7,) until the first tick.
+    (``missing_for_closed_loop``) and at least three rows. Until the first tick the device is held
+    at ``anchor_pose``.
     """
 
-    def __init__(
-        self,
-        info: DeviceInfo,
-        hand: Hand,
-        ticks: NDArray[np.void],
-        period: float,
-        start: tuple[float, ...],
-    ) -> None:
+    def __init__(self, run: RecordedRun, hand: Hand) -> None:
+        info, ticks, period, start = run.info, run.ticks, run.period, run.anchor_pose
         super().__init__(
             mass=info.mass or 0.0,
             damping=info.damping or 0.0,

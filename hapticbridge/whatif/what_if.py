@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -139,7 +139,7 @@ def what_if(
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
         HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
-    progress = progress or _silent
+    progress = progress or (lambda _done, _total, _name: None)
     progress(0, 4, "auditing what was recorded")
     report = audit(path, strict=strict)
     if report.verdict == "invalid":
@@ -148,33 +148,28 @@ def what_if(
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
         run = RecordedRun.of(recording, folder / "scene")
-        return _Experiment(run, report, folder, progress, strict=strict).changed(changes)
-
-
-class _Experiment:
-    """Repetitions of one recorded run."""
-
-    def __init__(
-        self,
-        run: RecordedRun,
-        report: AuditReport,
-        folder: Path,
-        progress: Callable[[int, int, str], None],
-        *,
-        strict: bool,
-    ) -> None:
-        self._run, self._report, self._folder, self._progress = run, report, folder, progress
-        self._strict = strict
-        self._ticks, self._period = run.recording.ticks, run.parameters.period
-        if len(self._ticks) < 3:
+        if len(run.ticks) < 3:
             raise RecordingError(
-                f"'{run.recording.path}' has {len(self._ticks)} ticks; a what-if needs 3"
+                f"'{recording.path}' has {len(run.ticks)} ticks; a what-if needs 3"
             )
-        self._concerns: dict[str, None] = {}
+        file = folder / "run.mcap"
+        return _Experiment(run, report, file, progress, strict).changed(changes)
+
+
+@dataclass(slots=True)
+class _Experiment:
+    """Repetitions of one recorded run, judged in its report, into a file at a path."""
+
+    run: RecordedRun
+    report: AuditReport
+    path: Path
+    progress: Callable[[int, int, str], None]
+    strict: bool
+    concerns: dict[str, None] = field(default_factory=dict)
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
         """Runs all repetitions and returns the result."""
-        run, settings = self._run, self._run.settings
+        run, settings = self.run, self.run.settings
         new = settings.changed(changes)
         is_changed = new != settings
         notes = []
@@ -183,8 +178,10 @@ class _Experiment:
                 "the attached scene does not compile to the recorded model: a program changed it "
                 "after loading, or it was compiled elsewhere; these runs lack that change"
             )
-        runs = [self._as_recorded()]
-        self._progress(1, 4, "the recorded motion")
+        peaks = self._peaks(run.ticks)
+        recorded = WhatIfRun(RECORDED, self.report, peaks, run.trip, run.period, run.recording)
+        runs = [recorded]
+        self.progress(1, 4, "the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
@@ -195,10 +192,12 @@ class _Experiment:
         if missing := missing_for_closed_loop(run.info):
             notes.append(f"no closed loop: {missing}")
         else:
-            self._progress(2, 4, "the model hand, nothing changed")
+            self.progress(2, 4, "the model hand, nothing changed")
             same = self._closed(settings)
-            hand_error = self._hand_error(same)
-            self._progress(3, 4, "the model hand")
+            count = min(len(same.ticks), len(run.ticks))
+            off = same.ticks["device_position"][:count] - run.ticks["device_position"][:count]
+            hand_error = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+            self.progress(3, 4, "the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
@@ -208,53 +207,35 @@ class _Experiment:
             (name, UNITS.get(name, ""), settings.value(name), new.value(name)) for name in changes
         )
         return WhatIf(
-            run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self._concerns)
+            run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self.concerns)
         )
 
-    def _as_recorded(self) -> WhatIfRun:
-        recording, peaks = self._run.recording, self._peaks(self._ticks)
-        return WhatIfRun(RECORDED, self._report, peaks, self._run.trip, self._period, recording)
-
     def _peaks(self, ticks: NDArray[np.void]) -> dict[str, float]:
-        return _peaks(ticks, is_held=not self._run.info.is_prescribed)
+        return _peaks(ticks, is_held=not self.run.info.is_prescribed)
 
     def _prescribed(self, settings: Settings) -> WhatIfRun:
-        run, ticks, period = self._run, self._ticks, self._period
-        start = run.parameters.device_start
+        run = self.run
         if settings.rate == run.settings.rate:
-            clock = RecordedClock(ticks, period)
-            motion = RecordedMotion(ticks, clock, period, start, run.info)
-            return self._simulated(PRESCRIBED, motion, clock, settings)
-        resampled = ResampledMotion(ticks, period, start, run.info)
-        return self._simulated(PRESCRIBED, resampled, SimulatedClock(), settings)
+            clock = RecordedClock(run.ticks, run.period)
+            return self._simulated(PRESCRIBED, RecordedMotion(run, clock), clock, settings)
+        return self._simulated(PRESCRIBED, ResampledMotion(run), SimulatedClock(), settings)
 
     def _closed(self, settings: Settings) -> WhatIfRun:
-        run = self._run
-        scene = run.scene(settings)
-        hand = scene_hand(scene.model, scene.path)
-        device = IdentifiedDevice(run.info, hand, self._ticks, self._period, run.anchor_pose)
+        scene = self.run.scene(settings)
+        device = IdentifiedDevice(self.run, scene_hand(scene.model, scene.path))
         return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
-    def _hand_error(self, same: WhatIfRun) -> float:
-        count = min(len(same.ticks), len(self._ticks))
-        off = same.ticks["device_position"][:count] - self._ticks["device_position"][:count]
-        return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
     def _simulated(self, name: str, device: Device, clock: Clock, settings: Settings) -> WhatIfRun:
-        repetition, path = Repetition(self._run, settings), self._path
+        repetition, path = Repetition(self.run, settings), self.path
         period, trip = repetition.into(path, device, clock)
-        if settings != self._run.settings:
-            self._concerns |= dict.fromkeys(repetition.warned)
+        if settings != self.run.settings:
+            self.concerns |= dict.fromkeys(repetition.warned)
         recording = read_recording(path)
-        report = audit(path, strict=self._strict)
+        report = audit(path, strict=self.strict)
         return WhatIfRun(name, report, self._peaks(recording.ticks), trip, period, recording)
 
-    @property
-    def _path(self) -> Path:
-        return self._folder / "run.mcap"
-
     def _agreement(self) -> str:
-        found = compare(self._run.recording.path, self._path)
+        found = compare(self.run.recording.path, self.path)
         if found.first is None and not any(found.alone):
             return "with nothing changed the prescribed run is the recorded one in every bit"
         if found.first is None:
@@ -306,7 +287,3 @@ def _peaks(ticks: NDArray[np.void], *, is_held: bool) -> dict[str, float]:
         "torque on tool": largest(tool[:, 3:]),
         "stretch": largest(ticks["handle_position"] - ticks["tool_position"]),
     }
-
-
-def _silent(_done: int, _total: int, _name: str) -> None:
-    """Ignores the progress."""

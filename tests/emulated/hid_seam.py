@@ -7,7 +7,6 @@ from typing import Any, Protocol
 
 from emulated.hid_device import HidDevice
 from emulated.usb_device import StallError
-from hapticbridge.device.transport.hid import HidHandle
 
 
 class Timed(Protocol):
@@ -59,7 +58,7 @@ class HidSeam:
             if vendor_id in (0, device.vendor) and product_id in (0, device.product)
         ]
 
-    def device(self) -> HidHandle:
+    def device(self) -> _Handle:
         return _Handle(self)
 
 

@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import fast, sway
+from numpy.typing import NDArray
 
-from faults.catalogue import FAULTS, PUSHED, RING_FULL, UNSEEN, Fault, passing
+from faults.catalogue import FAULTS, PUSHED, PUSHER, RING_FULL, UNSEEN, Fault, passing
 from faults.rig import CAUSE, PERIOD, PRESS, Rig
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import USUAL_ENERGY, Limits
-from hapticbridge.record import TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 
 LIMIT, MAX_ENERGY = 10.0, 0.05
@@ -88,6 +91,68 @@ def test_a_motors_push_is_cut_off_before_it_passes_the_energy_limit(
     assert 0.8 * energy < outcome.energy <= energy
     assert "more energy" in outcome.error
     assert outcome.last_is_zero
+
+
+class GivesWay:
+    """A hand that gives way slowly while a motor pushes, then jumps to the device's full speed.
+
+    Attributes:
+        given: Largest energy in J that it got beyond what b burnt.
+    """
+
+    info = DeviceInfo(
+        name="yielding", axes=("x", "y", "z"), force_limit=10.0, damping=0.2, is_real=False
+    )
+
+    def __init__(self, slow_until: float) -> None:
+        self._slow_until, self._gives_way = slow_until, False
+        self._force = self._position = self._net = self.given = 0.0
+
+    def start(self, period: float) -> NDArray[np.void]:
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self._gives_way = self._gives_way or abs(self._force) > 9.0
+        if self._gives_way:
+            speed = 0.2 if self._net < self._slow_until else self.info.speed_limit
+            step = math.copysign(speed * PERIOD, self._force)
+            self._position += step
+            self._net += self._force * step - 0.2 * step**2 / PERIOD
+            self.given = max(self.given, self._net)
+        sample["position"][0, 0] = self._position
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._force = float(wrench[0])
+
+    def close(self) -> None:
+        self._force = 0.0
+
+
+def given_to_a_hand_that_jumps(scene: Path, slow_until: float, changes: dict[str, Any]) -> float:
+    """Returns the energy in J that a motor gives to a hand that jumps to full speed."""
+    hand = GivesWay(slow_until)
+    bridge = Bridge(scene, hand, clock=SimulatedClock())
+    bridge.setup = replace(bridge.setup, guard=replace(bridge.setup.guard, **changes))
+    with bridge:
+        bridge.set_input(ctrl={"ram": -12.0})
+        with pytest.raises(SafetyTrip, match="more energy"):
+            bridge.run(1.0)
+    return hand.given
+
+
+@pytest.mark.parametrize("slow_until", [0.0, 0.005, 0.02, 0.038])
+def test_a_jump_to_full_speed_brings_at_most_fifty_millijoules(
+    tmp_path: Path, slow_until: float
+) -> None:
+    scene = tmp_path / "pusher.xml"
+    scene.write_text(PUSHER)
+    assert 0.0 < given_to_a_hand_that_jumps(scene, slow_until, {}) <= MAX_ENERGY
+    if slow_until > 0.01:
+        unlimited = given_to_a_hand_that_jumps(scene, slow_until, {"full_speed": 0.0})
+        assert unlimited > MAX_ENERGY
 
 
 def test_a_signal_at_any_tick_ends_a_run_with_zero_force(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
     TIMING,
-    USUAL_TORQUE_LIMIT,
     DeviceInfo,
+    calling_on_error,
     checked_period,
     stated_numbers,
     usual_delay,
@@ -173,7 +173,7 @@ class FalconDevice:
         self._link, self._name = link, name
         self._stream = ReplyStream()
         self._is_open, self._is_started = True, False
-        try:
+        with calling_on_error(self.close):
             bring_up(link, self._stream, name, firmware, notify)
             home(link, self._stream, name, notify)
             rate, delay = measured_timing(link, self._stream, name)
@@ -182,22 +182,13 @@ class FalconDevice:
                 axes=("x", "y", "z"),
                 mass=mass,
                 damping=damping,
-                rotational_inertia=None,
-                rotational_damping=None,
                 friction=friction,
                 resolution=resolution(),
                 force_limit=FORCE_LIMIT,
-                torque_limit=USUAL_TORQUE_LIMIT,
                 speed_limit=SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
-                is_prescribed=False,
-                is_real=True,
-                duration=None,
             )
-        except BaseException:
-            self.close()
-            raise
         self._motion = np.zeros(1, MOTION_DTYPE)
         self._last = np.zeros(1, SAMPLE_DTYPE)
         self._packet = array.array("B", bytes(SIZE))

@@ -86,36 +86,6 @@ def is_within_reach(position: NDArray[np.float64]) -> bool:
 
 
 @compiled
-def inverse(position: NDArray[np.float64], angles: NDArray[np.float64]) -> bool:
-    """Computes the thigh angles of a grip position; returns whether every leg reaches it.
-
-        θ = atan2(w, u + c) − arccos((ρ² + a² − L²) / (2 a ρ)),    ρ² = (u + c)² + w²
-
-    This is the smaller of the two angles, with the knee outside.
-
-    Args:
-        position: Shape (3,), in m, in the maker's frame.
-        angles: Output, shape (3,), in rad; unchanged without a solution.
-    """
-    found = np.empty(3)
-    for i in range(3):
-        out = position[0] * _COS[i] + position[1] * _SIN[i] - HIP_OUT + PLATE
-        lean = -position[0] * _SIN[i] + position[1] * _COS[i] - HIP_SIDEWAYS + SIDEWAYS
-        height = position[2]
-        squared = SHIN * SHIN - lean * lean
-        distance = math.sqrt(out * out + height * height)
-        if not (squared > 0.0 and distance > 0.0):
-            return False
-        length = math.sqrt(squared) + LINKS
-        cosine = (distance**2 + THIGH**2 - length**2) / (2.0 * THIGH * distance)
-        if not (-1.0 <= cosine <= 1.0):
-            return False
-        found[i] = math.atan2(height, out) - math.acos(cosine)
-    angles[:] = found
-    return True
-
-
-@compiled
 def closure(
     position: NDArray[np.float64],
     angles: NDArray[np.float64],
@@ -205,32 +175,6 @@ def forward(angles: NDArray[np.float64], position: NDArray[np.float64]) -> bool:
 
 
 # Statics of the Falcon's legs
-
-
-@compiled
-def jacobian(
-    position: NDArray[np.float64], angles: NDArray[np.float64], matrix: NDArray[np.float64]
-) -> bool:
-    """Computes ∂θ/∂p = −(∂h/∂θ)⁻¹ ∂h/∂p at a pose where the legs close.
-
-    Args:
-        position: Shape (3,), in m.
-        angles: Shape (3,), in rad, those of the position.
-        matrix: Output, shape (3, 3), in rad/m.
-
-    Returns:
-        False if a leg is stretched or folded.
-    """
-    gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
-    if not closure(position, angles, gaps, gradients, levers):
-        return False
-    for i in range(3):
-        if not abs(levers[i]) >= FLATTEST * THIGH:
-            return False
-    for i in range(3):
-        for j in range(3):
-            matrix[i, j] = -gradients[i, j] / levers[i]
-    return True
 
 
 @compiled
@@ -372,9 +316,19 @@ def command(
 
 
 def resolution() -> float:
-    """Returns the largest displacement in m of one encoder step, in the middle of the workspace."""
-    position, angles, matrix = np.array(PLACE), np.empty(3), np.empty((3, 3))
-    inverse(position, angles)
-    jacobian(position, angles, matrix)
-    ways = np.linalg.inv(matrix) * RADIANS_PER_COUNT
+    """Returns the largest displacement in m of one encoder step, in the middle of the workspace.
+
+    The middle is on the axis, so all thighs have the angle, with the knee outside,
+
+        θ = atan2(w, u + c) − arccos((ρ² + a² − L²) / (2 a ρ)),    ρ² = (u + c)² + w²
+    """
+    position = np.array(PLACE)
+    out, height = PLATE - HIP_OUT, position[2]
+    length = math.sqrt(SHIN**2 - (SIDEWAYS - HIP_SIDEWAYS) ** 2) + LINKS
+    distance = math.hypot(out, height)
+    cosine = (distance**2 + THIGH**2 - length**2) / (2.0 * THIGH * distance)
+    angles = np.full(3, math.atan2(height, out) - math.acos(cosine))
+    gaps, gradients, levers = np.empty(3), np.empty((3, 3)), np.empty(3)
+    closure(position, angles, gaps, gradients, levers)
+    ways = np.linalg.inv(gradients) * levers * RADIANS_PER_COUNT  # ∂p/∂θ = −(∂h/∂p)⁻¹ ∂h/∂θ
     return float(np.linalg.norm(ways, 2))

@@ -20,14 +20,15 @@ import math
 from collections.abc import Mapping
 from ctypes import byref, c_double, c_ushort
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
     AXES,
-    USUAL_SPEED_LIMIT,
     DeviceInfo,
+    calling_on_error,
     checked_period,
     stated_numbers,
 )
@@ -106,7 +107,7 @@ class ForceDimensionDevice:
         self._frame = (c_double * 9)()
         self._references = [byref(number) for number in self._place]
         self.saturated = 0
-        try:
+        with calling_on_error(self.close):
             kind = dhd.require("dhdGetSystemType", self._id, what=what)
             model = MODELS.get(kind, Model(f"Force Dimension device of type {kind}"))
             self._name, self._turns = model.name, model.turns
@@ -118,7 +119,7 @@ class ForceDimensionDevice:
             self.effector_mass = mass.value if is_known and mass.value > 0.0 else None
             what = f"{self._name}: gravity compensation cannot be set"
             dhd.require("dhdSetGravityCompensation", int(gravity), self._id, what=what)
-            known = dict(numbers or {})
+            known: dict[str, Any] = dict(numbers or {})
             library_limits = [
                 float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")
             ]
@@ -127,20 +128,13 @@ class ForceDimensionDevice:
             self.info = DeviceInfo(
                 name=self._name,
                 axes=AXES if self._turns else AXES[:3],
-                **{name: known.get(name) for name in MEASURED},
+                **{name: known[name] for name in MEASURED if name in known},
                 force_limit=limits[0],
                 torque_limit=limits[1],
-                speed_limit=USUAL_SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
-                is_prescribed=False,
-                is_real=True,
-                duration=None,
                 serial=serial,
             )
-        except BaseException:
-            self.close()
-            raise
         carried = "unknown" if self.effector_mass is None else f"{self.effector_mass:g} kg"
         notify(
             f"{self._name}: limits {limits[0]:g} N"
@@ -302,10 +296,7 @@ def _listed(dhd: Dhd) -> list[FoundDevice]:
             name="Force Dimension device",
             serial="",
             path=str(index),
-            vendor=0,
-            product=0,
             transport="library",
-            problem=None,
         )
         for index in range(max(int(dhd["dhdGetDeviceCount"]()), 0))
     ]

@@ -19,15 +19,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
     TIMING,
-    USUAL_SPEED_LIMIT,
-    USUAL_TORQUE_LIMIT,
     DeviceInfo,
+    calling_on_error,
     checked_number,
     checked_period,
     stated_numbers,
@@ -152,11 +152,8 @@ class HaplyDevice:
         self._is_open, self._is_started = True, False
         self._under_way = self.held_back = 0
         self._pending: tuple[float, ...] | None = None
-        known: dict[str, float | None] = {
-            "mass": None, "damping": None, "friction": None, "resolution": None,
-            "force_limit": FORCE_LIMIT, **(numbers or {}),
-        }  # fmt: skip
-        try:
+        known: dict[str, Any] = {"force_limit": FORCE_LIMIT, **(numbers or {})}
+        with calling_on_error(self.close):
             messages.refuse_scaled(listed)
             notify(messages.describe_filters(listed, force_gate))
             self._exchange(messages.first_message(listed, force_gate))
@@ -166,21 +163,11 @@ class HaplyDevice:
             self.info = DeviceInfo(
                 name=listed.kind,
                 axes=("x", "y", "z"),
-                rotational_inertia=None,
-                rotational_damping=None,
-                torque_limit=USUAL_TORQUE_LIMIT,
-                speed_limit=USUAL_SPEED_LIMIT,
                 rate=rate,
                 delay=delay,
-                is_prescribed=False,
-                is_real=True,
-                duration=None,
                 serial=listed.device_id,
-                **known,  # type: ignore[arg-type]
+                **known,
             )
-        except BaseException:
-            self.close()
-            raise
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
         self._watch = SilenceDetector(link.now())
@@ -322,15 +309,12 @@ def open_haply(options: Mapping[str, object], notify: Notify) -> HaplyDevice:
 
 def opened(link: Link, options: Mapping[str, object], notify: Notify) -> HaplyDevice:
     """Opens a device of a connected service; arguments as for ``open_haply``."""
-    try:
+    with calling_on_error(link.close):
         numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
         devices = _devices(link)
         serial = select_device(DRIVER, [_plugged(d) for d in devices], options.get("serial")).serial
         listed = next(device for device in devices if device.device_id == serial)
-    except BaseException:
-        link.close()
-        raise
     return HaplyDevice(link, listed, force_gate=force_gate, numbers=numbers, notify=notify)
 
 
@@ -372,10 +356,7 @@ def _plugged(device: Listed) -> FoundDevice:
         name=device.kind,
         serial=device.device_id,
         path=SERVICE,
-        vendor=0,
-        product=0,
         transport="service",
-        problem=None,
     )
 
 

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
-    USUAL_SPEED_LIMIT,
-    USUAL_TORQUE_LIMIT,
     DeviceInfo,
     checked_number,
     checked_period,
 )
-from hapticbridge.device.driver import Driver, Notify, select_device
+from hapticbridge.device.driver import Driver, Notify
 from hapticbridge.device.pid.reports import (
     DISABLE,
     ENABLE,
@@ -32,7 +30,7 @@ from hapticbridge.device.pid.reports import (
     has_force_feedback,
 )
 from hapticbridge.device.profile import profile_named, profile_of
-from hapticbridge.device.transport.hid import CONTROLLERS, HidApi, HidLink, find, polling
+from hapticbridge.device.transport.hid import CONTROLLERS, HidApi, HidLink, opened, polling
 from hapticbridge.device.transport.hid_descriptor import (
     INPUT,
     WIDEST,
@@ -44,7 +42,6 @@ from hapticbridge.device.transport.hid_descriptor import (
     place_of,
     required,
 )
-from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
@@ -315,23 +312,14 @@ def data_sheet(
     period = (
         None if write_interval is None else max(read_interval or 0.0, len(_AXES) * write_interval)
     )
-    values: dict[str, Any] = dict.fromkeys(CHANGES) | known
     return DeviceInfo(
         name=name,
         serial=serial,
         axes=_AXES,
-        rotational_inertia=None,
-        rotational_damping=None,
         resolution=0.5 * scale.travel * max(step),
         force_limit=scale.newtons,
-        torque_limit=USUAL_TORQUE_LIMIT,
-        speed_limit=USUAL_SPEED_LIMIT,
         rate=None if period is None else 1.0 / period,
-        delay=None,
-        is_prescribed=False,
-        is_real=True,
-        duration=None,
-        **values,
+        **known,
     )
 
 
@@ -577,12 +565,8 @@ def open_pid(options: Mapping[str, object], notify: Notify, api: HidApi | None =
     Raises:
         DeviceError: No stick is found, it cannot be opened, or it lacks a required capability.
     """
-    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
-    scale, known = scale_of(options, plugged.serial, str(plugged), notify)
-    link = HidLink.open(
-        plugged, api, is_overlapped=api is None, log=HexLog.from_options(options), slots=SLOTS
-    )
-    try:
+    with opened(DRIVER, options, api, slots=SLOTS) as (plugged, link):
+        scale, known = scale_of(options, plugged.serial, str(plugged), notify)
         device = PidDevice(
             link,
             str(plugged),
@@ -591,9 +575,6 @@ def open_pid(options: Mapping[str, object], notify: Notify, api: HidApi | None =
             intervals=polling(plugged.path) if api is None else (None, None),
             serial=plugged.serial,
         )
-    except BaseException:
-        link.close()
-        raise
     if api is None:
         device.leave_last_word(plugged.path)
     return device

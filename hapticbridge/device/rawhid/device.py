@@ -18,7 +18,7 @@ from hapticbridge.device.base import (
     DeviceInfo,
     checked_period,
 )
-from hapticbridge.device.driver import Driver, Notify, UsbId, select_device
+from hapticbridge.device.driver import Driver, Notify, UsbId
 from hapticbridge.device.rawhid.protocol import (
     LARGEST,
     LONGEST_WATCHDOG_MS,
@@ -33,8 +33,7 @@ from hapticbridge.device.rawhid.protocol import (
     force_frame,
     version_of,
 )
-from hapticbridge.device.transport.hid import HidApi, HidLink, Link, find
-from hapticbridge.device.transport.trace import HexLog
+from hapticbridge.device.transport.hid import HidApi, HidLink, opened
 from hapticbridge.device.watchdog import (
     SHORTEST_WATCHDOG,
     ForceOffGuardian,
@@ -56,21 +55,11 @@ POLLING = 1e-3
 """Polling interval of a full-speed device in s, in each direction."""
 
 _MUST_SAY = ("rate", "speed_limit")
-CHANGES = (
-    "mass",
-    "damping",
-    "rotational_inertia",
-    "rotational_damping",
-    "friction",
-    "resolution",
-    "force_limit",
-    "torque_limit",
-    "speed_limit",
-)
+CHANGES = tuple(name for name in Numbers._fields if name not in ("axes", "rate", "delay"))
 """Numbers of the data sheet that the user may replace."""
 
 
-def request_sheet(link: Link, name: str) -> tuple[Numbers, str]:
+def request_sheet(link: HidLink, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
     Raises:
@@ -82,7 +71,7 @@ def request_sheet(link: Link, name: str) -> tuple[Numbers, str]:
     return numbers, str(title)
 
 
-def _page(link: Link, name: str, page: int) -> Numbers | str:
+def _page(link: HidLink, name: str, page: int) -> Numbers | str:
     for _ in range(ASKS):
         link.write(b"\0" + ask_frame(page, page))
         for report in reports(link, ASK_WAIT_MS):
@@ -99,7 +88,7 @@ def _page(link: Link, name: str, page: int) -> Numbers | str:
     )
 
 
-def reports(link: Link, timeout_ms: int) -> Iterator[bytes]:
+def reports(link: HidLink, timeout_ms: int) -> Iterator[bytes]:
     """Yields reports as they come, for about ``timeout_ms``; a report counts as 1 ms."""
     left = timeout_ms
     while left > 0:
@@ -133,9 +122,6 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
             name=title or name,
             axes=axes,
             delay=None if delay is None else delay + 1.0 / known["rate"] + 2.0 * POLLING,
-            is_prescribed=False,
-            is_real=True,
-            duration=None,
             **known,
         )
     except (DeviceError, ZeroDivisionError) as error:
@@ -223,7 +209,7 @@ class RawHidDevice:
 
     def __init__(
         self,
-        link: Link,
+        link: HidLink,
         name: str,
         changes: Mapping[str, Any] | None = None,
         now: Callable[[], float] = time.monotonic,
@@ -372,14 +358,9 @@ def open_rawhid(
     Raises:
         DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
-    plugged = select_device(DRIVER, find(DRIVER, api), options.get("serial"))
-    link = HidLink.open(plugged, api, is_overlapped=api is None, log=HexLog.from_options(options))
     changes = {key: value for key, value in options.items() if key in CHANGES}
-    try:
+    with opened(DRIVER, options, api) as (plugged, link):
         device = RawHidDevice(link, str(plugged), changes, now)
-    except BaseException:
-        link.close()
-        raise
     device.info = replace(device.info, serial=plugged.serial)
     if api is None:
         zero = b"\0" + force_frame(0, NO_WRENCH, 1, is_enabled=False)

@@ -102,7 +102,7 @@ def _target(
     if not isinstance(hand, Hand) or path is None:
         return np.empty((0, 8)), None
     motion = path if isinstance(path, Motion) else read_motion(path)
-    return np.ascontiguousarray(motion.relative().table), motion.duration
+    return np.array(motion.relative().table, order="C"), motion.duration
 
 
 class SimulatedDevice:
@@ -123,6 +123,8 @@ class SimulatedDevice:
     composition of rotations about changing axes holds to third order in the period. At π the
     hand's torque reverses.
 
+    With ``dof`` 3 the device neither turns nor feels torque, as a Falcon.
+
     Wrenches are not clipped; the guard that sends them applies the limits.
 
     Args:
@@ -140,7 +142,9 @@ class SimulatedDevice:
         resolution: Step of the reported position in m, >= 0; 0 reports it exactly.
         rotational_resolution: Step of the reported rotation vector's components in rad, >= 0.
         friction: Coulomb friction f_c per axis of translation in N, >= 0.
-        delay: Whole samples from a write until the motors act, 0 to 100.
+        dof: 6, or 3 for a device without rotation.
+        delay: Whole samples from a write until the motors act, 0 to 100. The data sheet calls it
+            unknown, so such a device is not certified.
         force_limit: Force limit of the data sheet in N, >= 0.
         torque_limit: Torque limit of the data sheet in N m, >= 0.
         speed_limit: Speed limit of the data sheet in m/s, >= 0.
@@ -162,6 +166,7 @@ class SimulatedDevice:
         resolution: float = 0.0,
         rotational_resolution: float = 0.0,
         friction: float = 0.0,
+        dof: int = 6,
         delay: int = 0,
         force_limit: float = USUAL_FORCE_LIMIT,
         torque_limit: float = USUAL_TORQUE_LIMIT,
@@ -169,32 +174,26 @@ class SimulatedDevice:
     ) -> None:
         if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
+        if dof not in (3, 6):
+            raise DeviceError(f"dof = {dof!r}: must be 3 or 6 degrees of freedom")
         _check_hands(hand, rotational_hand, friction)
         self._motion, duration = _target(hand, path)
-        mass = checked_number("mass", mass, "kg", is_positive=True)
-        damping = checked_number("damping", damping, "N s/m")
-        rotational_inertia = checked_number(
-            "rotational_inertia", rotational_inertia, "kg m²", is_positive=True
-        )
-        rotational_damping = checked_number("rotational_damping", rotational_damping, "N m s/rad")
-        friction = checked_number("friction", friction, "N")
         self.info = DeviceInfo(
             name="simulated",
-            axes=AXES,
+            axes=AXES[:dof],
             mass=mass,
             damping=damping,
             rotational_inertia=rotational_inertia,
             rotational_damping=rotational_damping,
             friction=friction,
-            resolution=checked_number("resolution", resolution, "m"),
+            resolution=resolution,
             force_limit=force_limit,
             torque_limit=torque_limit,
             speed_limit=speed_limit,
-            rate=None,
-            delay=0.0,
-            is_prescribed=False,
+            delay=None if delay else 0.0,  # in samples, so its time is not known yet
             is_real=False,
             duration=duration,
+            buttons=0,
         )
         holder = hand if isinstance(hand, Hand) else NO_HAND
         self._translation = {
@@ -219,7 +218,9 @@ class SimulatedDevice:
         self._delay = delay
         self._states = np.zeros(1, STATE_DTYPE)
         # a memoryview assigns six numbers in 0.05 µs, NumPy in 0.15 µs
-        self._written = memoryview(self._states["written"][0])
+        self._written = memoryview(self._states["written"][0, :dof].data)
+        if dof == 3:
+            self._motion[:, 4:] = 1.0, 0.0, 0.0, 0.0
         self._is_started = False
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
@@ -273,7 +274,7 @@ class SimulatedDevice:
 
     def write(self, wrench: NDArray[np.float64]) -> None:
         """Holds a wrench on the handle until the next write, ``delay`` samples later."""
-        self._written[:] = wrench.data
+        self._written[:] = wrench.data[: len(self._written)]
 
     def displace(self, offset: NDArray[np.float64]) -> None:
         """Displaces the device before its first sample, in m and rad (rotation vector).

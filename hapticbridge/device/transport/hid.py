@@ -8,11 +8,13 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, TypeAlias
 
-from hapticbridge.device.driver import Driver, FoundDevice, access_problem
+from hapticbridge.device.base import calling_on_error
+from hapticbridge.device.driver import Driver, FoundDevice, access_problem, select_device
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import members, on_the_bus
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -35,45 +37,12 @@ list of products inspects only these; others, such as keyboards, are not opened.
 _INTERVAL, _UNITS = re.compile(r"(\d+)(ms|us)"), {"ms": 1e-3, "us": 1e-6}
 
 
-class HidHandle(Protocol):
-    """An open device, as in cython-hidapi; tests replace it by a model."""
+HidApi: TypeAlias = Any
+"""hidapi's module, which has no types; tests replace it by a model. ``enumerate`` lists the
+connected collections, ``device`` returns a handle that is not open yet."""
 
-    def open_path(self, path: bytes) -> None:
-        """Opens the device; raises OSError on failure."""
-
-    def set_nonblocking(self, enable: int) -> int:
-        """Makes ``read`` without a timeout return at once."""
-
-    def read(self, max_length: int, timeout_ms: int = 0) -> Sequence[int]:
-        """Returns one report, or an empty one after ``timeout_ms``."""
-
-    def write(self, data: bytes) -> int:
-        """Sends one report; its first byte is its number, 0 if reports have none."""
-
-    def send_feature_report(self, data: bytes) -> int:
-        """Sends a feature report; its first byte is its number, 0 if reports have none."""
-
-    def get_feature_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Requests a feature report."""
-
-    def get_input_report(self, report_num: int, max_length: int) -> Sequence[int]:
-        """Requests an input report."""
-
-    def get_report_descriptor(self) -> Sequence[int]:
-        """Returns the device's report descriptor."""
-
-    def close(self) -> None:
-        """Closes the device."""
-
-
-class HidApi(Protocol):
-    """hidapi's module: list of connected devices, and handles to open them."""
-
-    def enumerate(self, vendor_id: int = 0, product_id: int = 0) -> list[dict[str, Any]]:
-        """Lists the connected HID collections."""
-
-    def device(self) -> HidHandle:
-        """Returns a handle that is not open yet."""
+HidHandle: TypeAlias = Any
+"""An open device of hidapi. The first byte of a report is its number, 0 if reports have none."""
 
 
 def hid_api() -> HidApi | None:
@@ -84,7 +53,7 @@ def hid_api() -> HidApi | None:
     """
     for name in ("hidraw", "hid") if sys.platform == "linux" else ("hid",):
         try:
-            return cast("HidApi", importlib.import_module(name))
+            return importlib.import_module(name)
         except (ImportError, OSError):
             continue
     return None
@@ -243,22 +212,6 @@ FRESH_MS = 2
 LONGEST_WRITE = 0.05
 """Longest time in s for a device to accept a report. A full-speed device is polled every
 millisecond, so after 50 polls it never will; Linux gives up only after 5 s."""
-
-
-class Link(Protocol):
-    """Report transport of a device; ``HidLink`` is the real one."""
-
-    def take(self) -> list[bytes]:
-        """Returns the received reports without waiting."""
-
-    def wait(self, timeout_ms: int) -> bytes:
-        """Returns the next report, or an empty one after the timeout."""
-
-    def write(self, report: bytes) -> None:
-        """Sends a report, starting with its number."""
-
-    def close(self) -> None:
-        """Releases the device."""
 
 
 class HidLink:
@@ -430,3 +383,27 @@ class HidLink:
             return True  # no report waits, or it was just replaced
         finally:
             self._is_idle.set()
+
+
+@contextmanager
+def opened(
+    driver: Driver,
+    options: Mapping[str, object],
+    api: HidApi | None,
+    *,
+    is_overlapped: bool = True,
+    slots: int = 1,
+) -> Iterator[tuple[FoundDevice, HidLink]]:
+    """Opens a device by the options ``serial`` and ``log``; closes it if the block fails.
+
+    With a substitute of hidapi, ``api``, reports are sent without a thread.
+
+    Raises:
+        DeviceError: No device is found, or it cannot be opened.
+    """
+    plugged = select_device(driver, find(driver, api), options.get("serial"))
+    is_overlapped = is_overlapped and api is None
+    log = HexLog.from_options(options)
+    link = HidLink.open(plugged, api, is_overlapped=is_overlapped, log=log, slots=slots)
+    with calling_on_error(link.close):
+        yield plugged, link

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.check.cost import TICK_SHARE, WARM_UP, TimingStats
-from hapticbridge.check.observe import rehearsal_parameters
+from hapticbridge.check.observe import Setting, rehearsal_parameters
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import BoundKernel
@@ -83,7 +83,7 @@ def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDAr
     """
     model, data = scene.model, scene.data
     with _flags(model, variant):
-        parameters = rehearsal_parameters(scene, COUPLING, PERIOD)
+        parameters = rehearsal_parameters(scene, Setting(COUPLING, PERIOD))
         binding = BoundKernel(model, data, parameters)
         state, row = binding.state, binding.row
         samples = np.zeros(TICKS, SAMPLE_DTYPE)

@@ -85,6 +85,18 @@ class StabilityMap:
     draw: Callable[[Table, Mapping[str, Any]], Figure]
     sentences: Callable[[Mapping[str, Any]], Sentences]
 
+    @classmethod
+    def of(cls, module: Any) -> StabilityMap:
+        """Returns the map that a module holds under the names of these attributes."""
+        names = ("points", "evaluate", "summarize", "draw", "sentences")
+        functions = {name: getattr(module, name) for name in names}
+        return cls(
+            name=module.__name__.rpartition(".")[2],
+            doc=module.__doc__,
+            default_points=module.DEFAULT_POINTS,
+            **functions,
+        )
+
     @property
     def about(self) -> str:
         """Subject of the map in one sentence."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.lab.maps import base, contact_rigs
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.contact_rigs import PERIOD, TREATMENTS, ContactRun, Treatment, peg_runs
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
@@ -359,6 +359,10 @@ def _rule() -> tuple[Array, Array, list[Array]]:
     return steps, ratio, regions
 
 
+DEFAULT_POINTS = 333
+"""Approximate number of points by default."""
+
+
 def points(count: int) -> Sequence[Point]:
     """Returns timeconst by dampratio per panel and K, search and methods, ``count`` in all."""
     searches: list[Point] = [
@@ -449,15 +453,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "{created:.2g} J at most",
             one,
         )
-
-
-CONTACT = StabilityMap(
-    name="contact",
-    doc=__doc__,
-    default_points=333,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

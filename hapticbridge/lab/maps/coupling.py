@@ -15,7 +15,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
@@ -58,6 +58,10 @@ equal for every B."""
 
 PATH = base.swinging(0.0075, 1.5, duration=2.0, count=201)
 """Path of a hand that goes 5 mm deep into the wall three times in 2 s."""
+
+
+DEFAULT_POINTS = 6000
+"""Approximate number of points by default."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -331,15 +335,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "least, and (6) holds for what is used",
         {},
     )
-
-
-COUPLING = StabilityMap(
-    name="coupling",
-    doc=__doc__,
-    default_points=6000,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

@@ -22,7 +22,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -357,6 +357,10 @@ SMALLEST = 1e-4
 """Deviation in per cent that stems from rounding alone; no smaller one is quoted."""
 
 
+DEFAULT_POINTS = 400
+"""Approximate number of points by default."""
+
+
 def points(count: int) -> Sequence[Point]:
     """Returns a grid of β and σ, and dampers by method at which the friction needed is measured."""
     side = max(3, round(count**0.5))
@@ -488,11 +492,9 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
     return np.array(
         [
             quantization_limit(
-                SimulatedDevice(
-                    damping=float(b) * STIFFNESS * PERIOD,
-                    friction=float(s) * QUANTUM,
-                    resolution=RESOLUTION,
-                ).info,
+                float(b) * STIFFNESS * PERIOD,
+                float(s) * QUANTUM,
+                RESOLUTION,
                 coupling,
                 PERIOD,
             ).region
@@ -500,15 +502,3 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
         ],
         dtype=object,
     )
-
-
-DEVICE = StabilityMap(
-    name="device",
-    doc=__doc__,
-    default_points=400,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

@@ -20,7 +20,7 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -191,6 +191,10 @@ BOUNDS = {
 is 0 there."""
 
 
+DEFAULT_POINTS = 3600
+"""Approximate number of points by default."""
+
+
 def points(count: int) -> Sequence[Point]:
     """Returns a grid of length and stiffness for each method, about ``count`` in all, and limits.
 
@@ -345,15 +349,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "over all lengths; eq. (6), which has no length in it, says {predicted_6:.4g}",
             boundary[name] | {"name": name},
         )
-
-
-GEOMETRY = StabilityMap(
-    name="geometry",
-    doc=__doc__,
-    default_points=3600,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

@@ -20,7 +20,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.lab.closed_loop import PARTS, LoopOutcome, Timing
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -85,6 +85,10 @@ SEARCHED = (10.0, 1e6)
 """Range of every search for K in N/m, equal at all periods. Expected limits lie between 105 and 20
 000, and do not enter the search. A softer wall decays too slowly for a run. A much stiffer one
 needs another kind of hand, and longer runs to show it."""
+
+
+DEFAULT_POINTS = 110
+"""Approximate number of points by default."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -418,15 +422,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
                 {key: values[-1] for key, values in selected.items()}
                 | {"axis": AXES[what].capitalize(), "hand": hand},
             )
-
-
-RATE = StabilityMap(
-    name="rate",
-    doc=__doc__,
-    default_points=110,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

@@ -20,7 +20,7 @@ from matplotlib.lines import Line2D
 
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
 from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
@@ -284,6 +284,10 @@ LEAD = 0.2
 laws that a soft contact cannot distinguish would be named by chance."""
 
 
+DEFAULT_POINTS = 4200
+"""Approximate number of points by default."""
+
+
 def points(count: int) -> Sequence[Point]:
     """Returns contact settings, frictions and slides at angles that make about ``count``."""
     angles = np.linspace(0.05, 1.52, max(2, round(count / (len(SETTINGS) * len(FRICTIONS) * 3))))
@@ -366,15 +370,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "Newton's law {largest_by_newton:+.2g} J; the nearest law is {nearest}",
             selected | {"name": name, "nearest": selected["nearest_law"] or "none"},
         )
-
-
-RESTITUTION = StabilityMap(
-    name="restitution",
-    doc=__doc__,
-    default_points=4200,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

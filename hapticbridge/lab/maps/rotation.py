@@ -17,7 +17,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import RunSetup
 from hapticbridge.plotting import new_figure
@@ -278,6 +278,10 @@ LINES = (
 )
 """Method and K_r in N m/rad of the curves over the speed; with 0 the coupling acts on translation
 alone."""
+
+
+DEFAULT_POINTS = 1500
+"""Approximate number of points by default."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -555,15 +559,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "{weld:.1g} N m",
         cut["largest_torque_jump"],
     )
-
-
-ROTATION = StabilityMap(
-    name="rotation",
-    doc=__doc__,
-    default_points=1500,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

@@ -17,7 +17,7 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
-from hapticbridge.lab.maps.base import Point, Sentences, StabilityMap
+from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep.results import Table
@@ -176,6 +176,10 @@ LIMITS = 9
 
 SEARCHES = ("held still", "worst hand")
 """Ways to hold the handle in a search for a limit in mass."""
+
+
+DEFAULT_POINTS = 1000
+"""Approximate number of points by default."""
 
 
 def points(count: int) -> Sequence[Point]:
@@ -465,15 +469,3 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
                 "{disagreements} times",
                 selected.get(what, {}) | {"name": name, "what": what},
             )
-
-
-TOOL_MASS = StabilityMap(
-    name="tool_mass",
-    doc=__doc__,
-    default_points=1000,
-    points=points,
-    evaluate=evaluate,
-    summarize=summarize,
-    draw=draw,
-    sentences=sentences,
-)

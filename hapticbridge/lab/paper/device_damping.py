@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -51,6 +52,18 @@ def delayed(z: _Complex) -> _Complex:
     return np.asarray((K + B / PERIOD * (1 - 1 / z)) / z)
 
 
+def at_limit(quantity: str, expected: float, loop: SampledLoop, *, route: str = "") -> Check:
+    """Compares a damping in N s/m with that at which a sampled loop is at its limit."""
+    return Check(
+        quantity=quantity,
+        route=f"time-domain loop{route}, bisection",
+        expected=expected,
+        got=stability_limit(loop),
+        unit="N s/m",
+        tolerance=1e-3,
+    )
+
+
 def any_coupling() -> Section:
     """Walks through (2).
 
@@ -63,10 +76,9 @@ def any_coupling() -> Section:
     for every environment.
     """
     omega = THETA / PERIOD
-    digital = signal.dlti([K + B / PERIOD, -B / PERIOD], [1, 0], dt=PERIOD)
     curves = {
         "spring": damping_spectrum_of(lambda z: np.full_like(z, K), PERIOD, omega),
-        "spring and damper (4)": damping_spectrum_of(digital, PERIOD, omega),
+        "spring and damper (4)": damping_spectrum_of(lambda z: delayed(z) * z, PERIOD, omega),
         f"the same, damper low-passed with τ = {TAU * 1e3:g} ms": damping_spectrum_of(
             low_passed, PERIOD, omega
         ),
@@ -95,7 +107,6 @@ def any_coupling() -> Section:
         figure=figure,
         checks=(
             Check(
-                equation="(2)",
                 quantity="spring alone, b = KT/2",
                 route="frequency sweep",
                 expected=K * PERIOD / 2,
@@ -103,24 +114,18 @@ def any_coupling() -> Section:
                 unit="N s/m",
             ),
             Check(
-                equation="(2)",
                 quantity="low-passed damper, b = KT/2 + B T/(T + 2τ)",
                 route="frequency sweep of C as a callable of z",
                 expected=K * PERIOD / 2 + B * PERIOD / (PERIOD + 2 * TAU),
                 got=float(np.max(damping_spectrum_of(low_passed, PERIOD, omega))),
                 unit="N s/m",
             ),
-            Check(
-                equation="(2)",
-                quantity="low-passed damper against a wall, b at the limit of stability",
-                route="time-domain loop, bisection",
-                expected=float(filtered),
-                got=stability_limit(SampledLoop(COUPLING, PERIOD, filter_time=TAU)),
-                unit="N s/m",
-                tolerance=1e-3,
+            at_limit(
+                "low-passed damper against a wall, b at the limit of stability",
+                float(filtered),
+                SampledLoop(COUPLING, PERIOD, filter_time=TAU),
             ),
             Check(
-                equation="(2)",
                 quantity="one sample late, b for every environment",
                 route="frequency sweep",
                 expected=np.inf,
@@ -305,7 +310,6 @@ def direct_section() -> Section:
         figure=figure,
         checks=(
             Check(
-                equation="(1)",
                 quantity="lateral stiffness 2K_c",
                 route="second difference of the contacts' energy",
                 expected=2 * CONTACT,
@@ -314,7 +318,6 @@ def direct_section() -> Section:
                 tolerance=1e-6,
             ),
             Check(
-                equation="(1)",
                 quantity="rotational stiffness ½K_c L² (erratum) at the limit, 2b_θ/T",
                 route="second difference of the contacts' energy",
                 expected=float(maximum_stiffness(DEVICE, PERIOD)),
@@ -324,7 +327,6 @@ def direct_section() -> Section:
                 tolerance=1e-6,
             ),
             Check(
-                equation="(1)",
                 quantity=f"b_θ at which L = {1e3 * limit:.2f} mm is stable",
                 route="time-domain loop, bisection",
                 expected=DEVICE,
@@ -333,7 +335,6 @@ def direct_section() -> Section:
                 tolerance=1e-3,
             ),
             Check(
-                equation="(1)",
                 quantity="b_θ needed behind the coupling, largest over L = 2 … 300 mm",
                 route="frequency sweep, against the bound (6) of the coupling",
                 expected=bound,
@@ -424,14 +425,11 @@ def backward_difference() -> Section:
 
     bound = K * PERIOD / 2 + B
     loops = [
-        Check(
-            equation="(6)",
-            quantity=f"wall, T = {period * 1e3:g} ms: b at the limit of stability",
-            route="time-domain loop with the worst hand, bisection",
-            expected=K * period / 2 + B,
-            got=stability_limit(SampledLoop(COUPLING, period)),
-            unit="N s/m",
-            tolerance=1e-3,
+        at_limit(
+            f"wall, T = {period * 1e3:g} ms: b at the limit of stability",
+            K * period / 2 + B,
+            SampledLoop(COUPLING, period),
+            route=" with the worst hand",
         )
         for period in (5e-4, 1e-3, 2e-3)
     ]
@@ -450,7 +448,6 @@ def backward_difference() -> Section:
         figure=figure,
         checks=(
             Check(
-                equation="(6)",
                 quantity="b = KT/2 + B",
                 route="frequency sweep of (2)",
                 expected=bound,
@@ -459,7 +456,6 @@ def backward_difference() -> Section:
             ),
             *loops,
             Check(
-                equation="(6)",
                 quantity="sufficiency: residual of the energy identity",
                 route="random motion, K, B and b in three dimensions",
                 expected=0.0,
@@ -467,7 +463,6 @@ def backward_difference() -> Section:
                 tolerance=1e-12,
             ),
             Check(
-                equation="(6)",
                 quantity="heavy tool, b at the limit of stability",
                 route="MuJoCo in the loop, bisection",
                 expected=bound,
@@ -519,7 +514,6 @@ def tustin() -> Section:
         figure=figure,
         checks=(
             Check(
-                equation="(7)",
                 quantity="largest difference from the closed form in γ, relative",
                 route="frequency sweep of (2) with (5)",
                 expected=0.0,
@@ -527,7 +521,6 @@ def tustin() -> Section:
                 tolerance=1e-6,
             ),
             Check(
-                equation="(7)",
                 quantity="b at ω → 0, (KT)²/(2(KT + 2B))",
                 route="frequency sweep at 0.016 Hz",
                 expected=(K * PERIOD) ** 2 / (2 * (K * PERIOD + 2 * B)),
@@ -536,7 +529,6 @@ def tustin() -> Section:
                 tolerance=1e-6,
             ),
             Check(
-                equation="(7)",
                 quantity=f"b at {SHORT:g} rad before Nyquist, 8B²/((KT + 2B)(π − ωT)²)",
                 route="frequency sweep, against the growth of (7) without limit",
                 expected=8 * B**2 / ((K * PERIOD + 2 * B) * SHORT**2),
@@ -550,7 +542,6 @@ def tustin() -> Section:
                 tolerance=1e-6,
             ),
             Check(
-                equation="(7)",
                 quantity=f"mass of {LIGHT:g} kg behind it: b at the limit, ten times (6) and more",
                 route="time-domain loop with the worst hand, bisection",
                 expected=10 * (STIFF.stiffness * PERIOD / 2 + STIFF.damping),
@@ -561,14 +552,10 @@ def tustin() -> Section:
                 tolerance=0.0,
                 relation="at least",
             ),
-            Check(
-                equation="(7)",
-                quantity="B = 0: b = KT/2, as for (6)",
-                route="time-domain loop, bisection",
-                expected=K * PERIOD / 2,
-                got=stability_limit(SampledLoop(spring_with(0.0), PERIOD, discretization="tustin")),
-                unit="N s/m",
-                tolerance=1e-3,
+            at_limit(
+                "B = 0: b = KT/2, as for (6)",
+                K * PERIOD / 2,
+                SampledLoop(spring_with(0.0), PERIOD, discretization="tustin"),
             ),
         ),
     )
@@ -618,21 +605,11 @@ def worst_hand_section() -> Section:
     for period, delay, filter_time in product(PERIODS, DELAYS, FILTER_TIMES):
         case = SampledLoop(COUPLING, period, delay=delay, filter_time=filter_time)
         expected = float(minimum_damping(COUPLING, period, delay=delay, filter_time=filter_time))
-        checks.append(
-            Check(
-                equation="worst hand",
-                quantity=f"T = {1e3 * period:g} ms, delay {delay}, τ = {1e3 * filter_time:g} ms: "
-                "b at the limit",
-                route="time-domain loop, bisection, against the bound over frequency",
-                expected=expected,
-                got=stability_limit(case),
-                unit="N s/m",
-                tolerance=1e-3,
-            )
-        )
+        case_name = f"T = {1e3 * period:g} ms, delay {delay}, τ = {1e3 * filter_time:g} ms"
+        found = at_limit(f"{case_name}: b at the limit", expected, case)
+        checks.append(replace(found, route=f"{found.route}, against the bound over frequency"))
     checks.extend(
         Check(
-            equation="worst hand",
             quantity=f"heavy tool, b = {share:g} of (6): 1 if the force decays",
             route="MuJoCo in the loop",
             expected=expected,
@@ -655,7 +632,7 @@ def worst_hand_section() -> Section:
         name="worst_hand",
         caption="Force at 0.98 and 1.02 of the damping needed, in the plain loop and with MuJoCo.",
         figure=figure,
-        checks=tuple(checks),
+        checks=checks,
     )
 
 

@@ -122,7 +122,6 @@ def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
     found = float(impact.impulse[1]), float(impact.impulse[0]), got
     kept = [
         Check(
-            equation="§4",
             quantity=f"rod, {law}: {quantity}",
             route="closed form, against "
             + ("the exact decimals" if is_rational else "six decimals"),
@@ -139,7 +138,6 @@ def _checks_of_rod(law: Law, impact: Impact, stepped: float) -> list[Check]:
     )
     return kept + [
         Check(
-            equation="§4",
             quantity=f"rod, {law}: change of kinetic energy",
             route=route,
             expected=got,
@@ -155,7 +153,6 @@ def _checks_of_random_rods(share: dict[Law, float]) -> list[Check]:
     """Compares the shares of rods that gain energy with 0, and Newton's with its kept value."""
     checks = [
         Check(
-            equation="§4",
             quantity=f"random rods, {law}: share that gains energy",
             route=f"{IMPACTS // 1000} 000 impacts",
             expected=0.0,
@@ -167,7 +164,6 @@ def _checks_of_random_rods(share: dict[Law, float]) -> list[Check]:
     ]
     checks.append(
         Check(
-            equation="§4",
             quantity="random rods, newton: share that gains energy",
             route=f"{IMPACTS // 1000} 000 impacts, against 5 million others kept here",
             expected=GAINING,
@@ -214,7 +210,7 @@ def section() -> Section:
         caption="Left: the rod's impulses and where each law ends. Right: change of energy of "
         f"{IMPACTS // 1000} 000 random rods; v is the velocity of the tip.",
         figure=_drawn(impacts, gains, share),
-        checks=tuple(checks),
+        checks=checks,
         table=Table(
             (
                 "law",

@@ -530,7 +530,6 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
             in_time = stability_limit(loop)
             checks.append(
                 Check(
-                    equation="(19)",
                     quantity=f"{what}b needed, to four decimals",
                     route="closed form, against the value kept here",
                     expected=expected,
@@ -541,7 +540,6 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
             )
             checks.append(
                 Check(
-                    equation="(19)",
                     quantity=f"{what}b at the limit of stability",
                     route="time-domain loop with the worst hand, bisection",
                     expected=closed,
@@ -553,7 +551,6 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
             if np.isfinite(closed):
                 checks.append(
                     Check(
-                        equation="(19)",
                         quantity=f"{what}b needed",
                         route="the inequality above, swept over frequency",
                         expected=closed,
@@ -567,7 +564,6 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
                 measured = least_in_mujoco(mass, integrator)
                 checks.append(
                     Check(
-                        equation="(19)",
                         quantity=f"{what}b at the limit of stability",
                         route="MuJoCo in the loop, bisection",
                         expected=closed,
@@ -624,7 +620,6 @@ def virtual_mass_section() -> Section:
     for integrator, expected in least.items():
         checks.append(
             Check(
-                equation="(19)",
                 quantity=f"least stable mass, {MASS_NAMES[integrator]}",
                 route="time-domain loop, handle held still, bisection",
                 expected=expected,
@@ -652,7 +647,7 @@ def virtual_mass_section() -> Section:
         "which the tool is stable by itself; under explicit Euler there is none for B ≤ "
         "KT.",
         figure=figure,
-        checks=tuple(checks),
+        checks=checks,
         table=Table(
             (
                 "mass (kg)",

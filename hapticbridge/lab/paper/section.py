@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +30,7 @@ class Check:
     ``route`` states that.
 
     Attributes:
-        equation: Number of the equation in the paper: ``(6)``.
+        equation: Number of the equation in the paper: ``(6)``; empty takes the section's.
         quantity: Name of the number.
         route: Origin of ``got``, against that of ``expected``.
         expected: Value from the equation.
@@ -41,11 +41,11 @@ class Check:
         relation: ``equals``, or the kind of bound that ``expected`` is for ``got``.
     """
 
-    equation: str
     quantity: str
     route: str
     expected: float
     got: float
+    equation: str = ""
     tolerance: float = 1e-9
     unit: str = ""
     relation: Relation = "equals"
@@ -109,8 +109,12 @@ class Section:
     name: str
     caption: str
     figure: Figure
-    checks: tuple[Check, ...]
+    checks: Sequence[Check]
     table: Table | None = None
+
+    def __post_init__(self) -> None:
+        named = [replace(check, equation=check.equation or self.equation) for check in self.checks]
+        object.__setattr__(self, "checks", tuple(named))
 
 
 def explained(doc: str | None, **numbers: float) -> tuple[str, ...]:

@@ -131,7 +131,6 @@ def section() -> Section:
     for trip in ROUND_TRIPS:
         checks.append(
             Check(
-                equation="future work",
                 quantity=f"line, {_samples(trip)} there and back: b at the limit",
                 route=f"time-domain loop with the worst hand at θ = {TURN:g} rad",
                 expected=float(
@@ -146,7 +145,6 @@ def section() -> Section:
         )
         checks.append(
             Check(
-                equation="future work",
                 quantity=f"line, {_samples(trip)}: static stiffness of the stiffest, 2b/(nT)",
                 route="handle pushed once, mean force",
                 expected=_stiffest(trip),
@@ -157,7 +155,6 @@ def section() -> Section:
     best = float(maximum_stiffness(IMPEDANCE, PERIOD))
     checks.append(
         Check(
-            equation="future work",
             quantity="stiffness of the line with one sample each way, over the spring's: ½",
             route="static push and time-domain limits of both",
             expected=0.5,
@@ -178,7 +175,7 @@ def section() -> Section:
         caption=f"Left: damping needed over frequency, Z = {IMPEDANCE:g} N s/m. Right: what a "
         "device allows.",
         figure=figure,
-        checks=tuple(checks),
+        checks=checks,
         table=Table(
             ("coupling", "largest static stiffness at b = 2 N s/m, 1 kHz (N/m)"),
             (
