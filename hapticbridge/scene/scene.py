@@ -119,7 +119,8 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, and a margin of ``MARGIN`` at least.
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the points
+        of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
@@ -128,16 +129,19 @@ class Scene:
         if not is_rigid:
             for name, value in own.items():
                 setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
-            own.clear()
+            use_exact_points(model, is_used=False)
+            self._own_contact = {}
             return
-        own |= {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
+        own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
         own |= {name: getattr(model, name).copy() for name in _MARGINS}
+        self._own_contact = own  # a new object: copies of the scene share the old one
         for name, value in _CONTACT_OPTIONS.items():
             setattr(model.opt, name, value)
         model.opt.o_margin = max(own["o_margin"], MARGIN)
         for name in _MARGINS:
             margins = getattr(model, name)
             margins[:] = np.maximum(margins, MARGIN)
+        use_exact_points(model)
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
