@@ -125,7 +125,6 @@ class Scene:
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
             return
-        use_exact_points(model, is_used=is_rigid)
         if not is_rigid:
             for name, value in own.items():
                 setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
