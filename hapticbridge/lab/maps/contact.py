@@ -226,8 +226,8 @@ def _draw_depths(axes: Axes, found: Sequence[Mapping[str, Any]], quantity: str, 
         axes.plot(np.maximum(depths, 1e-4), COMPARED_RIGS, "osv^D"[place], ms=4, label=treatment)
     axes.set(xscale="log", xlabel=words)
     axes.invert_yaxis()
-    if quantity == "median_depth":
-        axes.legend(fontsize="x-small")
+    if quantity == "largest_depth":
+        axes.legend(fontsize="x-small", loc="upper left")
 
 
 def _is(one: Mapping[str, Any], treatment: str, rig: str) -> bool:
