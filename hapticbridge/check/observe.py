@@ -273,6 +273,7 @@ def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
         handle_origin=scene.grip_pose(),
         device_start=IDENTITY_POSE,
         scheme=method.scheme,
+        is_rigid=method.is_rigid,
     )
 
 
