@@ -115,6 +115,11 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
 
+    @property
+    def has_rigid_contact(self) -> bool:
+        """True if the options of rigid contacts are set."""
+        return bool(self._own_contact)
+
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
@@ -125,6 +130,7 @@ class Scene:
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
             return
+        use_exact_points(model, is_used=is_rigid)
         if not is_rigid:
             for name, value in own.items():
                 setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
