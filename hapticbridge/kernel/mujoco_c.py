@@ -36,6 +36,7 @@ def _library() -> Path:
 llvmlite.binding.load_library_permanently(str(_library()))
 
 mj_step: Any = external("mj_step", "void(intp, intp)")
+mj_step1: Any = external("mj_step1", "void(intp, intp)")
 mj_step2: Any = external("mj_step2", "void(intp, intp)")
 mj_kinematics: Any = external("mj_kinematics", "void(intp, intp)")
 mj_fwd_kinematics: Any = external("mj_fwdKinematics", "void(intp, intp)")
@@ -172,7 +173,7 @@ def field_address(data: mujoco.MjData, name: str) -> int:
 
 
 def contact_layout() -> dict[str, int]:
-    """Returns the size of ``mjContact`` and the offsets that a tick reads, in bytes."""
+    """Returns the size of ``mjContact`` and the offsets that a tick uses, in bytes."""
     contact = struct_of("mjContact")
     fields = {
         "distance": "dist",
@@ -181,6 +182,10 @@ def contact_layout() -> dict[str, int]:
         "geoms": "geom",
         "dim": "dim",
         "row": "efc_address",
+        "friction": "friction",
+        "solref": "solref",
+        "solreffriction": "solreffriction",
+        "solimp": "solimp",
     }
     offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
     return {"size": ctypes.sizeof(contact), **offsets}
@@ -250,6 +255,10 @@ _DATA_FIELDS = (
     "efc_type",
     "efc_id",
     "efc_pos",
+    "efc_margin",
+    "efc_vel",
+    "efc_aref",
+    "efc_R",
     "efc_force",
     "contact",
 )
@@ -268,7 +277,19 @@ _OWNED = (
 )
 _MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
 _SIZES = ("nq", "nv", "na", "nhistory", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
-_CONTACT = ("size", "distance", "point", "frame", "geoms", "dim", "row")
+_CONTACT = (
+    "size",
+    "distance",
+    "point",
+    "frame",
+    "geoms",
+    "dim",
+    "row",
+    "friction",
+    "solref",
+    "solreffriction",
+    "solimp",
+)
 _IDS = (
     "handle_mocap_id",
     "handle_site_id",

@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: twelve sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: fourteen sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -18,6 +18,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
+| contact     | tank and share of rigid contacts                  | rigid_contact                 |
 | timing      | delay of the force, energy that it may have given | timing                        |
 """
 
@@ -56,9 +57,10 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     observe_reset,
 )
+from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact
 from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
-from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
+from hapticbridge.kernel.tick import LOOP_DTYPE, between_halves, discard_wrench, pause
 from hapticbridge.kernel.tick_guard import (
     GUARD_DTYPE,
     bind_guard,
@@ -68,6 +70,8 @@ from hapticbridge.kernel.tick_guard import (
 )
 from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
+
+MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
 _FROM_PARAMETERS = (
     "period",
@@ -125,6 +129,7 @@ STATE_DTYPE = np.dtype(
         ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
         ("springs", SPRINGS_DTYPE),
+        ("contact", RIGID_DTYPE),
         ("timing", TIMING_DTYPE),
     ]
 )
@@ -176,6 +181,26 @@ class BoundKernel:
     def slack(self) -> float:
         """Energy in J that the environment may have created so far."""
         return float(self.state["energy"]["slack"][0])
+
+    @property
+    def step(self) -> MujocoStep:
+        """MuJoCo's part of a substep through the Python bindings.
+
+        ``kernel.tick.advance`` calls the C functions with equal results to the bit.
+        """
+        plain: MujocoStep = mujoco.mj_step
+        if self._record["run"]["scheme"] == Scheme.MASSLESS:
+            plain = mujoco.mj_fwdPosition
+        if not self._record["contact"]["is_rigid"]:
+            return plain
+        state, aim = self.state, direct(between_halves, self.state)
+
+        def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            mujoco.mj_step1(model, data)
+            aim(state)
+            mujoco.mj_step2(model, data)
+
+        return step
 
     def resume(self) -> None:
         """Starts the ramp at the next tick, after a pause in which zero was commanded."""
@@ -281,6 +306,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
+        bind_contact(s["contact"], parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record
