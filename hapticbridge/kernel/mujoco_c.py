@@ -24,7 +24,8 @@ from hapticbridge.jit import Deferred, compiled, external, intrinsic
 from hapticbridge.kernel.codes import Part
 
 
-def _library() -> Path:
+def library_path() -> Path:
+    """Returns MuJoCo's library, which the Python bindings use too."""
     folder = Path(mujoco.__file__).parent
     for pattern in ("libmujoco.so.*", "libmujoco.*.dylib", "mujoco.dll"):
         for path in folder.glob(pattern):
@@ -33,7 +34,7 @@ def _library() -> Path:
 
 
 # Makes the symbols known to the compiler's linker; the Python bindings use the same library file.
-llvmlite.binding.load_library_permanently(str(_library()))
+llvmlite.binding.load_library_permanently(str(library_path()))
 
 mj_step: Any = external("mj_step", "void(intp, intp)")
 mj_step1: Any = external("mj_step1", "void(intp, intp)")
@@ -92,6 +93,13 @@ def floats(address: int, count: int) -> NDArray[np.float64]:
 
 
 @compiled
+def singles(address: int, count: int) -> NDArray[np.float32]:
+    """Returns ``count`` numbers of single precision at an address, as a view."""
+    view: NDArray[np.float32] = _view(_as_pointer(address), count, np.float32)
+    return view
+
+
+@compiled
 def ints(address: int, count: int) -> NDArray[np.int32]:
     """Returns ``count`` 32-bit integers at an address, as a view."""
     view: NDArray[np.int32] = _view(_as_pointer(address), count, np.int32)
@@ -133,6 +141,8 @@ def has_warned(mj: Part) -> bool:
 _SCALARS: dict[str, Any] = {
     "int": ctypes.c_int,
     "mjtNum": ctypes.c_double,
+    "float": ctypes.c_float,
+    "char": ctypes.c_char,
     "mjtByte": ctypes.c_ubyte,
     "mjtBool": ctypes.c_bool,
     "mjtSize": ctypes.c_int64,
@@ -150,6 +160,8 @@ def _ctype(declared: Any) -> Any:
         for extent in reversed(declared.extents):
             inner = inner * extent
         return inner
+    if isinstance(declared, ast_nodes.AnonymousStructDecl):
+        return _structure("anonymous", declared.fields)
     if declared.name in _SCALARS:
         return _SCALARS[declared.name]
     if declared.name in structs.STRUCTS:
@@ -163,7 +175,11 @@ def _ctype(declared: Any) -> Any:
 @cache
 def struct_of(name: str) -> Any:
     """Returns the ctypes structure of a C struct of MuJoCo, by its name."""
-    fields = [(field.name, _ctype(field.type)) for field in structs.STRUCTS[name].fields]
+    return _structure(name, structs.STRUCTS[name].fields)
+
+
+def _structure(name: str, declared: Any) -> Any:
+    fields = [(field.name, _ctype(field.type)) for field in declared]
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 

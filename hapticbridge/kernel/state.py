@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
+from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_home, set_tool
@@ -249,6 +250,7 @@ class BoundKernel:
 
     def _bind_model(self, parameters: RunParameters) -> None:
         model, data, mj = self._model, self._data, self._record["mj"]
+        bind_colliders(model)
         values, owned = model_addresses(model, data)
         for name, value in values.items():
             mj[name] = value
