@@ -12,6 +12,7 @@ import numpy as np
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
@@ -118,7 +119,8 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, and a margin of ``MARGIN`` at least.
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the points
+        of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
@@ -126,6 +128,7 @@ class Scene:
         if not is_rigid:
             for name, value in own.items():
                 setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+            use_exact_points(model, is_used=False)
             self._own_contact = {}
             return
         own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
@@ -137,6 +140,7 @@ class Scene:
         for name in _MARGINS:
             margins = getattr(model, name)
             margins[:] = np.maximum(margins, MARGIN)
+        use_exact_points(model)
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
