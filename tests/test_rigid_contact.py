@@ -244,6 +244,38 @@ def test_without_the_tank_a_contact_creates_energy() -> None:
     assert not strict(run)
 
 
+RAILS = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0"/>
+  <default><joint limited="true" range="-0.004 0.003" solreflimit="-1000000 -500"
+    solimplimit="0.9 0.95 0.001"/><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="tool">
+    <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+    <joint type="slide" axis="0 0 1"/><joint axis="1 0 0" range="-0.02 0.03"/>
+    <joint axis="0 1 0" range="-0.02 0.03"/><joint axis="0 0 1" range="-0.02 0.03"/>
+    <geom type="box" size="0.01 0.01 0.03" mass="0.01"/><site name="grip"/></body></worldbody>
+</mujoco>"""
+
+
+def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
+    stiff = Coupling(6000.0, 0.5, 0.6, 5e-5)
+    runs = {}
+    for contact in ("rigid", "scene"):
+        loaded = load(RAILS)
+        own = loaded.model.jnt_solref.copy(), loaded.model.jnt_solimp.copy()
+        samples = jamming(1)
+        samples["position"] *= 2.0
+        runs[contact] = through(prepared(loaded, "implicit", stiff, contact), samples)
+        assert (loaded.model.jnt_solref == own[0]).all()
+        assert (loaded.model.jnt_solimp == own[1]).all()
+    assert strict(runs["rigid"])
+    assert not strict(runs["scene"])
+    settled = load(RAILS)
+    run = through(prepared(settled), pressed(1000, 15.0))
+    assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
+
+
 # Sharpness
 
 

@@ -227,6 +227,8 @@ class BoundKernel:
         """Puts back what a step that was broken off left in the model, at the end of a run."""
         if self._restore_springs is not None:
             self._restore_springs(self._record)
+        self._model.jnt_solref[:] = self._owned["own_solref"]
+        self._model.jnt_solimp[:] = self._owned["own_solimp"]
 
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
@@ -308,7 +310,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
-        bind_contact(s["contact"], parameters)
+        self._owned |= bind_contact(s["contact"], self._model, parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record
