@@ -319,9 +319,12 @@ def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
 @pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
 def test_compiled_ticks_equal_those_through_mujocos_bindings(method: str) -> None:
     samples = jamming(7, 600)
-    peg = {"mass": 0.03, "mu": 0.1}
-    one = go_on(prepared(scene(PEG, **peg), method), samples)
-    other = through(prepared(scene(PEG, **peg), method), samples)
+
+    def peg() -> Scene:
+        return scene(PEG, mass=0.03, mu=0.1)
+
+    one = go_on(prepared(peg(), method), samples)
+    other = through(prepared(peg(), method), samples)
     assert one.ticks.tobytes() == other.ticks.tobytes()
     assert int(one.binding.state["contact"]["repetitions"][0]) > 0
     assert strict(one)
