@@ -485,20 +485,11 @@ def static_load(scene: Scene) -> NDArray[np.float64]:
 
     World frame, about the grip. The tool settles on the coupling with the handle at its grip; its
     motion is stopped whenever its kinetic energy has passed a peak (dynamic relaxation with kinetic
-    damping). The scene itself is not changed. Zero if the tool rests without a hand, or does not
-    settle because the scene moves it. The contacts are those of the scene, because MuJoCo's own
-    step would push a tool out of the margin of rigid ones.
+    damping), on the scene's own contacts: MuJoCo alone would push at the margin of rigid ones. The
+    scene itself is not changed. Zero if the tool rests without a hand, or does not settle because
+    the scene moves it.
     """
-    is_rigid = scene.has_rigid_contact
-    scene.set_contact(is_rigid=False)
-    try:
-        return _settled_load(scene)
-    finally:
-        scene.set_contact(is_rigid=is_rigid)
-
-
-def _settled_load(scene: Scene) -> NDArray[np.float64]:
-    model, load = scene.model, np.zeros(6)
+    model, load = scene.model_with_own_contact(), np.zeros(6)
     data = mujoco.MjData(model)
     mujoco.mj_copyData(data, model, scene.data)
     mujoco.mj_forward(model, data)

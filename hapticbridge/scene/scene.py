@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -115,11 +116,6 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
 
-    @property
-    def has_rigid_contact(self) -> bool:
-        """True if the options of rigid contacts are set."""
-        return bool(self._own_contact)
-
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
@@ -130,11 +126,8 @@ class Scene:
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
             return
-        use_exact_points(model, is_used=is_rigid)
         if not is_rigid:
-            for name, value in own.items():
-                setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
-            use_exact_points(model, is_used=False)
+            self._restore_contact(model)
             self._own_contact = {}
             return
         own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
@@ -147,6 +140,19 @@ class Scene:
             margins = getattr(model, name)
             margins[:] = np.maximum(margins, MARGIN)
         use_exact_points(model)
+
+    def _restore_contact(self, model: mujoco.MjModel) -> None:
+        for name, value in self._own_contact.items():
+            setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+        use_exact_points(model, is_used=False)
+
+    def model_with_own_contact(self) -> mujoco.MjModel:
+        """Returns the model if its contacts are the scene's own, else a copy that has these."""
+        if not self._own_contact:
+            return self.model
+        model = copy.copy(self.model)
+        self._restore_contact(model)
+        return model
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
