@@ -48,7 +48,7 @@ def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ("<mujoco>\n\n<worldbody><body pos='a b c'/></worldbody></mujoco>", ["'pos'", "line 3"]),
         ("<mujoco><include file='gone.xml'/></mujoco>", ["'gone.xml'", "line 1"]),
         ("<mujoco><include file='part.xml'/></mujoco>", ["line 3 is not well-formed XML"]),
-        ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["grip"]),
+        ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["'gone.stl'"]),
         (mjcf("<asset><mesh name='m' file='gone.stl'/></asset>"), ["'gone.stl'"]),
         (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
         (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),

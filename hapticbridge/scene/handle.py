@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError, choices
+from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.scene.compile import go_to_start
 
@@ -186,20 +186,10 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
         grip: Name of the site on the tool.
 
     Raises:
-        SceneError: The site does not exist, or the scene uses a name that the bridge adds.
+        SceneError: The scene uses a name that the bridge adds.
     """
-    sites = [site.name for site in spec.sites if site.name]
-    if grip not in sites:
-        remedy = (
-            "name one of them (--grip, or grip= in Python)"
-            if sites
-            else f'put <site name="{grip or "grip"}"/> into the tool\'s body'
-        )
-        raise SceneError(
-            f"the scene has no site '{grip}' to grip the tool by; sites: {choices(sites)}; {remedy}"
-        )
     _refuse_taken("body", HANDLE, [body.name for body in spec.bodies])
-    _refuse_taken("site", HANDLE, sites)
+    _refuse_taken("site", HANDLE, [site.name for site in spec.sites])
     for name in COUPLING_ACTUATORS:
         _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
     # a weld is added later and identified by its name only
