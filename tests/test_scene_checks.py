@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.inputs import input_writes
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    HANDLE,
+    PREFIX,
+    WELD_NAME,
+    added_id,
+    coupling_ids,
+)
 from hapticbridge.scene import load_scene, scene_names, scene_path
 
 
@@ -69,45 +76,33 @@ def test_unreadable_file_is_told_with_line(tmp_path: Path, text: str, words: lis
     assert "must end in .xml" in refusal(scene_file(tmp_path, text, "scene.mjcf"))
 
 
-def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Path) -> None:
-    body = "<body><freejoint/><geom size='.01'/><site name='tip'/><site/><site name='heel'/></body>"
-    message = refusal_of(tmp_path, mjcf(body=body))
-    assert "no site 'grip' to grip the tool by; sites: 'heel', 'tip'; name one of them" in message
-    assert "--grip" in message
-    none = refusal_of(tmp_path, mjcf(body=body.replace("site name", "geom size='.01' name")))
-    assert none.endswith('sites: none exist; put <site name="grip"/> into the tool\'s body')
-    path = scene_file(tmp_path, mjcf(body=body))
-    assert load_scene(path, grip="heel").grip == "heel"
-    assert "no site ''" in refusal(path, "")
+def test_scene_may_use_any_name_but_under_our_prefix(tmp_path: Path) -> None:
+    body = HINGE_TOOL.format(joint="").replace("elbow", "handle").replace('"arm"', '"handle"')
+    names = ("handle", *(name.removeprefix(PREFIX) for name in COUPLING_ACTUATORS))
+    motors = "".join(f"<motor name='{name}' joint='handle'/>" for name in names)
+    world = "<site name='handle'/><body name='hapticbridge'/>"
+    weld = "<equality><weld name='handle_weld' body1='handle'/></equality>"
+    text = mjcf(f"<actuator>{motors}</actuator>{weld}", body=body, world=world)
+    model = load_scene(scene_file(tmp_path, text)).model
+    assert coupling_ids(model) == tuple(range(7, 13))
+    assert model.body_mocapid[added_id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE)] == 0
+    assert added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) == -1
+    for kind in ("<body name='{}'/>", "<site name='{}'/>"):
+        world = kind.format(f"{PREFIX}x")
+        assert f"name '{PREFIX}x'" in refusal_of(tmp_path, mjcf(world=world))
 
 
-WELD = "<weld name='handle_weld' body1='arm'/>"
-
-
-@pytest.mark.parametrize(
-    ("world", "actuator", "culprit"),
-    [
-        ("<body name='handle'/>", "", "body 'handle'"),
-        ("<site name='handle'/>", "", "site 'handle'"),
-        ("", f"<equality>{WELD}</equality>", "equality constraint 'handle_weld'"),
-        *[
-            ("", f"<actuator><motor name='{name}' joint='elbow'/></actuator>", f"actuator '{name}'")
-            for name in COUPLING_ACTUATORS
-        ],
-    ],
-)
-def test_our_names_are_refused(tmp_path: Path, world: str, actuator: str, culprit: str) -> None:
-    text = mjcf(actuator, body=HINGE_TOOL.format(joint=""), world=world)
-    message = refusal_of(tmp_path, text)
-    assert culprit in message
-    assert "rename it" in message
-
-
-def test_names_of_ours_are_free_for_other_kinds_of_things(tmp_path: Path) -> None:
-    body = HINGE_TOOL.format(joint="").replace("elbow", "handle").replace('"arm"', '"coupling_x"')
-    actuator = "<actuator><motor name='coupling_left' joint='handle'/></actuator>"
-    world = "<geom name='handle' size='.01' pos='1 0 0'/><body name='hapticbridge_handle'/>"
-    assert load_scene(scene_file(tmp_path, mjcf(actuator, body=body, world=world))).model.nu == 7
+def test_names_of_earlier_recordings_are_found() -> None:
+    motors = "".join(
+        f"<motor name='{name.removeprefix(PREFIX)}' site='grip'/>" for name in COUPLING_ACTUATORS
+    )
+    weld = "<equality><weld name='handle_weld' body1='tool'/></equality>"
+    handle = "<body name='handle' mocap='true'><site name='handle'/></body>"
+    text = mjcf(f"<actuator><motor joint='tool'/>{motors}</actuator>{weld}", world=handle)
+    model = mujoco.MjModel.from_xml_string(text)
+    assert coupling_ids(model) == tuple(range(1, 7))
+    assert added_id(model, mujoco.mjtObj.mjOBJ_SITE, HANDLE) == model.site("handle").id
+    assert added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) == 0
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME
 from hapticbridge.scene.compile import go_to_start
 
 # Weld between grip and handle (MuJoCo's equality constraint)
@@ -174,43 +174,31 @@ def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> floa
     return float(0.5 * force if axis >= 3 else force)
 
 
-_PREFIX = "hapticbridge_"
-"""Prefix that separates the handle's default class from the scene's classes."""
-
-
 def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
-    """Adds the mocap body ``handle`` with its site, and the six coupling actuators.
+    """Adds a mocap body, the handle, with its site, and the six coupling actuators.
 
     Args:
         spec: The user's scene; changed in place.
         grip: Name of the site on the tool.
 
     Raises:
-        SceneError: The scene uses a name that the bridge adds.
+        SceneError: The scene has a name that starts with ``PREFIX``.
     """
-    _refuse_taken("body", HANDLE, [body.name for body in spec.bodies])
-    _refuse_taken("site", HANDLE, [site.name for site in spec.sites])
-    for name in COUPLING_ACTUATORS:
-        _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
-    # a weld is added later and identified by its name only
-    _refuse_taken("equality constraint", WELD_NAME, [each.name for each in spec.equalities])
-
+    elements = (*spec.bodies, *spec.sites, *spec.actuators, *spec.equalities)
+    if taken := [each.name for each in elements if each.name.startswith(PREFIX)]:
+        raise SceneError(
+            f"the scene has the name '{taken[0]}', and names that start with '{PREFIX}' are those "
+            "that the bridge adds; rename it"
+        )
     # in a specification of its own: a <default> of the scene could rotate the handle's site, and
     # boundmass could give it mass
     handle_spec = mujoco.MjSpec()
     handle = handle_spec.worldbody.add_body(name=HANDLE, mocap=True)
     handle.add_site(name=HANDLE)
-    body = spec.worldbody.add_frame().attach_body(handle, _PREFIX, "")
+    body = spec.worldbody.add_frame().attach_body(handle, PREFIX, "")
     body.name = body.sites[0].name = HANDLE
     for axis, name in enumerate(COUPLING_ACTUATORS):
         _add_coupling_actuator(spec, name, axis, grip)
-
-
-def _refuse_taken(kind: str, name: str, taken: list[str]) -> None:
-    if name in taken:
-        raise SceneError(
-            f"the scene already has {kind} '{name}', a name that the bridge adds; rename it"
-        )
 
 
 def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str) -> None:
