@@ -296,8 +296,8 @@ class Check:
     ] = ()
     """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3."""
     grip: str = "grip"
-    """What the hand holds: a site, BODY (at its centre of mass) or BODY@x,y,z (a point in m in the
-    body's frame). If there is none of that name, the most plausible are listed."""
+    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
+    body's frame. If the scene has none of that name, the most plausible ones are listed."""
     motion: Path | None = None
     """Motion of the handle (CSV or recording); by default NAME.csv beside the scene, or else the
     simulated hand's own: slow, 1 cm."""

@@ -232,8 +232,8 @@ class Run:
     """Set a parameter of the scene, as in --set clearance=0.1e-3. 'hapticbridge scenes NAME' lists
     the parameters with units and ranges."""
     grip: str = "grip"
-    """What the hand holds: a site, BODY (at its centre of mass) or BODY@x,y,z (a point in m in the
-    body's frame). If there is none of that name, the most plausible are listed."""
+    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
+    body's frame. If the scene has none of that name, the most plausible ones are listed."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
