@@ -24,12 +24,13 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, method_named
+from hapticbridge.rendering import check_prepared
 from hapticbridge.run_description import (
     MODEL_ATTACHMENT,
     STARTS,
     STATE_ATTACHMENT,
     meta_start,
+    method_of,
     processor,
     restore_state,
     start_of,
@@ -64,7 +65,7 @@ def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoc
     ids[parameters.grip] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, parameters.grip)
     if lacking := [name for name, id_ in ids.items() if id_ < 0]:
         raise RecordingError(f"the attached model has no '{lacking[0]}'")
-    method = method_named(recording.meta.get("method", ""))
+    method = method_of(recording.meta)
     step = parameters.period / parameters.substeps
     forces, torques = method.gains(parameters.coupling, step)
     for axis, actuator_id in enumerate(actuators):
@@ -151,7 +152,7 @@ class Resimulator:
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
         start = recording.attachments[STATE_ATTACHMENT]
-        method = method_named(recording.meta.get("method", ""))
+        method = method_of(recording.meta)
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
