@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -60,11 +61,8 @@ def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
         (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),
         (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
-        # what breaks the implicit step
-        (mjcf("<option solver='PGS'/>"), ["PGS", "use Newton"]),
-        (mjcf("<option noslip_iterations='3'/>"), ["noslip_iterations=3", "set it to 0"]),
+        # what switches the coupling off or cannot be simulated again
         (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
-        (mjcf("<option><flag sleep='enable'/></option>"), ["flag sleep", "disable it"]),
         (mjcf("<option><flag actuation='disable'/></option>"), ["actuation", "enable it"]),
         (mjcf("<option actuatorgroupdisable='30 0 4'/>"), ["0, 4, 30", "remove actuatorgr"]),
     ],
@@ -126,15 +124,36 @@ def test_grip_on_a_rigid_part_of_a_moving_body_is_accepted(tmp_path: Path) -> No
     assert scene.grip_pose()[:3] == (0.1, 0.0, 0.0)
 
 
-def test_rk4_runs_under_discrete_with_warning_and_other_integrators_without(tmp_path: Path) -> None:
-    path = scene_file(tmp_path, mjcf("<option integrator='RK4'/>"))
-    with pytest.warns(UserWarning, match="RK4; it runs under 'discrete'") as caught:
-        scene = load_scene(path)
-    assert len(caught) == 1
-    assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
-    for name in ("Euler", "implicit", "implicitfast", "discrete"):
-        scene = load_scene(scene_file(tmp_path, mjcf(f"<option integrator='{name}'/>")))
-        assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+@pytest.mark.parametrize(
+    ("option", "change", "is_needed"),
+    [
+        ("<option solver='PGS'/>", "solver: PGS → Newton", True),
+        ("<option noslip_iterations='3'/>", "noslip_iterations: 3 → 0", True),
+        ("<option><flag sleep='enable'/></option>", "flag sleep: enable → disable", True),
+        ("<option solver='CG'/>", "solver: CG → Newton", False),
+        ("<option integrator='RK4'/>", "integrator: RK4 → discrete", False),
+        ("<option integrator='implicitfast'/>", "integrator: implicitfast → discrete", False),
+    ],
+)
+def test_options_that_exclude_the_coupling_are_changed_and_told(
+    tmp_path: Path, option: str, change: str, *, is_needed: bool
+) -> None:
+    path = scene_file(tmp_path, mjcf(option))
+    scene = load_scene(path)
+    assert change in scene.changes
+    assert len(scene.changes) == 1 + ("integrator" not in change)  # Euler, MuJoCo's default
+    opt = scene.model.opt
+    assert opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    assert opt.noslip_iterations == 0
+    assert not opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    if is_needed:
+        with pytest.raises(hb.SceneError, match=re.escape(change)):
+            load_scene(path, as_is=True)
+    else:
+        assert load_scene(path, as_is=True).changes == scene.changes
+    fitting = mjcf("<option integrator='discrete'/>")
+    assert load_scene(scene_file(tmp_path, fitting), as_is=True).changes == ()
 
 
 def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import mujoco
@@ -67,11 +68,14 @@ def test_grip_is_a_site_then_a_body_at_its_centre_of_mass_then_a_point(tmp_path:
 
 
 def test_run_that_holds_a_point_of_a_body_is_simulated_again(tmp_path: Path, call: Called) -> None:
-    text = mjcf("<option gravity='0 0 0'/>", body=ARM.format(site=""))
+    text = mjcf("<option gravity='0 0 0' noslip_iterations='2'/>", body=ARM.format(site=""))
     path, file = scene_file(tmp_path, text), tmp_path / "run.mcap"
     options = ("--fast", "--duration", "0.2", "--record", str(file))
     code, out, err = call("run", str(path), "--grip", "hand@.04,0,.02", *options)
     assert (code, "passive" in out) == (0, True), err
+    changes = ["integrator: Euler → discrete", "noslip_iterations: 2 → 0"]
+    assert f"options changed in the scene: {', '.join(changes)}" in err
+    assert json.loads(hb.read_recording(file).meta["scene_changes"]) == changes
     report = hb.audit(file)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     ticks = hb.read_recording(file).ticks

@@ -224,11 +224,47 @@ def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str)
     actuator.damping = np.zeros(3)
 
 
-def set_options(spec: mujoco.MjSpec) -> None:
-    """Sets the options for an implicit coupling and a known energy of every step."""
-    option = spec.option
+_INTEGRATORS = "Euler", "RK4", "implicit", "implicitfast", "discrete"
+_SOLVERS = "PGS", "CG", "Newton"
+
+
+def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
+    """Sets the options for an implicit coupling and a known energy of every step.
+
+    Solver PGS and ``noslip_iterations`` leave the coupling out of the implicit step, and the
+    coupling does not move a tool that sleeps.
+
+    Args:
+        spec: The user's scene; changed in place.
+        as_is: If true, a scene with one of these three is refused.
+
+    Returns:
+        The options of the scene that were changed, each as ``name: old → new``.
+
+    Raises:
+        SceneError: A change is needed that ``as_is`` forbids.
+    """
+    option, enable = spec.option, mujoco.mjtEnableBit
+    needed, changes = [], []
+    if (solver := int(option.solver)) != mujoco.mjtSolver.mjSOL_NEWTON:
+        changes.append(f"solver: {_SOLVERS[solver]} → Newton")
+        needed += changes if solver == mujoco.mjtSolver.mjSOL_PGS else []
+    if option.noslip_iterations > 0:
+        needed.append(f"noslip_iterations: {option.noslip_iterations} → 0")
+    if option.enableflags & enable.mjENBL_SLEEP:
+        needed.append("flag sleep: enable → disable")
+    if needed and as_is:
+        raise SceneError(
+            f"the scene needs other options to be coupled ({', '.join(needed)}); set them, or let "
+            "them be changed (without --as-is)"
+        )
+    if (integrator := int(option.integrator)) != mujoco.mjtIntegrator.mjINT_DISCRETE:
+        changes.append(f"integrator: {_INTEGRATORS[integrator]} → discrete")
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY | mujoco.mjtEnableBit.mjENBL_DIAGEXACT
+    option.noslip_iterations = 0
+    option.enableflags &= ~int(enable.mjENBL_SLEEP)
+    option.enableflags |= enable.mjENBL_ENERGY | enable.mjENBL_DIAGEXACT
     # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return tuple(dict.fromkeys((*changes, *needed)))
