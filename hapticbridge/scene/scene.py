@@ -48,6 +48,7 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
+        changes: Options of the file that were changed, each as ``name: old → new``.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
