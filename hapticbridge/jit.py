@@ -105,14 +105,48 @@ class Compiled(Deferred):
             self._direct[kinds] = self._loaded(kinds, arguments) or self._by_numba(arguments)
         return self._direct[kinds]
 
+    def callback(self, c_types: tuple[str, ...]) -> int:
+        """Returns the address of a C function that calls the machine code (``jit.callback``)."""
+        arguments = tuple(0.0 if kind == "double" else 0 for kind in c_types)
+        code = b""
+        if sys.platform == "linux":
+            kinds = tuple(type(argument) for argument in arguments)
+            code = self._object_code(kinds, arguments, c_types)
+        return machine_code.address_of(code, self._function.__name__) if code else self._c(c_types)
+
+    def _c(self, c_types: tuple[str, ...]) -> int:
+        numba, called = import_module("numba"), self.built
+        names = {"ptr": "intp", "i64": "intp", "i32": "int32", "double": "float64"}
+        signature = f"int32({', '.join(names[kind] for kind in c_types)})"
+
+        def call(a: int, b: int, c: int, d: int, e: int, f: float) -> int:  # cfunc takes no *args
+            return int(called(a, b, c, d, e, f))
+
+        function = numba.cfunc(signature)(call)
+        _callbacks.append(function)
+        return int(function.address)
+
     def _by_numba(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
         return cast(Callable[..., Any], self.built.compile(_signature(arguments)))
 
     def _loaded(
         self, kinds: tuple[machine_code.Kind, ...], arguments: tuple[object, ...]
     ) -> Callable[..., Any] | None:
-        function = self._function
-        names = (function.__module__, function.__qualname__, *map(machine_code.name_of, kinds))
+        code = self._object_code(kinds, arguments)
+        try:
+            return machine_code.load(code, self._function.__name__) if code else None
+        except RuntimeError:
+            return None
+
+    def _object_code(
+        self,
+        kinds: tuple[machine_code.Kind, ...],
+        arguments: tuple[object, ...],
+        c_types: tuple[str, ...] = (),
+    ) -> bytes:
+        """Returns the machine code on disk, compiled before if it is not there."""
+        function, types = self._function, (*map(machine_code.name_of, kinds), *c_types)
+        names = (function.__module__, function.__qualname__, *types)
         digest = hashlib.sha256(repr((names, _environment())).encode()).hexdigest()[:16]
         path = Path(cache_folder()) / f"{function.__name__}-{digest}.o"
         code = machine_code.read(path)
@@ -122,12 +156,10 @@ class Compiled(Deferred):
             dispatcher.compile(signature)
             found, ir = dispatcher.overloads[signature], dispatcher.inspect_llvm(signature)
             result = str(found.signature.return_type)
-            code = machine_code.object_code(ir, found.fndesc.llvm_func_name, kinds, result)
+            symbol = found.fndesc.llvm_func_name
+            code = machine_code.object_code(ir, symbol, kinds, result, c_types)
             machine_code.write(path, code)
-        try:
-            return machine_code.load(code, function.__name__) if code else None
-        except RuntimeError:
-            return None
+        return code
 
     def _decorated(self, *, is_cached: bool) -> Any:
         numba = import_module("numba")
@@ -140,6 +172,9 @@ class Compiled(Deferred):
             finally:
                 numba.config.CACHE_DIR = outside
 
+
+_callbacks: list[object] = []
+"""C functions that numba made, which must live until the process ends."""
 
 _decorating = threading.Lock()
 """Held while numba's setting of the cache folder is another one."""
@@ -171,6 +206,24 @@ def intrinsic(function: Callable[..., Any]) -> Any:
     return Deferred(lambda: import_module("numba.extending").intrinsic(function))
 
 
+def stack_floats(count: int) -> Any:
+    """Declares a function that returns the address of ``count`` doubles on its caller's stack.
+
+    The memory belongs to the compiled function that calls it, until that returns.
+    """
+
+    def generate(context: Any, builder: Any, _signature: Any, _arguments: Any) -> Any:
+        types, lir = import_module("numba.core.types"), import_module("llvmlite.ir")
+        cgutils = import_module("numba.core.cgutils")
+        block = cgutils.alloca_once(builder, lir.ArrayType(lir.DoubleType(), count))
+        return builder.ptrtoint(block, context.get_value_type(types.intp))
+
+    def address(_typing: Any) -> Any:
+        return import_module("numba.core.types").intp(), generate
+
+    return intrinsic(address)
+
+
 def external(symbol: str, signature: str) -> Any:
     """Declares a C function for compiled callers, with a signature such as "void(intp, intp)"."""
 
@@ -195,3 +248,14 @@ def direct(function: _Function, *arguments: object) -> _Function:
             other types; nothing checks them.
     """
     return cast(_Function, cast(Compiled, function).direct(arguments))
+
+
+def callback(function: Callable[..., int], *c_types: str) -> int:
+    """Returns the address of a C function that calls a compiled function and returns an ``int``.
+
+    Args:
+        function: Function from ``compiled`` that returns an integer, allocates nothing and raises
+            nothing. Python calls it with addresses as integers.
+        *c_types: Types of the six arguments: "i64" (also for pointers), "i32" or "double".
+    """
+    return cast(Compiled, function).callback(c_types)

@@ -105,7 +105,9 @@ def processor() -> tuple[str, str]:
     return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
 
 
-def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> bytes:
+def object_code(
+    ir: str, symbol: str, kinds: Sequence[Kind], result: str, c_types: Sequence[str] = ()
+) -> bytes:
     """Compiles a function's optimised code together with an entry.
 
     Args:
@@ -113,6 +115,8 @@ def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> byt
         symbol: Name of the function there.
         kinds: Types of the arguments.
         result: numba's name of the result's type.
+        c_types: If given, LLVM's types of the arguments of a C function that returns an ``int``;
+            the entry is then that function. Otherwise it takes Python objects.
 
     Returns:
         The object code, empty if it cannot be used without numba's runtime.
@@ -122,7 +126,8 @@ def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> byt
     target, _ = _machine()
     try:
         module = llvm.parse_assembly(ir)
-        module.link_in(llvm.parse_assembly(_entry(symbol, kinds, result)))
+        entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result)
+        module.link_in(llvm.parse_assembly(entry))
         for value in (*module.functions, *module.global_variables):
             if not value.is_declaration and value.name != _ENTRY:
                 value.linkage = "internal"
@@ -130,7 +135,7 @@ def object_code(ir: str, symbol: str, kinds: Sequence[Kind], result: str) -> byt
         passes.add_global_dead_code_eliminate_pass()
         passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
         code = bytes(target.emit_object(module))
-        load(code, symbol)
+        address_of(code, symbol)
     except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
         return b""
     return code
@@ -168,6 +173,31 @@ fail:
 ret ptr null
 done:
 {give}
+}}
+"""
+
+
+def _c_entry(symbol: str, c_types: Sequence[str]) -> str:
+    """Returns LLVM code of a C function that calls a function of numba with 64-bit integers."""
+    declared = ", ".join(f"{kind} %c{number}" for number, kind in enumerate(c_types))
+    lines, passed = list[str](), ["ptr %place", "ptr %exception"]
+    for number, kind in enumerate(c_types):
+        wide = kind
+        if kind == "i32":
+            lines.append(f"%a{number} = sext i32 %c{number} to i64")
+            wide = "i64"
+        passed.append(f"{wide} %{'a' if kind == 'i32' else 'c'}{number}")
+    types = ", ".join(value.split()[0] for value in passed)
+    body = "\n".join(lines)
+    return f"""declare i32 @"{symbol}"({types})
+define i32 @{_ENTRY}({declared}) {{
+%place = alloca i64
+%exception = alloca ptr
+{body}
+%status = call i32 @"{symbol}"({", ".join(passed)})
+%value = load i64, ptr %place
+%short = trunc i64 %value to i32
+ret i32 %short
 }}
 """
 
@@ -228,12 +258,24 @@ _new_function = ctypes.PYFUNCTYPE(ctypes.py_object, *3 * (ctypes.c_void_p,))(
 _numbers = count()
 """Numbers of libraries, whose names must differ."""
 
-_loaded: list[tuple[object, object]] = []
+_loaded: list[object] = []
 """All that must live as long as the functions, which is as long as the process."""
 
 
 def load(code: bytes, name: str) -> Callable[..., Any]:
-    """Returns a function that runs object code.
+    """Returns a function of Python objects that runs object code.
+
+    Raises:
+        RuntimeError: As ``address_of``.
+    """
+    definition = _Definition(name.encode(), address_of(code, name), _FAST_CALL, None)
+    _loaded.append(definition)
+    function: Callable[..., Any] = _new_function(ctypes.addressof(definition), None, None)
+    return function
+
+
+def address_of(code: bytes, name: str) -> int:
+    """Returns the address of the entry of object code, which stays until the process ends.
 
     Raises:
         RuntimeError: It needs a symbol that neither MuJoCo nor this process has, or is no object
@@ -245,10 +287,8 @@ def load(code: bytes, name: str) -> Callable[..., Any]:
     builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
     builder.import_symbol("NRT_MemInfo_call_dtor", unused).export_symbol(_ENTRY)
     library = builder.link(linker, f"{name} {next(_numbers)}")
-    definition = _Definition(name.encode(), library[_ENTRY], _FAST_CALL, None)
-    _loaded.append((library, definition))
-    function: Callable[..., Any] = _new_function(ctypes.addressof(definition), None, None)
-    return function
+    _loaded.append(library)
+    return int(library[_ENTRY])
 
 
 def read(path: Path) -> bytes | None:

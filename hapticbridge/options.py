@@ -113,6 +113,9 @@ class BridgeOptions:
             of their wrenches and needs another damping (``certificate.required_damping``).
         method: Name of the rendering method (``rendering.METHODS``). None selects ``lossless``, or
             ``implicit`` with substeps, because ``lossless`` takes none.
+        contact: ``rigid``, strictly passive contacts at the level of velocities
+            (``kernel.rigid_contact``), or ``scene``, MuJoCo's contacts with the settings of the
+            MJCF. None is rigid for every method that can.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
         i_know: True accepts a hazardous method (``Method.hazard``) on a real device.
         workspace: Map from the device's frame to the scene's.
@@ -139,6 +142,7 @@ class BridgeOptions:
     rate: float = 1000.0
     substeps: int = 1
     method: str | None = None
+    contact: str | None = None
     contact_stiffness: float | None = None
     i_know: bool = False
     workspace: Workspace = SAME_FRAME
@@ -168,10 +172,12 @@ class BridgeOptions:
 
     @property
     def rendering_method(self) -> Method:
-        """The named method, or the default for these substeps."""
+        """The named method, or the default for these substeps, with the chosen contact."""
         if self.method is None:
-            return default_method(checked_substeps(self.substeps))
-        return method_named(self.method)
+            method = default_method(checked_substeps(self.substeps))
+        else:
+            method = method_named(self.method)
+        return method.with_contact(self.contact)
 
 
 DEFAULT_OPTIONS = BridgeOptions()
@@ -184,6 +190,7 @@ class OptionChanges(TypedDict, total=False):
     rate: float
     substeps: int
     method: str | None
+    contact: str | None
     contact_stiffness: float | None
     i_know: bool
     workspace: Workspace
@@ -411,6 +418,7 @@ class RunSetup:
             handle_origin=handle_origin,
             device_start=pose,
             scheme=self.method.scheme,
+            is_rigid=self.method.is_rigid,
             effective=effective,
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,

@@ -83,6 +83,7 @@ TICK_DTYPE = np.dtype(
         ("injected_damping", "<f8"),
         ("injected_rotational_damping", "<f8"),
         ("share", "<f8"),
+        ("contact_tank", "<f8"),
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
@@ -91,9 +92,11 @@ works in J. Wrenches (force in N, torque in N m) are in the world frame about th
 (``wrench_on_tool``) or in the device's frame (``wrench_on_device``). ``injected_damping`` in N s/m
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
 of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
-the wrench that was sent, and of the device's motion to the next sample that the handle makes."""
+the wrench that was sent, and of the device's motion to the next sample that the handle makes.
+``contact_tank`` is the energy that may pay for the depenetration of rigid contacts (``kernel.
+rigid_contact``)."""
 
-LATER_FIELDS = ("share",)
+LATER_FIELDS = ("share", "contact_tank")
 """Fields that recordings of earlier versions lack; such a recording is read without them.
 
 To add a field:
@@ -152,6 +155,7 @@ UNITS = {
     "external_work": "J",
     "environment_energy": "J",
     "device_energy": "J",
+    "contact_tank": "J",
     "injected_damping": "N s/m",
     "injected_rotational_damping": "N m s/rad",
 }

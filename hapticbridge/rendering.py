@@ -23,12 +23,18 @@ from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered
 from hapticbridge.scene.contacts import warn_of_contacts
 from hapticbridge.scene.handle import measured_weld
+from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.theory.compensation import (
     IMPLICIT_SHARE,
     MIDPOINT_SHARE,
     effective_damping,
     law_damping,
 )
+
+RIGID, SCENE = "rigid", "scene"
+CONTACTS = (RIGID, SCENE)
+"""Contacts by name: rigid and strictly passive (``kernel.rigid_contact``), or MuJoCo's with the
+scene's own settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,8 @@ class Method:
             integration adds it; no unit.
         added_share: Share of K h that the integration adds to the damping, subtracted or not; None
             if it adds another amount or removes some.
+        is_rigid: True if contacts are rigid and strictly passive (``kernel.rigid_contact``), which
+            needs the integrator ``discrete`` and a coupling law; False for those of the scene.
     """
 
     name: str
@@ -67,17 +75,42 @@ class Method:
     warns: bool = True
     compensated_share: float = 0.0
     added_share: float | None = None
+    is_rigid: bool = False
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
-        """MuJoCo's part of a substep through the Python bindings.
-
-        ``kernel.tick.advance`` calls the C function with equal results to the bit.
-        """
+        """MuJoCo's step through the Python bindings, with the contacts of the scene."""
         step: Callable[[Any, Any], None] = (
             mujoco.mj_step if self.has_coupling else mujoco.mj_fwdPosition
         )
         return step
+
+    @property
+    def can_be_rigid(self) -> bool:
+        """True if contacts can be rigid: MuJoCo solves the coupling's law together with them."""
+        properties = self.scheme.properties
+        return self.integrator == "discrete" and properties.has_law and not properties.holds_wrench
+
+    @property
+    def contact(self) -> str:
+        """Contact by its name in ``CONTACTS``."""
+        return RIGID if self.is_rigid else SCENE
+
+    def with_contact(self, contact: str | None) -> Method:
+        """Returns the method with a contact of ``CONTACTS``; None is rigid where the method can.
+
+        Raises:
+            SceneError: The name is unknown, or the method cannot have rigid contacts.
+        """
+        if contact is not None and contact not in CONTACTS:
+            raise SceneError(f"no contact is called '{contact}'; contacts: {choices(CONTACTS)}")
+        if contact == RIGID and not self.can_be_rigid:
+            able = [method.name for method in METHODS.values() if method.can_be_rigid]
+            raise SceneError(
+                f"method '{self.name}' has the contacts of the scene; rigid contacts need one of "
+                f"{choices(able)}"
+            )
+        return replace(self, is_rigid=self.can_be_rigid if contact is None else contact == RIGID)
 
     def law_evaluations(self, substeps: int) -> int:
         """Returns the evaluations of the tool's wrench per tick."""
@@ -273,6 +306,7 @@ IMPLICIT = Method(
     scheme=Scheme.IMPLICIT,
     integrator="discrete",
     added_share=IMPLICIT_SHARE,
+    is_rigid=True,
 )
 
 COMPENSATED = replace(
@@ -292,6 +326,7 @@ LOSSLESS_COUPLING = Method(
     reach=REACH,
     compensated_share=MIDPOINT_SHARE,
     added_share=MIDPOINT_SHARE,
+    is_rigid=True,
 )
 
 METHODS = {method.name: method for method in (IMPLICIT, COMPENSATED, LOSSLESS_COUPLING)}
@@ -422,7 +457,8 @@ def prepare(
     scene.set_timestep(period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
     scene.set_reach(method.reach)
-    if warns and method.warns:
+    scene.set_contact(is_rigid=method.is_rigid)
+    if warns and method.warns and not method.is_rigid:
         warn_of_contacts(scene.model, scene.grip, scene.path)
     step = period / substeps
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
@@ -514,6 +550,8 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
     check_scene(model, parameters.grip, method)
     if model.opt.integrator != _INTEGRATORS[method.integrator]:
         raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
+    if method.is_rigid and not has_rigid_contact(model):
+        raise SceneError("rigid contacts require an elliptic cone, impratio 1000 and a margin")
     has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
     if has_weld != method.is_weld:
         raise SceneError(

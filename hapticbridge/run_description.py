@@ -26,7 +26,7 @@ from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.recording import Attachment
-from hapticbridge.rendering import Method, method_named
+from hapticbridge.rendering import RIGID, SCENE, Method, method_named
 from hapticbridge.scene import Scene
 
 # Start of a run: MuJoCo's state, compiled model, and energies
@@ -226,6 +226,7 @@ def describe_run(
         "ramp_ticks": str(parameters.ramp_ticks),
         "guard": parameters.guarding.to_json(),
         "method": method,
+        "contact": RIGID if parameters.is_rigid else SCENE,
         "requested": json.dumps([getattr(requested, name) for name in _GAINS]),
         "effective": json.dumps(effective and [getattr(effective, name) for name in _GAINS]),
         "discretization": method_named(method).discretization,
@@ -244,6 +245,15 @@ def describe_run(
     }
 
 
+def method_of(meta: Mapping[str, str]) -> Method:
+    """Returns the method of a recorded run, with its contact; earlier recordings have the scene's.
+
+    Raises:
+        SceneError: Method or contact is unknown, or they exclude each other.
+    """
+    return method_named(meta.get("method", "")).with_contact(meta.get("contact", SCENE))
+
+
 def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
     """Returns a weld's measured coupling; None for other methods."""
     if not method.is_weld:
@@ -258,7 +268,7 @@ def requested_of(meta: Mapping[str, str]) -> Coupling:
         RecordingError: It is missing or out of range, or the method makes another law of it.
     """
     numbers = meta_numbers(meta, "requested", len(_GAINS))
-    parameters, method = parameters_of(meta), method_named(meta["method"])
+    parameters, method = parameters_of(meta), method_of(meta)
     try:
         requested = Coupling(*numbers)
         law = method.law_coupling(requested, parameters.period / parameters.substeps)
@@ -284,7 +294,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             "and judged; 'hapticbridge export' still reads its ticks"
         )
     try:
-        method = method_named(meta.get("method", ""))
+        method = method_of(meta)
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
         damping, rotational = (None, None) if device is None else device.dissipating_damping
         numbers: dict[str, Any] = {name: meta_float(meta, name) for name in _FLOATS}
@@ -297,6 +307,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             ramp_ticks=meta_count(meta, "ramp_ticks"),
             axes=meta_numbers(meta, "axes", 9),
             scheme=method.scheme,
+            is_rigid=method.is_rigid,
             effective=_effective(meta, method),
             **numbers,
             device_damping=damping,

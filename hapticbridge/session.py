@@ -55,8 +55,6 @@ sees no more pictures. Check and picture cost the loop 4 µs each after the wren
 
 _NO_FORCE = np.zeros(6)
 
-MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
-
 
 class StopRequest:
     """Requests to end a run, from any thread or from a signal handler.
@@ -175,8 +173,7 @@ class TickKernel:
 
     def bind(self, bound: BoundKernel, setup: RunSetup) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
-        method = setup.method
-        self.bound, self.step, self.substeps = bound, method.step, range(setup.substeps)
+        self.bound, self.step, self.substeps = bound, bound.step, range(setup.substeps)
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
         self.is_ahead = False
         self.external_flags = bound.external_flags

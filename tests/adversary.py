@@ -254,6 +254,7 @@ class Attack:
             handle_origin=scene.grip_pose(),
             device_start=start,
             scheme=method.scheme,
+            is_rigid=method.is_rigid,
             device_damping=b,
             device_rotational_damping=b_r,
             guarding=GuardParameters(

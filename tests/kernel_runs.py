@@ -1,7 +1,7 @@
 """Small MJCF scenes behind the compiled tick, and SciPy's view of what was recorded.
 
-``live`` steps through ``mujoco.mj_step`` as the bridge does, ``fast`` through MuJoCo's C symbol as
-the audit does. The device's pose is the handle's, relative to the grip's at the start, unless a
+``live`` steps through MuJoCo's Python bindings as the bridge does, ``fast`` through its C symbols
+as the audit does. The device's pose is the handle's, relative to the grip's at the start, unless a
 test chooses otherwise.
 """
 
@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -24,8 +23,9 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import prepare
+from hapticbridge.rendering import IMPLICIT, prepare
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.summary import Ledger
 
 Array: TypeAlias = NDArray[np.float64]
@@ -148,6 +148,7 @@ def unlimited(
         device_origin=device_start,
         handle_origin=scene.grip_pose(),
         device_start=device_start,
+        is_rigid=has_rigid_contact(scene.model),
     )
     return replace(parameters, **changes)
 
@@ -158,11 +159,12 @@ def bind(
     *,
     period: float = T,
     substeps: int = 1,
+    contact: str = "rigid",
     device_start: tuple[float, ...] = IDENTITY,
     **changes: Any,
 ) -> tuple[BoundKernel, RunParameters]:
     """Prepares a scene for ``implicit`` and binds the kernel to it, without force limits."""
-    prepare(scene, coupling, period, substeps)
+    prepare(scene, coupling, period, substeps, IMPLICIT.with_contact(contact))
     parameters = unlimited(scene, coupling, period, substeps, device_start, **changes)
     return BoundKernel(scene.model, scene.data, parameters), parameters
 
@@ -187,16 +189,16 @@ def go_on(
     on_tick: OnTick | None = None,
     after_tick: OnTick | None = None,
 ) -> Run:
-    """Adds ticks to a run through ``mujoco.mj_step``; the callbacks get (tick, data)."""
+    """Adds ticks to a run through MuJoCo's bindings; the callbacks get (tick, data)."""
     model, data = run.scene.model, run.scene.data
-    state, row = run.binding.state, run.binding.row
+    state, row, step = run.binding.state, run.binding.row, run.binding.step
     rows = np.zeros(len(samples), TICK_DTYPE)
     for k in range(len(samples)):
         if on_tick is not None:
             on_tick(k, data)
         for substep in range(run.parameters.substeps):
             assert before_step(state, samples[k : k + 1], row, substep, T) == OK
-            mujoco.mj_step(model, data)
+            step(model, data)
             assert after_step(state, row, substep) == OK
         rows[k] = row[0]
         if after_tick is not None:

@@ -71,6 +71,7 @@ def rendered(
         coupling,
         substeps=substeps,
         scheme=chosen.scheme,
+        is_rigid=chosen.is_rigid,
         effective=felt,
         contact_stiffness=resolve_contact_stiffness(chosen, coupling, contact_stiffness),
         **changes,

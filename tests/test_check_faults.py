@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -25,6 +27,7 @@ from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
 from hapticbridge.check.case import open_case
+from hapticbridge.check.contact_faults import shape_faults
 from hapticbridge.check.fault import Fault, length, weight
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
@@ -91,6 +94,34 @@ def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", scene_names())
 def test_shipped_scene_has_no_fault(name: str) -> None:
     assert faults_of(scene_path(name)) == ()
+
+
+def test_boxes_are_named_unless_the_run_keeps_their_points() -> None:
+    case = case_of(scene_path("planar_peg"))
+    assert not tuple(shape_faults(case))
+    (fault,) = shape_faults(replace(case, contact="scene"))
+    assert fault.kind == "box edges"
+    assert "and 2 more" in fault.sentence
+    assert 'contact="rigid"' in fault.change
+
+
+@pytest.mark.parametrize(
+    ("corners", "contact", "is_named"),
+    [(8, "scene", True), (8, "rigid", False), (200, "rigid", True)],
+)
+def test_meshes_are_named_unless_the_run_corrects_their_normals(
+    tmp_path: Path, corners: int, contact: Literal["rigid", "scene"], is_named: bool
+) -> None:
+    angles = np.arange(corners // 2) * 4 * np.pi / corners
+    ring = [(np.cos(a), np.sin(a), z) for a in angles for z in (-3.0, 3.0)]
+    vertices = " ".join(f"{0.01 * value:.9g}" for corner in ring for value in corner)
+    text = scene_path("planar_peg").read_text(encoding="utf-8")
+    text = text.replace('size="0.01 0.01 0.03" mass', 'type="mesh" mesh="prism" mass')
+    text = text.replace("<asset>", f'<asset><mesh name="prism" vertex="{vertices}"/>', 1)
+    scene = tmp_path / "prism.xml"
+    scene.write_text(text, encoding="utf-8")
+    found = {fault.kind for fault in shape_faults(replace(case_of(scene), contact=contact))}
+    assert ("mesh faces" in found) == is_named
 
 
 def test_peg_sinks_deeper_than_its_clearance_with_mujocos_default(tmp_path: Path) -> None:

@@ -252,7 +252,7 @@ BOUNCY_WALL = f"""
 def test_an_active_environment_is_named_with_its_first_ticks() -> None:
     motion = np.zeros((1500, 3))
     motion[:, 0] = 0.02 * np.sin(2 * np.pi * 10 * T * np.arange(1500))
-    run = fast(mjcf(BOUNCY_WALL), samples_of(motion), Coupling(20000, 0.5, 0, 0))
+    run = fast(mjcf(BOUNCY_WALL), samples_of(motion), Coupling(20000, 0.5, 0, 0), contact="scene")
     work = coupling_work(run)
     allowed = ENERGY_TOLERANCE * (1 + np.cumsum(np.abs(work)))
     energy, room = _closed(run), slack(run)

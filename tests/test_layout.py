@@ -202,6 +202,7 @@ WRITERS = {
     "observer": "passivity_controller",
     "lossless": "lossless",
     "springs": "springs",
+    "contact": "rigid_contact",
     "timing": "timing",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""

@@ -20,10 +20,9 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.parameters import EARLIER_VERSION, RunParameters
-from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import Method, RunCoupling, method_named
-from hapticbridge.run_description import meta_start, parameters_of
+from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.run_description import meta_start, method_of, parameters_of
 
 Array = NDArray[np.float64]
 
@@ -151,12 +150,12 @@ class AuditedRun:
             RecordingError: They are damaged or do not describe a run.
         """
         meta, parameters = recording.meta, parameters_of(recording.meta)
-        if recording.record != TICK_DTYPE:
+        if "share" not in (recording.record.names or ()):
             raise RecordingError(EARLIER_VERSION)
         try:
             info = DeviceInfo.from_json(meta.get("device", ""))
             limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))
-            method = method_named(meta.get("method", ""))
+            method = method_of(meta)
         except HapticBridgeError as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         if meta.get("discretization") != method.discretization:

@@ -24,12 +24,13 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, method_named
+from hapticbridge.rendering import check_prepared
 from hapticbridge.run_description import (
     MODEL_ATTACHMENT,
     STARTS,
     STATE_ATTACHMENT,
     meta_start,
+    method_of,
     processor,
     restore_state,
     start_of,
@@ -63,7 +64,7 @@ def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoc
         kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
         if mujoco.mj_name2id(model, kind, name) < 0:
             raise RecordingError(f"the attached model has no '{name}'")
-    method = method_named(recording.meta.get("method", ""))
+    method = method_of(recording.meta)
     step = parameters.period / parameters.substeps
     forces, torques = method.gains(parameters.coupling, step)
     for axis, name in enumerate(COUPLING_ACTUATORS):
@@ -150,7 +151,7 @@ class Resimulator:
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
         start = recording.attachments[STATE_ATTACHMENT]
-        method = method_named(recording.meta.get("method", ""))
+        method = method_of(recording.meta)
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)

@@ -21,6 +21,7 @@ SUMS = (
     "slack",
     "delayed_device_energy",
     "device_dissipation",
+    "tank_ceiling",
 )
 """Names of the cumulative energies."""
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -113,6 +114,8 @@ class SceneUnderCheck:
         has_chosen_period: True if the user chose the period.
         observation: Result of the motion; None if the motion did not finish.
         motion_fault: Reason why the motion did not finish.
+        contact: Contact of the run that the scene is checked for: ``rigid``, the default of a run,
+            or ``scene``, MuJoCo's own.
     """
 
     source: SceneSource
@@ -130,6 +133,7 @@ class SceneUnderCheck:
     has_chosen_period: bool
     observation: Observation | None = None
     motion_fault: str = ""
+    contact: Literal["rigid", "scene"] = "rigid"
 
     @property
     def model(self) -> mujoco.MjModel:

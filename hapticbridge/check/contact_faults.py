@@ -12,6 +12,7 @@ from hapticbridge.check.fault import Fault, length, number, others
 from hapticbridge.check.observe import clearances
 from hapticbridge.check.physics import body_inertia, constraint_stiffness, depth_under
 from hapticbridge.check.source_map import Place
+from hapticbridge.kernel.colliders import MOST_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import (
@@ -21,6 +22,7 @@ from hapticbridge.scene.contacts import (
     ContactSetting,
     contact_concerns,
     contact_numbers,
+    meeting_pairs,
     settings_among,
     tool_geoms,
 )
@@ -74,6 +76,55 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 f"the contact of {names} (solref {_numbers(setting.solref)}) {clause}",
                 change if is_cone else change + also,
             )
+
+
+_FLAT = (int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_MESH))
+
+
+def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields pairs of flat shapes whose contact points MuJoCo drops or tilts (``colliders``)."""
+    model = case.model
+    is_tool = tool_geoms(model, case.scene.grip)
+    is_exact = case.contact == "rigid"
+    boxes, meshes = list[tuple[int, int]](), list[tuple[int, int]]()
+    for first, second, _ in meeting_pairs(model, is_tool):
+        kinds = {int(model.geom_type[first]), int(model.geom_type[second])}
+        if kinds == {_FLAT[0]} and not is_exact:
+            boxes.append((first, second))
+        is_flat = kinds <= {*_FLAT} and _FLAT[1] in kinds
+        corners = max(_corners(model, first), _corners(model, second))
+        if is_flat and (not is_exact or corners > MOST_VERTICES):
+            meshes.append((first, second))
+    if boxes:
+        yield Fault(
+            "box edges",
+            case.places.geom(_tool_geom(boxes[0], is_tool)),
+            f"{pair_names(case, boxes)} are boxes, of whose contact MuJoCo drops points from step "
+            "to step where an edge is touched; a peg of 30 g sank 5 mm in that way",
+            'contact="rigid" for the run, whose boxes keep all points',
+        )
+    if meshes:
+        count = max(_corners(model, geom) for pair in meshes for geom in pair)
+        yield Fault(
+            "mesh faces",
+            case.places.geom(_tool_geom(meshes[0], is_tool)),
+            f"{pair_names(case, meshes)} meet with the normal of either face, up to 84 mrad off "
+            "the one that is touched; a tilted tool without friction sank 2.5 mm in that way",
+            f"boxes, spheres and capsules instead, or meshes of at most {MOST_VERTICES} corners "
+            f'(now {count}) and contact="rigid" for the run',
+        )
+
+
+def _tool_geom(pair: tuple[int, int], is_tool: np.ndarray) -> int:
+    return pair[0] if is_tool[pair[0]] else pair[1]
+
+
+def _corners(model: mujoco.MjModel, geom: int) -> int:
+    """Returns the number of corners or faces of a mesh geom, the larger one; 8 for others."""
+    if model.geom_type[geom] != _FLAT[1]:
+        return 8
+    mesh = int(model.geom_dataid[geom])
+    return int(max(model.mesh_vertnum[mesh], model.mesh_polynum[mesh]))
 
 
 def push_of(case: SceneUnderCheck) -> float:

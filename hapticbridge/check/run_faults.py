@@ -8,7 +8,12 @@ import mujoco
 import numpy as np
 
 from hapticbridge.check.case import SceneUnderCheck
-from hapticbridge.check.contact_faults import contact_faults, margin_faults, start_faults
+from hapticbridge.check.contact_faults import (
+    contact_faults,
+    margin_faults,
+    shape_faults,
+    start_faults,
+)
 from hapticbridge.check.fault import Fault, number
 from hapticbridge.check.model_faults import constraint_faults, geometry_faults, mass_faults
 from hapticbridge.check.observe import Observation
@@ -169,6 +174,7 @@ RULES = (
     geometry_faults,
     start_faults,
     contact_faults,
+    shape_faults,
     margin_faults,
     constraint_faults,
     run_faults,

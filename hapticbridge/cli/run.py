@@ -47,7 +47,10 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     """
     coupling, method, substeps = setup.coupling, setup.method, setup.substeps
     scene, device = escape(setup.scene.name), escape(setup.info.name)
-    err.print(f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}")
+    err.print(
+        f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}, "
+        f"{method.contact} contacts"
+    )
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
@@ -59,9 +62,9 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
             "it, or at a higher --rate, the error falls"
         )
     usual = default_method()
-    if is_method_chosen and method != usual:
+    if is_method_chosen and method.name != usual.name:
         err.print(f"  {method.name}: {escape(method.about)}")
-    elif method != usual:
+    elif method.name != usual.name:
         err.print(
             f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and {substeps} "
             "are requested"
@@ -249,6 +252,10 @@ class Run:
     coupling inside the step, which adds K T to the damping. 'compensated': 'implicit' with the
     added K T subtracted from the coupling's damping. Or a method that exists to be compared, such
     as 'explicit', 'weld' or 'direct' (a tool without mass); an unknown name lists them."""
+    contact: Literal["rigid", "scene"] | None = None
+    """Contacts. 'rigid', the default: strictly passive, sharp, with Coulomb friction in an elliptic
+    cone. 'scene': MuJoCo's contacts with the settings of the MJCF, as methods for comparison have
+    them."""
     contact_stiffness: float | None = None
     """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
     i_know: bool = False
@@ -380,6 +387,7 @@ class Run:
             rate=self.rate,
             substeps=self.substeps,
             method=self.method,
+            contact=self.contact,
             contact_stiffness=self.contact_stiffness,
             i_know=self.i_know,
             workspace=Workspace(

@@ -31,6 +31,7 @@ from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
+from hapticbridge.kernel.rigid_contact import lower_share
 from hapticbridge.pose import Vector, norm, scaled
 
 TOLERANCE = 1e-6
@@ -106,6 +107,20 @@ def keep_state(s: State) -> None:
 
 
 @compiled
+def _repeat_step(s: State) -> None:
+    """Repeats MuJoCo's step from the state before it; its positions must be those of the start."""
+    _copy_state(s, False)
+    mj_step2(s.mj.model, s.mj.data)
+
+
+@compiled
+def spend_within_tank(s: State) -> None:
+    """Repeats the step that just ended until its contacts spend no more than the tank allows."""
+    while lower_share(s):
+        _repeat_step(s)
+
+
+@compiled
 def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     """Returns P_F of a force and a torque on the tool, and notes if one was limited.
 
@@ -169,10 +184,11 @@ def solve_level(s: State) -> bool:
         shares = (level.share[0], level.share[1])
         level.share[0], level.share[1] = wanted[0], wanted[1]
         set_gains(s, 1.0)
-        _copy_state(s, False)
         if count == 0:
+            _copy_state(s, False)
             mj_kinematics(s.mj.model, s.mj.data)  # forces on bodies act at the start's positions
-        mj_step2(s.mj.model, s.mj.data)
+        _repeat_step(s)
+        spend_within_tank(s)
         count += 1
     level.repetitions += count
     return count > 0

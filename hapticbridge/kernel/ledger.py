@@ -198,6 +198,14 @@ def mocap_work(s: State) -> float:
                 to_upper = abs(residual[i] - (ranges[2 * t + 1] - lengths[t]))
                 sign = 1.0 if to_lower <= to_upper else -1.0
                 work -= sign * force[i] * (lengths[t] - tendon_before[t])
+    return work + mocap_contact_work(s)
+
+
+@compiled
+def mocap_contact_work(s: State) -> float:
+    """Returns the part of ``mocap_work`` that goes through contacts, in J."""
+    mj, work = s.mj, 0.0
+    force = floats(pointer_at(mj.efc_force), ints(mj.nefc, 1)[0])
     for c in range(ints(mj.ncon, 1)[0]):
         work -= _contact_work(s, pointer_at(mj.contact) + c * mj.contact_size, force)
     return work

@@ -24,7 +24,8 @@ from hapticbridge.jit import Deferred, compiled, external, intrinsic
 from hapticbridge.kernel.codes import Part
 
 
-def _library() -> Path:
+def library_path() -> Path:
+    """Returns MuJoCo's library, which the Python bindings use too."""
     folder = Path(mujoco.__file__).parent
     for pattern in ("libmujoco.so.*", "libmujoco.*.dylib", "mujoco.dll"):
         for path in folder.glob(pattern):
@@ -33,9 +34,10 @@ def _library() -> Path:
 
 
 # Makes the symbols known to the compiler's linker; the Python bindings use the same library file.
-llvmlite.binding.load_library_permanently(str(_library()))
+llvmlite.binding.load_library_permanently(str(library_path()))
 
 mj_step: Any = external("mj_step", "void(intp, intp)")
+mj_step1: Any = external("mj_step1", "void(intp, intp)")
 mj_step2: Any = external("mj_step2", "void(intp, intp)")
 mj_kinematics: Any = external("mj_kinematics", "void(intp, intp)")
 mj_fwd_kinematics: Any = external("mj_fwdKinematics", "void(intp, intp)")
@@ -91,6 +93,13 @@ def floats(address: int, count: int) -> NDArray[np.float64]:
 
 
 @compiled
+def singles(address: int, count: int) -> NDArray[np.float32]:
+    """Returns ``count`` numbers of single precision at an address, as a view."""
+    view: NDArray[np.float32] = _view(_as_pointer(address), count, np.float32)
+    return view
+
+
+@compiled
 def ints(address: int, count: int) -> NDArray[np.int32]:
     """Returns ``count`` 32-bit integers at an address, as a view."""
     view: NDArray[np.int32] = _view(_as_pointer(address), count, np.int32)
@@ -132,6 +141,8 @@ def has_warned(mj: Part) -> bool:
 _SCALARS: dict[str, Any] = {
     "int": ctypes.c_int,
     "mjtNum": ctypes.c_double,
+    "float": ctypes.c_float,
+    "char": ctypes.c_char,
     "mjtByte": ctypes.c_ubyte,
     "mjtBool": ctypes.c_bool,
     "mjtSize": ctypes.c_int64,
@@ -149,6 +160,8 @@ def _ctype(declared: Any) -> Any:
         for extent in reversed(declared.extents):
             inner = inner * extent
         return inner
+    if isinstance(declared, ast_nodes.AnonymousStructDecl):
+        return _structure("anonymous", declared.fields)
     if declared.name in _SCALARS:
         return _SCALARS[declared.name]
     if declared.name in structs.STRUCTS:
@@ -162,7 +175,11 @@ def _ctype(declared: Any) -> Any:
 @cache
 def struct_of(name: str) -> Any:
     """Returns the ctypes structure of a C struct of MuJoCo, by its name."""
-    fields = [(field.name, _ctype(field.type)) for field in structs.STRUCTS[name].fields]
+    return _structure(name, structs.STRUCTS[name].fields)
+
+
+def _structure(name: str, declared: Any) -> Any:
+    fields = [(field.name, _ctype(field.type)) for field in declared]
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
@@ -172,7 +189,7 @@ def field_address(data: mujoco.MjData, name: str) -> int:
 
 
 def contact_layout() -> dict[str, int]:
-    """Returns the size of ``mjContact`` and the offsets that a tick reads, in bytes."""
+    """Returns the size of ``mjContact`` and the offsets that a tick uses, in bytes."""
     contact = struct_of("mjContact")
     fields = {
         "distance": "dist",
@@ -181,6 +198,10 @@ def contact_layout() -> dict[str, int]:
         "geoms": "geom",
         "dim": "dim",
         "row": "efc_address",
+        "friction": "friction",
+        "solref": "solref",
+        "solreffriction": "solreffriction",
+        "solimp": "solimp",
     }
     offsets = {name: int(getattr(contact, field).offset) for name, field in fields.items()}
     return {"size": ctypes.sizeof(contact), **offsets}
@@ -250,6 +271,10 @@ _DATA_FIELDS = (
     "efc_type",
     "efc_id",
     "efc_pos",
+    "efc_margin",
+    "efc_vel",
+    "efc_aref",
+    "efc_R",
     "efc_force",
     "contact",
 )
@@ -268,7 +293,19 @@ _OWNED = (
 )
 _MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
 _SIZES = ("nq", "nv", "na", "nhistory", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
-_CONTACT = ("size", "distance", "point", "frame", "geoms", "dim", "row")
+_CONTACT = (
+    "size",
+    "distance",
+    "point",
+    "frame",
+    "geoms",
+    "dim",
+    "row",
+    "friction",
+    "solref",
+    "solreffriction",
+    "solimp",
+)
 _IDS = (
     "handle_mocap_id",
     "handle_site_id",

@@ -201,6 +201,12 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
         raise HapticBridgeError(f"substeps is {substeps!r}; {reason}, so it must be 1")
 
 
+TANK_STRETCH = 1e-3
+"""Stretch c in m of the coupling whose energy is the cap of the tank of rigid contacts. Dissipation
+of a long time then pays for no more than the hand stores in the coupling within a millimetre. A
+larger value frees a jammed tool sooner, and lets it be pushed out harder."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParameters:
     """All numbers besides scene and device motion that the results of a run depend on.
@@ -230,6 +236,8 @@ class RunParameters:
         device_rotational_damping: Rotational damping in N m s/rad; None without rotation, or if
             ``device_damping`` is.
         guarding: Limits and thresholds of the guard.
+        is_rigid: True if contacts are rigid (``kernel.rigid_contact``), False for those of the
+            scene.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -254,6 +262,7 @@ class RunParameters:
     device_damping: float | None = None
     device_rotational_damping: float | None = None
     guarding: GuardParameters = UNGUARDED
+    is_rigid: bool = False
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)
@@ -291,6 +300,11 @@ class RunParameters:
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
             raise _no_rotation(self.axes)
+
+    @property
+    def tank_cap(self) -> float:
+        """Largest energy in J that may pay for the depenetration of rigid contacts, ½ K c²."""
+        return 0.5 * self.coupling.stiffness * TANK_STRETCH**2
 
     @property
     def properties(self) -> SchemeProperties:

@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: twelve sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: fourteen sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -18,6 +18,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
+| contact     | tank and share of rigid contacts                  | rigid_contact                 |
 | timing      | delay of the force, energy that it may have given | timing                        |
 """
 
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
+from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_home, set_tool
@@ -56,9 +58,10 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     observe_reset,
 )
+from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact
 from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
-from hapticbridge.kernel.tick import LOOP_DTYPE, discard_wrench, pause
+from hapticbridge.kernel.tick import LOOP_DTYPE, between_halves, discard_wrench, pause
 from hapticbridge.kernel.tick_guard import (
     GUARD_DTYPE,
     bind_guard,
@@ -68,6 +71,8 @@ from hapticbridge.kernel.tick_guard import (
 )
 from hapticbridge.kernel.timing import TIMING_DTYPE
 from hapticbridge.record import TICK_DTYPE
+
+MujocoStep = Callable[[mujoco.MjModel, mujoco.MjData], None]
 
 _FROM_PARAMETERS = (
     "period",
@@ -125,6 +130,7 @@ STATE_DTYPE = np.dtype(
         ("watch", WATCH_DTYPE),
         ("lossless", LOSSLESS_DTYPE),
         ("springs", SPRINGS_DTYPE),
+        ("contact", RIGID_DTYPE),
         ("timing", TIMING_DTYPE),
     ]
 )
@@ -177,6 +183,26 @@ class BoundKernel:
         """Energy in J that the environment may have created so far."""
         return float(self.state["energy"]["slack"][0])
 
+    @property
+    def step(self) -> MujocoStep:
+        """MuJoCo's part of a substep through the Python bindings.
+
+        ``kernel.tick.advance`` calls the C functions with equal results to the bit.
+        """
+        plain: MujocoStep = mujoco.mj_step
+        if self._record["run"]["scheme"] == Scheme.MASSLESS:
+            plain = mujoco.mj_fwdPosition
+        if not self._record["contact"]["is_rigid"]:
+            return plain
+        state, aim = self.state, direct(between_halves, self.state)
+
+        def step(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+            mujoco.mj_step1(model, data)
+            aim(state)
+            mujoco.mj_step2(model, data)
+
+        return step
+
     def resume(self) -> None:
         """Starts the ramp at the next tick, after a pause in which zero was commanded."""
         s = self._record
@@ -201,6 +227,8 @@ class BoundKernel:
         """Puts back what a step that was broken off left in the model, at the end of a run."""
         if self._restore_springs is not None:
             self._restore_springs(self._record)
+        self._model.jnt_solref[:] = self._owned["own_solref"]
+        self._model.jnt_solimp[:] = self._owned["own_solimp"]
 
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
@@ -224,6 +252,7 @@ class BoundKernel:
 
     def _bind_model(self, parameters: RunParameters) -> None:
         model, data, mj = self._model, self._data, self._record["mj"]
+        bind_colliders(model)
         values, owned = model_addresses(model, data)
         for name, value in values.items():
             mj[name] = value
@@ -281,6 +310,7 @@ class BoundKernel:
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
+        self._owned |= bind_contact(s["contact"], self._model, parameters)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record

@@ -35,7 +35,12 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
-from hapticbridge.kernel.force_level import keep_state, limited_wrench, limited_wrench_after_step
+from hapticbridge.kernel.force_level import (
+    keep_state,
+    limited_wrench,
+    limited_wrench_after_step,
+    spend_within_tank,
+)
 from hapticbridge.kernel.handle import (
     anchor_handle,
     device_from_scene,
@@ -78,6 +83,8 @@ from hapticbridge.kernel.mujoco_c import (
     mj_sensor_pos,
     mj_sensor_vel,
     mj_step,
+    mj_step1,
+    mj_step2,
     mj_transmission,
     pointer_at,
     release_fence,
@@ -88,6 +95,7 @@ from hapticbridge.kernel.passivity_controller import (
     observe_energy,
     within_energy_limit,
 )
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -320,6 +328,7 @@ def take_handle_in(s: State) -> None:
     mj_fwd_velocity(mj.model, mj.data)
     if mj.nsensor > 0:
         mj_sensor_vel(mj.model, mj.data)
+    aim_contacts(s)
 
 
 @compiled
@@ -335,7 +344,7 @@ def is_sound(s: State) -> bool:
 
 @compiled
 def advance(state: NDArray[np.void]) -> None:
-    """Runs MuJoCo's part of a substep by C symbol; ``Method.step`` is its twin in Python.
+    """Runs MuJoCo's part of a substep by C symbol; ``BoundKernel.step`` is its twin in Python.
 
     A tool without mass has no dynamics; for it, only positions and contacts are computed.
     """
@@ -343,8 +352,18 @@ def advance(state: NDArray[np.void]) -> None:
     mj = s.mj
     if s.run.scheme == Scheme.MASSLESS:
         mj_fwd_position(mj.model, mj.data)
+    elif s.contact.is_rigid:
+        mj_step1(mj.model, mj.data)
+        aim_contacts(s)
+        mj_step2(mj.model, mj.data)
     else:
         mj_step(mj.model, mj.data)
+
+
+@compiled
+def between_halves(state: NDArray[np.void]) -> None:
+    """Runs the part of ``advance`` between MuJoCo's halves, for ``BoundKernel.step``."""
+    aim_contacts(state[0])
 
 
 # After MuJoCo's step: first the wrench, because the device waits for it, then energies and record
@@ -373,12 +392,15 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     """
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
+    spend_within_tank(s)
     if scheme != Scheme.MASSLESS:
         meter_ports(s)
     is_last = substep + 1 == s.run.substeps
     if count == 1 and not is_last:
         return OK
     force, torque, moved, turned = _evaluate(s, is_last)
+    if s.contact.is_rigid:
+        finish_contacts(s)
     loop.law_work = dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
@@ -406,6 +428,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     loop.active_contacts = ints(s.mj.ncon, 1)[0]
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
+    if s.contact.is_rigid:
+        loop.active_contacts = s.contact.active_contacts
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
@@ -459,6 +483,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
         return _refuse(s)
+    fill_tank(s)
     loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
     loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_device[3:6])))
     loop.peak_tool_force = max(loop.peak_tool_force, norm(vector_of(loop.wrench_on_tool)))
@@ -506,6 +531,7 @@ def _record(s: State, row: NDArray[np.void]) -> None:
     r.injected_damping = s.observer.injected_damping
     r.injected_rotational_damping = s.observer.injected_rotational_damping
     r.share = s.guard.share
+    r.contact_tank = s.contact.tank
 
 
 @compiled

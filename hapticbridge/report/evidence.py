@@ -25,8 +25,13 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.recording.timeline import due_times
-from hapticbridge.rendering import Method, RunCoupling, method_named
-from hapticbridge.run_description import MODEL_ATTACHMENT, parameters_of, requested_of
+from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.run_description import (
+    MODEL_ATTACHMENT,
+    method_of,
+    parameters_of,
+    requested_of,
+)
 from hapticbridge.summary import was_always_implicit
 
 if TYPE_CHECKING:
@@ -136,7 +141,7 @@ def draw_recording(recording: Recording) -> Figure:
     position_axes.set_ylabel("displacement (mm)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
-    method = method_named(meta.get("method", ""))
+    method = method_of(meta)
     coupling = RunCoupling.of(
         method,
         parameters.period / parameters.substeps,

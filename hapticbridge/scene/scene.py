@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,9 +12,28 @@ import numpy as np
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.kernel.colliders import use_exact_points
+from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
+
+_CONTACT_OPTIONS = {
+    "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
+    "impratio": IMPRATIO,
+    "noslip_iterations": 0,
+    "o_margin": MARGIN,
+}
+_MARGINS = ("geom_margin", "pair_margin", "flex_margin")
+
+
+def has_rigid_contact(model: mujoco.MjModel) -> bool:
+    """Returns True if a model has the options that ``Scene.set_contact`` sets for rigid ones."""
+    options, margins = dict(_CONTACT_OPTIONS), [model.opt.o_margin]
+    del options["o_margin"]
+    for name in _MARGINS:
+        margins += getattr(model, name).ravel().tolist()
+    return min(margins) >= MARGIN and all(getattr(model.opt, k) == v for k, v in options.items())
 
 
 @dataclass(slots=True)
@@ -39,6 +59,7 @@ class Scene:
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
     _reach: float = 0.0
+    _own_contact: dict[str, Any] = field(default_factory=dict)
 
     def claim(self) -> None:
         """Reserves the scene for one bridge, because two bridges would move one tool.
@@ -93,6 +114,33 @@ class Scene:
         self.model.geom_gap += more
         self.model.pair_gap += more
         self.model.flex_gap += more
+
+    def set_contact(self, *, is_rigid: bool) -> None:
+        """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
+
+        Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the points
+        of ``kernel.colliders``.
+        """
+        model, own = self.model, self._own_contact
+        if is_rigid == bool(own):
+            return
+        if not is_rigid:
+            for name, value in own.items():
+                setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+            use_exact_points(model, is_used=False)
+            self._own_contact = {}
+            return
+        own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
+        own |= {name: getattr(model, name).copy() for name in _MARGINS}
+        self._own_contact = own  # a new object: copies of the scene share the old one
+        for name, value in _CONTACT_OPTIONS.items():
+            setattr(model.opt, name, value)
+        model.opt.o_margin = max(own["o_margin"], MARGIN)
+        for name in _MARGINS:
+            margins = getattr(model, name)
+            margins[:] = np.maximum(margins, MARGIN)
+        use_exact_points(model)
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]

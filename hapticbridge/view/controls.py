@@ -26,8 +26,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
-from hapticbridge.rendering import RunCoupling, method_named
-from hapticbridge.run_description import parameters_of
+from hapticbridge.rendering import RunCoupling
+from hapticbridge.run_description import method_of, parameters_of
 
 PACE = 2.0 * INTERVAL
 """Smallest time in s between two commands to the bridge. At the bridge's own limit a delayed
@@ -52,7 +52,7 @@ _WORDS = {
 
 def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
     """Returns the coupling limits of a run's device, from the run's metadata."""
-    parameters, method = parameters_of(metadata), method_named(metadata["method"])
+    parameters, method = parameters_of(metadata), method_of(metadata)
     info, guarding = DeviceInfo.from_json(metadata["device"]), parameters.guarding
     limits = Limits(
         force=parameters.force_limit,

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticbridge.check.physics import matrix_of
 from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.rendering import RunCoupling, method_named
-from hapticbridge.run_description import requested_of
+from hapticbridge.rendering import RunCoupling
+from hapticbridge.run_description import method_of, requested_of
 from hapticbridge.summary import is_always_implicit
 from hapticbridge.units import format_forces, format_si
 from hapticbridge.view.geometry import (
@@ -448,7 +448,7 @@ def _strongest(sight: Sight) -> float:
 
 
 def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
-    method = method_named(facts.get("method", ""))
+    method = method_of(facts)
     coupling = RunCoupling.of(
         method,
         parameters.period / parameters.substeps,

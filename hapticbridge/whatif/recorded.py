@@ -28,10 +28,11 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
-from hapticbridge.rendering import Method, method_named, prepare
+from hapticbridge.rendering import Method, prepare
 from hapticbridge.run_description import (
     SOURCE_PREFIX,
     compiled_model,
+    method_of,
     parameters_of,
     requested_of,
 )
@@ -126,7 +127,7 @@ class RecordedRun:
             RecordingError: The recording does not describe its run, or carries no scene.
         """
         parameters = parameters_of(recording.meta)
-        method = method_named(recording.meta["method"])
+        method = method_of(recording.meta)
         try:
             info = DeviceInfo.from_json(recording.meta.get("device", ""))
             values = dict(read_json(recording.meta.get("scene_parameters", "{}")))

@@ -313,6 +313,7 @@ class Repetition:
             rate=settings.rate,
             substeps=settings.substeps,
             method=settings.method.name,
+            contact=settings.method.contact,
             contact_stiffness=settings.contact_stiffness,
             recording=path,
             clock=clock,

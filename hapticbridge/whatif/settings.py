@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.guard import CONTROLLERS
-from hapticbridge.rendering import Method, method_named, method_names
+from hapticbridge.rendering import CONTACTS, Method, method_named, method_names
 
 UNITS = {
     "stiffness": "N/m",
@@ -17,6 +17,7 @@ UNITS = {
     "rotational_stiffness": "N m/rad",
     "rotational_damping": "N m s/rad",
     "method": "",
+    "contact": "",
     "rate": "Hz",
     "substeps": "",
     "scale": "",
@@ -64,6 +65,8 @@ class Settings:
             return float(getattr(self.coupling, name))
         if name == "method":
             return self.method.name
+        if name == "contact":
+            return self.method.contact
         if name == "controller":
             return self.controller or "as the device needs"
         if name in UNITS:
@@ -89,6 +92,10 @@ class Settings:
             )
         values = {name: _convert(name, value) for name, value in changes.items()}
         method = method_named(str(values.get("method", self.method.name)))
+        contact_name = values.get("contact")
+        if contact_name is None and (method.can_be_rigid or not self.method.is_rigid):
+            contact_name = self.method.contact
+        method = method.with_contact(None if contact_name is None else str(contact_name))
         gains = {name: float(values[name]) for name in GAINS if name in values}
         scale = float(values.get("scale", self.scale))
         is_equal = self.scale == self.force_scale
@@ -131,7 +138,11 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
 
 def _convert(name: str, value: Value) -> Value:
     """Converts a value to the type of its setting; the bridge checks its range."""
-    named: dict[str, Collection[object]] = {"method": method_names(), "controller": CONTROLLERS}
+    named: dict[str, Collection[object]] = {
+        "method": method_names(),
+        "contact": CONTACTS,
+        "controller": CONTROLLERS,
+    }
     if name in named:
         if value not in named[name]:
             raise RecordingError(

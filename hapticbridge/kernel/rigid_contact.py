@@ -1,0 +1,302 @@
+"""Rigid contact at the level of velocities, whose depenetration is paid from a tank of energy.
+
+Each contact has a wanted normal velocity at the end of the step, in m/s,
+
+    ŵ = σ β p/h − μ|v_t|    in the penetration p > 0,        ŵ = −gap/h − μ|v_t|    in a gap
+
+h is the time step in s, v the relative velocity at the start, μ|v_t| = sqrt(Σ (μ_j v_j)²) over the
+rows of friction and σ the share of the depenetration. The wanted velocities of the friction rows
+are 0. MuJoCo's convex problem, with the regularisation R of each row, then gives impulses h λ with
+
+    C = h λᵀ J v⁺ = h λᵀ ŵ − h² λᵀ R λ   <=   Σ_{p>0} (σ β p/h)² / (4 R)
+
+C is the energy in J that the contacts give in the step. It is at most 0 for σ = 0: the contact
+holds, opens freely and never pushes out. A step is therefore solved with σ = 1 first. If C exceeds
+``SPENDABLE`` of the tank, the step is repeated with a smaller σ, at last 0. The tank holds what the
+environment has dissipated,
+
+    D_k = min(cap, D_{k−1} − E_k) <= −Σ E_k,    D_0 = 0
+
+so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
+remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
+moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
+Limits of joints are rows like a contact's without friction and share the tank. Limits of tendons
+and equality constraints stay MuJoCo's.
+
+MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
+parameters and the row's position. These are therefore written between the halves of its step. With
+an impedance d, R is (1 − d)/d of the row's inverse inertia, and under ``integrator="discrete"``
+
+    solref = (−ε d², −d/h),  position = −(2ŵ − v)/(ε h d)    →    J v⁺ = ŵ − h R λ
+    solreffriction = (0, −d/(ε h))                           →    ŵ_t = 0 to ε
+
+References:
+    Anitescu & Potra 1997 (velocity-level contact); Franken et al. 2011 (energy tank).
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import LIMIT_JOINT, Part, State
+from hapticbridge.kernel.ledger import mocap_contact_work
+from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.parameters import RunParameters
+
+SOFTNESS = 1e-3
+"""Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
+m sinks in by h² F SOFTNESS/(m DEPENETRATION), 0.15 µm at 3 N on 0.1 kg and 1 ms. A smaller value
+is more rigid and slower to solve."""
+
+DEPENETRATION = 0.2
+"""Share β of a penetration that a contact removes in one step, without unit. A larger share removes
+penetrations sooner and costs more energy at once."""
+
+IMPRATIO = 1000.0
+"""Ratio of the regularisations of normal and friction, MuJoCo's ``impratio``; no unit. A larger one
+creeps less below the limit of friction: 3 nm/s at half of it where 100 creeps by 31 nm/s (3 N on
+0.1 kg)."""
+
+MARGIN = 1.5e-4
+"""Distance in m at which a contact takes part in the step before it closes. A tool at 0.15 m/s
+moves so far in 1 ms. Faster contacts are first seen in penetration, which the tank then pays for.
+A larger margin costs time for contacts without force."""
+
+SPENDABLE = 0.9
+"""Largest share of the tank that one tick spends, without unit. The rest covers the remainder of
+the integration."""
+
+RESERVE = 1e-7
+"""Energy in J of the tank that is never spent; it covers rounding and the remainder of the
+integration."""
+
+_EXACT = 1e-9
+"""ε of the module's equations, without unit: the spring that is left in the row of a contact, and
+the velocity that is left in the rows of friction."""
+
+_IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
+
+_LIMIT_ADDRESSES = ("jnt_solref", "jnt_solimp", "own_solref", "own_solimp", "limit_positions")
+
+RIGID_DTYPE = np.dtype(
+    [
+        ("is_rigid", "<i8"),
+        ("repetitions", "<i8"),
+        ("active_contacts", "<i8"),
+        ("is_aimed", "<i8"),
+        ("limit_capacity", "<i8"),
+        *((name, "<i8") for name in _LIMIT_ADDRESSES),
+        ("share", "<f8"),
+        ("tank", "<f8"),
+        ("cap", "<f8"),
+        ("last_energy", "<f8"),
+    ]
+)
+"""Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
+``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
+force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
+last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of joint limits: largest count
+of rows, and addresses of the model's parameters, of copies, and of the rows' own positions."""
+
+
+def bind_contact(
+    contact: Part, model: mujoco.MjModel, parameters: RunParameters
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
+    contact["is_rigid"] = parameters.is_rigid
+    contact["cap"] = parameters.tank_cap
+    contact["limit_capacity"] = 2 * int(np.count_nonzero(model.jnt_limited))
+    owned: dict[str, NDArray[np.generic]] = {
+        "own_solref": model.jnt_solref.copy(),
+        "own_solimp": model.jnt_solimp.copy(),
+        "limit_positions": np.zeros(max(2 * model.njnt, 1)),
+    }
+    for name, array in owned.items():
+        contact[name] = array.ctypes.data
+    contact["jnt_solref"] = model.jnt_solref.ctypes.data
+    contact["jnt_solimp"] = model.jnt_solimp.ctypes.data
+    return owned
+
+
+@compiled
+def _aim(s: State) -> None:
+    """Writes parameters and positions for ``mj_step2``, for the present share."""
+    if s.contact.limit_capacity > 0:
+        _aim_limits(s)
+    mj, h, push = s.mj, s.run.timestep, s.contact.share * DEPENETRATION
+    d = _IMPEDANCE
+    count = ints(mj.nefc, 1)[0]
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    margins = floats(pointer_at(mj.efc_margin), count)
+    contacts = pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        row = ints(contact + mj.contact_row, 1)[0]
+        if row < 0:
+            continue
+        friction = floats(contact + mj.contact_friction, 5)
+        slide = 0.0
+        for j in range(1, ints(contact + mj.contact_dim, 1)[0]):
+            slide += (friction[j - 1] * velocities[row + j]) ** 2
+        distance = floats(contact + mj.contact_distance, 1)[0]
+        wanted = (-push if distance < 0.0 else -1.0) * distance / h - math.sqrt(slide)
+        positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
+        margins[row] = 0.0
+        solref = floats(contact + mj.contact_solref, 2)
+        solref[0], solref[1] = -_EXACT * d * d, -d / h
+        solref = floats(contact + mj.contact_solreffriction, 2)
+        solref[0], solref[1] = 0.0, -d / (_EXACT * h)
+        solimp = floats(contact + mj.contact_solimp, 2)
+        solimp[0] = solimp[1] = d
+
+
+@compiled
+def _aim_limits(s: State) -> None:
+    """Does for the limits of joints what ``_aim`` does for contacts.
+
+    Their parameters are the model's, which has its own values again after the step.
+    """
+    mj, contact, h = s.mj, s.contact, s.run.timestep
+    push, d = contact.share * DEPENETRATION, _IMPEDANCE
+    count = ints(mj.nefc, 1)[0]
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    margins = floats(pointer_at(mj.efc_margin), count)
+    own, found = floats(contact.limit_positions, contact.limit_capacity), 0
+    for row in range(count):
+        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
+            continue
+        if not contact.is_aimed:
+            own[found] = positions[row]
+        wanted = (-push if own[found] < 0.0 else -1.0) * own[found] / h
+        positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
+        margins[row] = 0.0
+        solref = floats(contact.jnt_solref + 16 * ids[row], 2)
+        solref[0], solref[1] = -_EXACT * d * d, -d / h
+        solimp = floats(contact.jnt_solimp + 40 * ids[row], 2)
+        solimp[0] = solimp[1] = d
+        found += 1
+
+
+@compiled
+def _restore_limits(s: State) -> None:
+    mj, contact, found = s.mj, s.contact, 0
+    count = ints(mj.nefc, 1)[0]
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    own = floats(contact.limit_positions, contact.limit_capacity)
+    for row in range(count):
+        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
+            continue
+        positions[row] = own[found]
+        for place, kept, step in (
+            (contact.jnt_solref, contact.own_solref, 16),
+            (contact.jnt_solimp, contact.own_solimp, 40),
+        ):
+            values = floats(place + step * ids[row], 2)
+            before = floats(kept + step * ids[row], 2)
+            values[0], values[1] = before[0], before[1]
+        found += 1
+
+
+@compiled
+def aim_contacts(s: State) -> None:
+    """Makes contacts and limits of the coming ``mj_step2`` rigid; needs the velocity stage."""
+    contact = s.contact
+    if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
+        has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
+        contact.share = 1.0 if has_energy else 0.0
+        _aim(s)
+        contact.is_aimed = 1
+
+
+@compiled
+def _spendable(s: State) -> float:
+    return float(SPENDABLE * (s.contact.tank - RESERVE) / s.run.substeps)
+
+
+@compiled
+def returned_energy(s: State) -> float:
+    """Returns C, the energy in J that contacts and limits gave in the step that just ended."""
+    mj, h = s.mj, s.run.timestep
+    count = ints(mj.nefc, 1)[0]
+    force = floats(pointer_at(mj.efc_force), count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    reference = floats(pointer_at(mj.efc_aref), count)
+    regularisation = floats(pointer_at(mj.efc_R), count)
+    contacts, total = pointer_at(mj.contact), 0.0
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        row = ints(contact + mj.contact_row, 1)[0]
+        if row < 0:
+            continue
+        for i in range(row, row + ints(contact + mj.contact_dim, 1)[0]):
+            end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
+            total += h * force[i] * end
+    if s.contact.limit_capacity > 0:
+        kinds = ints(pointer_at(mj.efc_type), count)
+        for i in range(count):
+            if kinds[i] == LIMIT_JOINT:
+                end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
+                total += h * force[i] * end
+    return total
+
+
+@compiled
+def lower_share(s: State) -> bool:
+    """Aims at less depenetration if the step that just ended spent more than the tank allows.
+
+    Returns:
+        True if it did; the step must then be repeated.
+    """
+    contact = s.contact
+    if not contact.is_aimed or contact.share <= 0.0:
+        return False
+    allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
+    if s.energy.mocap_has_moved:
+        allowed += mocap_contact_work(s)  # the external port pays for it
+    if returned <= allowed:
+        return False
+    # C is nearly proportional to the share while the forces stay; a second excess ends it
+    is_first = contact.share == 1.0 and allowed > 0.0
+    contact.share = SPENDABLE * allowed / returned if is_first else 0.0
+    contact.repetitions += 1
+    _aim(s)
+    return True
+
+
+@compiled
+def finish_contacts(s: State) -> None:
+    """Counts the contacts with a force, and restores positions and the limits' parameters."""
+    mj = s.mj
+    if s.contact.is_aimed and s.contact.limit_capacity > 0:
+        _restore_limits(s)
+    s.contact.is_aimed = 0
+    count = ints(mj.nefc, 1)[0]
+    positions = floats(pointer_at(mj.efc_pos), count)
+    force = floats(pointer_at(mj.efc_force), count)
+    s.contact.active_contacts = 0
+    contacts = pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        row = ints(contact + mj.contact_row, 1)[0]
+        if row >= 0:
+            positions[row] = floats(contact + mj.contact_distance, 1)[0]
+            s.contact.active_contacts += force[row] > 0.0
+
+
+@compiled
+def fill_tank(s: State) -> None:
+    """Adds the energy that the environment dissipated in the tick; takes what it created."""
+    contact, created = s.contact, s.energy.environment_energy
+    if not contact.is_rigid:
+        return
+    contact.tank = min(contact.tank - (created - contact.last_energy), contact.cap)
+    contact.last_energy = created

@@ -1,0 +1,412 @@
+"""Rigid contacts: passive by the tank, sharp, with Coulomb's friction, repeated to the bit."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from kernel_runs import Array, Run, T, go_on, load, run_of, samples_of, unlimited
+from scipy.spatial.transform import Rotation
+
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate
+from hapticbridge.options import BridgeOptions
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.rendering import METHODS, prepare
+from hapticbridge.run_description import method_of
+from hapticbridge.scene import Scene, load_scene
+
+BETA, SPENDABLE = 0.2, 0.9  # of the law, written down anew
+
+OPTION = '<option gravity="0 0 {g}" cone="{cone}"/>'
+HEAD = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  {OPTION}
+  <default><geom solref="0.002 1" solimp="0.9 0.95 0.001" condim="{{condim}}"
+    friction="{{mu}} 0.002 0.002"/></default>
+  <worldbody>"""
+PEG = (
+    HEAD
+    + """
+    <body name="tool"><freejoint/><geom type="box" size="0.01 0.01 0.03" mass="{mass}"/>
+      <site name="grip"/></body>
+    <geom type="box" size="0.02 0.05 0.03" pos="0.0302 0 -0.03"/>
+    <geom type="box" size="0.02 0.05 0.03" pos="-0.0302 0 -0.03"/>
+    <geom type="box" size="0.0102 0.02 0.03" pos="0 0.0302 -0.03"/>
+    <geom type="box" size="0.0102 0.02 0.03" pos="0 -0.0302 -0.03"/>
+    <geom type="box" size="0.03 0.03 0.005" pos="0 0 -0.065"/>
+  </worldbody>
+</mujoco>"""
+)
+BLOCK = (
+    HEAD
+    + """
+    <body name="tool"><freejoint/><geom type="box" size="0.015 0.015 0.01" mass="{mass}"/>
+      <site name="grip"/></body>
+    <geom type="box" size="0.3 0.1 0.01" pos="0 0 -0.02"/>
+  </worldbody>
+</mujoco>"""
+)
+BALL = (
+    HEAD
+    + """
+    <body name="tool"><freejoint/><geom type="sphere" size="0.01" mass="{mass}"/>
+      <site name="grip"/></body>
+    <geom type="box" size="0.1 0.1 0.01" pos="0 0 -0.02"/>
+    <body name="other" pos="0.03 0 0"><freejoint/>
+      <geom type="capsule" size="0.01 0.02" euler="1.5708 0 0" mass="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+)
+COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
+
+
+def scene(
+    xml: str, *, mass: float = 0.1, mu: float = 0.4, condim: int = 3, g: float = 0.0,
+    cone: str = "elliptic",
+) -> Scene:  # fmt: skip
+    return load(xml.format(mass=mass, mu=mu, condim=condim, g=g, cone=cone))
+
+
+def prepared(
+    loaded: Scene, method: str = "implicit", coupling: Coupling = COUPLING, contact: str = "rigid"
+) -> Run:
+    """Returns a run without ticks that starts where the scene stands."""
+    chosen = METHODS[method].with_contact(contact)
+    start = loaded.data.qpos.copy()
+    prepare(loaded, coupling, T, 1, chosen, warns=False)
+    loaded.data.qpos[:] = start
+    mujoco.mj_forward(loaded.model, loaded.data)
+    parameters = unlimited(
+        loaded,
+        chosen.law_coupling(coupling, T),
+        scheme=chosen.scheme,
+        is_rigid=chosen.is_rigid,
+    )
+    return run_of(loaded, BoundKernel(loaded.model, loaded.data, parameters), parameters)
+
+
+def through(run: Run, samples: np.ndarray) -> Run:
+    """Runs all ticks in compiled code."""
+    run.ticks = np.zeros(len(samples), TICK_DTYPE)
+    done = simulate(run.binding.state, samples, run.binding.row, run.ticks)
+    assert done == len(samples)
+    return run
+
+
+def jamming(seed: int, count: int = 1500) -> np.ndarray:
+    """Returns samples of a random hand that turns and pushes a tool in its hole."""
+    generator = np.random.default_rng(seed)
+    time = T * np.arange(1, count + 1)
+
+    def wave(amplitude: float) -> Array:
+        frequency = generator.uniform(0.3, 6.0, 5)
+        weight = generator.uniform(0.2, 1.0, 5) / np.sqrt(frequency)
+        phase = generator.uniform(0.0, 2 * np.pi, 5)
+        curve = np.sin(2 * np.pi * np.outer(time, frequency) + phase) @ (weight / weight.sum())
+        return np.asarray(2 * amplitude * (curve - curve[0]) * np.minimum(time / 0.1, 1.0))
+
+    places = np.stack([wave(0.004) for _ in range(3)], axis=1)
+    turns = np.stack([wave(0.08) for _ in range(3)], axis=1)
+    return samples_of(places, Rotation.from_rotvec(turns))
+
+
+def pressed(count: int, force: float, sideways: float = 0.0) -> np.ndarray:
+    """Returns samples that press with a force in N, and pull sideways after 0.4 s, in 0.2 s."""
+    time = T * np.arange(1, count + 1)
+    places = np.zeros((count, 3))
+    places[:, 2] = -force / COUPLING.stiffness * np.minimum(time / 0.2, 1.0)
+    places[:, 0] = sideways / COUPLING.stiffness * np.clip((time - 0.4) / 0.2, 0.0, 1.0)
+    return samples_of(places)
+
+
+def strict(run: Run) -> bool:
+    return int(run.binding.state["energy"]["first_unstrict"][0]) < 0
+
+
+# The law
+
+
+@dataclass
+class Work:
+    """Work of the contacts in each tick, by MuJoCo's own rows; ``tank`` is the one before it."""
+
+    given: list[float]
+    bound: list[float]
+    tank: list[float]
+    depth: list[float]
+
+    def note(self, run: Run, data: mujoco.MjData) -> None:
+        tank = float(run.binding.state["contact"]["tank"][0])
+        self.tank.append(tank)
+        rows = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+        speed = np.zeros(data.nefc)
+        if data.nefc:
+            mujoco.mj_mulJacVec(run.scene.model, data, speed, data.qvel)
+        self.given.append(float(T * (data.efc_force * speed)[rows].sum()))
+        normals = [c.efc_address for c in data.contact if c.efc_address >= 0]
+        depth = np.maximum(-data.efc_pos[normals], 0.0)
+        wanted = BETA * depth / T
+        self.bound.append(float((wanted**2 / (4 * data.efc_R[normals])).sum()))
+        self.depth.append(float(depth.max(initial=0.0)))
+
+
+def measured(run: Run, samples: np.ndarray) -> Work:
+    work = Work([], [], [float(run.binding.state["contact"]["tank"][0])], [])
+    go_on(run, samples, after_tick=lambda _, data: work.note(run, data))
+    return work
+
+
+@pytest.mark.parametrize("condim", [1, 3, 4, 6])
+@pytest.mark.parametrize(("xml", "mass"), [(PEG, 0.03), (BALL, 0.1), (BLOCK, 0.03)])
+def test_contacts_give_no_more_than_the_law_and_the_tank_allow(
+    xml: str, mass: float, condim: int
+) -> None:
+    run = prepared(scene(xml, mass=mass, mu=0.3, condim=condim, g=-2.0))
+    samples = jamming(condim, 900)
+    samples["position"][:, 2] -= 0.002
+    work = measured(run, samples)
+    given, bound, tank = np.array(work.given), np.array(work.bound), np.array(work.tank)
+    assert np.abs(given).max() > 1e-6
+    assert max(work.depth) > 1e-8
+    assert (given <= bound + 1e-15).all()
+    assert (given <= SPENDABLE * np.maximum(tank[:-1], 0.0) + 1e-15).all()
+    assert strict(run)
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_a_jammed_peg_is_strict_where_the_contact_of_the_scene_creates_energy(cone: str) -> None:
+    stiff = Coupling(6000.0, 0.5, 6.0, 5e-4)
+    for seed, mass, mu in ((4, 0.03, 0.0), (5, 0.03, 0.1), (7, 0.1, 0.0), (7, 0.03, 0.4)):
+        condim, friction = (1, 1.0) if mu == 0.0 else (3, mu)
+        results = {}
+        for contact in ("rigid", "scene"):
+            peg = scene(PEG, mass=mass, mu=friction, condim=condim, cone=cone)
+            results[contact] = through(prepared(peg, "implicit", stiff, contact), jamming(seed))
+        assert strict(results["rigid"]), (seed, mass, mu)
+        assert not strict(results["scene"]), (seed, mass, mu)
+
+
+def test_the_tank_is_filled_by_what_was_dissipated_up_to_its_cap() -> None:
+    run = through(prepared(scene(PEG, mass=0.1)), jamming(5))
+    created = np.concatenate([[0.0], run.ticks["environment_energy"]])
+    tank = run.ticks["contact_tank"]
+    cap = 0.5 * COUPLING.stiffness * 1e-3**2
+    level, expected = 0.0, []
+    for change in np.diff(created):
+        level = min(level - change, cap)
+        expected.append(level)
+    assert tank == pytest.approx(np.array(expected), abs=1e-12)
+    assert tank.max() == cap
+    assert (tank <= -run.ticks["environment_energy"] + 1e-15).all()
+
+
+def sunken(tank: float, cap: float, depth: float = 1e-3) -> Run:
+    """Returns a run whose tool stands inside the floor, with a tank of this energy."""
+    block = scene(BLOCK, mass=0.1)
+    block.data.qpos[2] = -depth
+    run = prepared(block)
+    run.binding.state["contact"]["tank"] = tank
+    run.binding.state["contact"]["cap"] = cap
+    return run
+
+
+def test_with_an_empty_tank_a_contact_holds_and_opens_but_never_pushes_out() -> None:
+    run = go_on(sunken(0.0, 0.0), pressed(400, 3.0))
+    height = run.ticks["tool_position"][:, 2]
+    assert height.min() > -1.01e-3
+    assert np.diff(height).max() <= 1e-12
+    assert strict(run)
+    lifted = np.zeros((600, 3))
+    lifted[:, 2] = 0.004
+    go_on(run, samples_of(lifted))
+    assert run.ticks["tool_position"][-1, 2] > 1e-3
+
+
+def test_a_full_tank_pushes_out_and_pays_for_it() -> None:
+    run = go_on(sunken(4e-3, 4e-3), pressed(400, 1.0))
+    assert run.ticks["tool_position"][-1, 2] > -2e-6
+    spent = 4e-3 - run.ticks["contact_tank"].min()
+    assert 0.0 < run.ticks["environment_energy"].max() <= spent + 1e-12 <= 4e-3
+
+
+def test_without_the_tank_a_contact_creates_energy() -> None:
+    run = go_on(sunken(1e3, 1e3), pressed(400, 3.0))
+    assert not strict(run)
+
+
+RAILS = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0"/>
+  <default><joint limited="true" range="-0.004 0.003" solreflimit="-1000000 -500"
+    solimplimit="0.9 0.95 0.001"/><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="tool">
+    <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+    <joint type="slide" axis="0 0 1"/><joint axis="1 0 0" range="-0.02 0.03"/>
+    <joint axis="0 1 0" range="-0.02 0.03"/><joint axis="0 0 1" range="-0.02 0.03"/>
+    <geom type="box" size="0.01 0.01 0.03" mass="0.01"/><site name="grip"/></body></worldbody>
+</mujoco>"""
+
+
+def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
+    stiff = Coupling(6000.0, 0.5, 0.6, 5e-5)
+    runs = {}
+    for contact in ("rigid", "scene"):
+        loaded = load(RAILS)
+        own = loaded.model.jnt_solref.copy(), loaded.model.jnt_solimp.copy()
+        samples = jamming(1)
+        samples["position"] *= 2.0
+        runs[contact] = through(prepared(loaded, "implicit", stiff, contact), samples)
+        assert (loaded.model.jnt_solref == own[0]).all()
+        assert (loaded.model.jnt_solimp == own[1]).all()
+    assert strict(runs["rigid"])
+    assert not strict(runs["scene"])
+    settled = load(RAILS)
+    run = through(prepared(settled), pressed(1000, 15.0))
+    assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
+
+
+# Sharpness
+
+
+def test_a_pressed_tool_settles_within_a_micrometre() -> None:
+    for mass in (0.03, 0.3):
+        run = through(prepared(scene(BALL, mass=mass, mu=0.4)), pressed(1000, 3.0))
+        assert -1e-6 < run.ticks["tool_position"][-1, 2] < 0.0
+
+
+def test_a_lifted_tool_is_released_within_10_ms() -> None:
+    samples = pressed(1000, 20.0)
+    samples["position"][800:, 2] = 0.002
+    run = through(prepared(scene(BALL)), samples)
+    opened = np.flatnonzero(run.ticks["tool_position"][800:, 2] > 0.0)
+    assert opened[0] <= 10
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.4])
+def test_friction_breaks_away_at_coulombs_limit_and_slides_at_it(mu: float) -> None:
+    samples = pressed(6000, 3.0)
+    samples["position"][:, 0] = 2e-4 * np.maximum(T * np.arange(6000) - 0.4, 0.0)
+    run = through(prepared(scene(BLOCK, mu=mu)), samples)
+    force = -run.ticks["wrench_on_tool"][:, [0, 2]] * [-1.0, 1.0]
+    ratio = force[400:, 0] / force[400:, 1]
+    held = ratio[np.abs(run.ticks["tool_position"][400:, 0]) < 1e-6]
+    assert held.max() == pytest.approx(mu, rel=0.01)
+    assert np.median(ratio[-500:]) == pytest.approx(mu, rel=0.01)
+
+
+def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
+    for contact, least, most in (("rigid", 0.0, 10e-9), ("scene", 1e-6, 1.0)):
+        block = scene(BLOCK, mu=0.4)
+        run = through(prepared(block, contact=contact), pressed(2600, 3.0, 0.5 * 0.4 * 3.0))
+        creep = abs(run.ticks["tool_position"][-1, 0] - run.ticks["tool_position"][-1001, 0])
+        assert least <= creep < most
+
+
+# Equal in every repetition
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
+def test_compiled_ticks_equal_those_through_mujocos_bindings(method: str) -> None:
+    samples = jamming(7, 600)
+
+    def peg() -> Scene:
+        return scene(PEG, mass=0.03, mu=0.1)
+
+    one = go_on(prepared(peg(), method), samples)
+    other = through(prepared(peg(), method), samples)
+    assert one.ticks.tobytes() == other.ticks.tobytes()
+    assert int(one.binding.state["contact"]["repetitions"][0]) > 0
+    assert strict(one)
+
+
+@pytest.mark.parametrize("level", [0.5, 5.0])
+def test_a_force_limit_and_a_tank_hold_together(level: float) -> None:
+    run = prepared(scene(PEG, mass=0.03, mu=0.1))
+    run.parameters = replace(run.parameters, force_limit=level, torque_limit=0.05)
+    run.binding = BoundKernel(run.scene.model, run.scene.data, run.parameters)
+    work = measured(run, jamming(2, 900))
+    force = np.linalg.norm(run.ticks["wrench_on_tool"][:, :3], axis=1)
+    assert force.max() == pytest.approx(level)
+    assert (work.given <= SPENDABLE * np.maximum(work.tank[:-1], 0.0) + 1e-15).all()
+    assert strict(run)
+
+
+@pytest.mark.parametrize("contact", ["rigid", "scene"])
+def test_a_recorded_contact_is_read_back_and_repeated(contact: str, tmp_path: Path) -> None:
+    from hapticbridge.audit import audit
+
+    path = tmp_path / "run.mcap"
+    with Bridge(
+        "peg_in_hole",
+        clock=SimulatedClock(),
+        contact=contact,
+        recording=path,
+        pipelined=True,
+    ) as bridge:
+        bridge.run(2.5)
+        assert bridge.session.parameters.is_rigid == (contact == "rigid")
+    report = audit(path)
+    assert (report.verdict, report.environment) == ("passive", "strict")
+    assert report.resimulation == "bit for bit"
+
+
+# The option
+
+
+def test_contact_of_the_scene_restores_what_rigid_contact_changed() -> None:
+    loaded = scene(PEG, cone="pyramidal")
+    fields = ("geom_margin", "pair_margin", "flex_margin")
+    before = [getattr(loaded.model, name).copy() for name in fields]
+    own = loaded.model.opt.cone, loaded.model.opt.impratio, loaded.model.opt.o_margin
+    prepared(loaded)
+    assert loaded.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert (loaded.model.geom_margin > 0).all()
+    prepared(loaded, contact="scene")
+    after = [getattr(loaded.model, name) for name in fields]
+    assert all((a == b).all() for a, b in zip(before, after, strict=True))
+    assert own == (loaded.model.opt.cone, loaded.model.opt.impratio, loaded.model.opt.o_margin)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"contact": "soft"}, "no contact is called 'soft'; contacts: 'rigid', 'scene'"),
+        ({"contact": "rigid", "method": "weld"}, "'weld' has the contacts of the scene"),
+        (
+            {"contact": "rigid", "method": "explicit:rk4"},
+            "one of 'compensated', 'implicit', 'lossless'",
+        ),
+    ],
+)
+def test_a_contact_that_a_method_cannot_have_is_refused(
+    changes: dict[str, str], message: str
+) -> None:
+    with pytest.raises(HapticBridgeError, match=re.escape(message)):
+        BridgeOptions(**changes)  # type: ignore[arg-type] # names are checked there
+
+
+def test_methods_for_comparison_and_earlier_recordings_have_the_contact_of_the_scene() -> None:
+    assert BridgeOptions(method="weld").rendering_method.contact == "scene"
+    assert BridgeOptions().rendering_method.contact == "rigid"
+    assert method_of({"method": "lossless"}).contact == "scene"
+    assert method_of({"method": "lossless", "contact": "rigid"}).contact == "rigid"
+
+
+@pytest.mark.parametrize("name", ["lock", "pliers", "planar_peg"])
+def test_a_shipped_scene_starts_at_rest_with_rigid_contacts(name: str) -> None:
+    run = prepared(load_scene(name), "lossless")
+    through(run, samples_of(np.zeros((300, 3))))
+    moved = np.linalg.norm(run.ticks["tool_position"] - run.tool_start[:3], axis=1)
+    assert moved.max() < 1e-3
+    assert strict(run)
