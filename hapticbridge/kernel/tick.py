@@ -193,7 +193,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
-    watch_device(s, moved, turned)
+    watch_device(s, moved, turned, interval)
     move_device(pose, position, quaternion)
 
     buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
