@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
+        changes: Options of the file that were changed, each as ``name: old → new``.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -126,9 +129,7 @@ class Scene:
         if is_rigid == bool(own):
             return
         if not is_rigid:
-            for name, value in own.items():
-                setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
-            use_exact_points(model, is_used=False)
+            self._restore_contact(model)
             self._own_contact = {}
             return
         own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
@@ -141,6 +142,19 @@ class Scene:
             margins = getattr(model, name)
             margins[:] = np.maximum(margins, MARGIN)
         use_exact_points(model)
+
+    def _restore_contact(self, model: mujoco.MjModel) -> None:
+        for name, value in self._own_contact.items():
+            setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+        use_exact_points(model, is_used=False)
+
+    def model_with_own_contact(self) -> mujoco.MjModel:
+        """Returns the model if its contacts are the scene's own, else a copy that has these."""
+        if not self._own_contact:
+            return self.model
+        model = copy.copy(self.model)
+        self._restore_contact(model)
+        return model
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
