@@ -220,15 +220,16 @@ PATHS = {
     "point_mass": HandPath(figure_eight, axes=(1, 1, 1, 1, 1, 1), seed=2),
     # The paths of the pegs: come down tilted and off centre, so that one corner of the peg's end is
     # the lowest and enters the hole whatever the error; push that corner against the hole's walls;
-    # go down a little; straighten; go down to 3 mm above the bottom; push against a wall; wiggle;
-    # press on the bottom; withdraw.
+    # go down by 0.6 mm, no further: a peg of width w is wider across when it stands l deep and
+    # tilted, by l²/2w, and would not straighten in a clearance below l²/4w; straighten; go down to
+    # 3 mm above the bottom; push against a wall; wiggle; press on the bottom; withdraw.
     "planar_peg": HandPath(
         reaching(
-            Reach(0.3, 1.0, (0.4, 0, -10.3), (0, 3.0, 0)),
+            Reach(0.3, 1.0, (0.4, 0, -10.2), (0, 3.0, 0)),
             Reach(1.5, 0.6, (1.6, 0, 0)),
-            Reach(2.1, 0.5, (0, 0, -1.5)),
+            Reach(2.1, 0.5, (0, 0, -0.6)),
             Reach(2.6, 0.7, (-1.8, 0, 0), (0, -3.0, 0)),
-            Reach(3.3, 1.2, (-0.2, 0, -35.2)),
+            Reach(3.3, 1.2, (-0.2, 0, -36.2)),
             Reach(4.6, 0.5, (2.4, 0, 0)),
             Reach(5.2, 0.4, (-4.4, 0, 0), (0, 2.5, 0)),
             Reach(5.5, 0.4, (3.4, 0, 0), (0, -5.0, 0)),
@@ -243,9 +244,9 @@ PATHS = {
         reaching(
             Reach(0.3, 1.0, (0.4, -0.3, -10.0), (-2.5, 2.5, 1.0)),
             Reach(1.5, 0.6, (1.6, 2.1, 0)),
-            Reach(2.1, 0.5, (0, 0, -1.5)),
+            Reach(2.1, 0.5, (0, 0, -0.6)),
             Reach(2.6, 0.7, (-1.8, -1.6, 0), (2.5, -2.5, -1.0)),
-            Reach(3.3, 1.2, (-0.2, -0.2, -35.9)),
+            Reach(3.3, 1.2, (-0.2, -0.2, -36.8)),
             Reach(4.6, 0.5, (2.4, 0, 0)),
             Reach(5.2, 0.4, (-2.4, -2.0, 0), (2.0, 0, 0)),
             Reach(5.5, 0.4, (-1.5, 3.5, 0), (-2.0, 2.5, 2.0)),

@@ -135,7 +135,7 @@ def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     path = tmp_path / "wall.mcap"
     device = ScriptedDevice(press, strength=100.0, damping=20.0)
     limits = Limits(force=100.0, torque=5.0, ramp=0.05, energy=math.inf)
-    recorded(path, scene, device, coupling, duration=0.3, limits=limits)
+    recorded(path, scene, device, coupling, duration=0.3, limits=limits, contact="scene")
     report = audit(path)
     assert (report.verdict, report.exit_code) == ("active", 1)
     assert report.tick is not None and 160 < report.tick < 200

@@ -172,10 +172,15 @@ def peg_at_edge(seed: int) -> tuple[Floats, list[Rotation]]:
     """Returns a smooth motion of a peg that leans on the edge of a wall beside it."""
     random = np.random.default_rng(seed)
     t = np.arange(1000) * 1e-3
-    waves = sum(
-        random.uniform(0.2, 1.0, (6, 1))
-        * np.sin(2 * np.pi * random.uniform(0.5, 3.0, (6, 1)) * t + random.uniform(0, 6, (6, 1)))
-        for _ in range(3)
+    waves = np.sum(
+        [
+            random.uniform(0.2, 1.0, (6, 1))
+            * np.sin(
+                2 * np.pi * random.uniform(0.5, 3.0, (6, 1)) * t + random.uniform(0, 6, (6, 1))
+            )
+            for _ in range(3)
+        ],
+        axis=0,
     )
     tilt = np.array([0.02, 0.06, 0.03])[:, None] * waves[3:]
     return np.array([0.0, 0.004, 0.01])[:, None] * waves[:3], [
@@ -321,7 +326,7 @@ def test_threads_find_the_same_points() -> None:
         data.qvel[:] = 0.1, 0.0, 0.0, 1.0, 2.0, 3.0
         for _ in range(300):
             mujoco.mj_step(model, data)
-        return data.qpos.copy()
+        return np.array(data.qpos)
 
     with ThreadPoolExecutor(2) as pool:
         results = list(pool.map(rolled, range(4)))

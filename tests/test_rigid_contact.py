@@ -244,6 +244,38 @@ def test_without_the_tank_a_contact_creates_energy() -> None:
     assert not strict(run)
 
 
+RAILS = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0"/>
+  <default><joint limited="true" range="-0.004 0.003" solreflimit="-1000000 -500"
+    solimplimit="0.9 0.95 0.001"/><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="tool">
+    <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+    <joint type="slide" axis="0 0 1"/><joint axis="1 0 0" range="-0.02 0.03"/>
+    <joint axis="0 1 0" range="-0.02 0.03"/><joint axis="0 0 1" range="-0.02 0.03"/>
+    <geom type="box" size="0.01 0.01 0.03" mass="0.01"/><site name="grip"/></body></worldbody>
+</mujoco>"""
+
+
+def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
+    stiff = Coupling(6000.0, 0.5, 0.6, 5e-5)
+    runs = {}
+    for contact in ("rigid", "scene"):
+        loaded = load(RAILS)
+        own = loaded.model.jnt_solref.copy(), loaded.model.jnt_solimp.copy()
+        samples = jamming(1)
+        samples["position"] *= 2.0
+        runs[contact] = through(prepared(loaded, "implicit", stiff, contact), samples)
+        assert (loaded.model.jnt_solref == own[0]).all()
+        assert (loaded.model.jnt_solimp == own[1]).all()
+    assert strict(runs["rigid"])
+    assert not strict(runs["scene"])
+    settled = load(RAILS)
+    run = through(prepared(settled), pressed(1000, 15.0))
+    assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
+
+
 # Sharpness
 
 
@@ -284,12 +316,25 @@ def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
 # Equal in every repetition
 
 
+def drumming(count: int) -> np.ndarray:
+    """Returns samples of a hand that drums on the floor at 20 Hz, too fast for an empty tank."""
+    time = T * np.arange(1, count + 1)
+    places, turns = np.zeros((count, 3)), np.zeros((count, 3))
+    places[:, 0] = 0.004 * np.sin(2 * np.pi * 1.3 * time)
+    places[:, 2] = 0.004 * np.sin(2 * np.pi * 20 * time) * np.minimum(time / 0.1, 1.0) - 0.002
+    turns[:, 1] = 0.1 * np.sin(9 * time)
+    return samples_of(places, Rotation.from_rotvec(turns))
+
+
 @pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
 def test_compiled_ticks_equal_those_through_mujocos_bindings(method: str) -> None:
-    samples = jamming(7, 600)
-    peg = {"mass": 0.03, "mu": 0.1}
-    one = go_on(prepared(scene(PEG, **peg), method), samples)
-    other = through(prepared(scene(PEG, **peg), method), samples)
+    samples = drumming(600)
+
+    def block() -> Scene:
+        return scene(BLOCK, mass=0.03, mu=0.1)
+
+    one = go_on(prepared(block(), method), samples)
+    other = through(prepared(block(), method), samples)
     assert one.ticks.tobytes() == other.ticks.tobytes()
     assert int(one.binding.state["contact"]["repetitions"][0]) > 0
     assert strict(one)

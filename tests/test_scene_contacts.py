@@ -184,12 +184,15 @@ def test_defaults_and_an_approximate_diagonal_are_mentioned_only_when_asked(tmp_
     assert "approximate diagonal" in said
 
 
-def prepared(path: Path, rate: float, substeps: int = 1, method: str = "implicit") -> list[str]:
+def prepared(
+    path: Path, rate: float, substeps: int = 1, method: str = "implicit", contact: str = "scene"
+) -> list[str]:
     """Returns the warnings of loading a scene and preparing it for a rate in Hz."""
+    chosen = METHODS[method].with_contact(contact)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         loaded = load_scene(path)
-        prepare(loaded, Coupling(1000.0, 0.5, 1.0, 5e-4), 1 / rate, substeps, METHODS[method])
+        prepare(loaded, Coupling(1000.0, 0.5, 1.0, 5e-4), 1 / rate, substeps, chosen)
     return [str(one.message) for one in caught]
 
 
@@ -206,6 +209,7 @@ def test_a_method_that_solves_contacts_in_its_own_way_is_not_judged(tmp_path: Pa
     path = scene(tmp_path, floor=GOOD, tip=HARD)
     assert prepared(path, 1000) != []
     assert prepared(path, 1000, method="explicit") == []
+    assert prepared(path, 1000, contact="rigid") == []
 
 
 @pytest.mark.parametrize(

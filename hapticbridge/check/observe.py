@@ -250,13 +250,13 @@ def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
 
 
 def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
-    """Resets a scene for the default method, and returns the parameters for ``BoundKernel``.
+    """Resets a scene for the default method with its own contacts, and returns the parameters.
 
     Raises:
         SceneError: A value is out of range.
     """
     coupling, period, substeps = setting.coupling, setting.period, setting.substeps
-    method = default_method(substeps)
+    method = default_method(substeps).with_contact("scene")  # these are what is examined
     prepare(scene, coupling, period, substeps, method, warns=False)
     # an error inside the C function would end the process; the first step in Python raises instead
     mujoco.mj_step(scene.model, scene.data)

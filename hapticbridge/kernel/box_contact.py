@@ -192,11 +192,12 @@ def _inward(r: Numbers, corner: Any, n: Any) -> float:
     The box, with axes r (by rows) and the vertex at the signs ``corner``, lies on the side of n of
     a plane through the vertex if the result is 0 or less.
     """
-    return max(
+    largest: float = max(
         corner[0] * (r[0] * n[0] + r[3] * n[1] + r[6] * n[2]),
         corner[1] * (r[1] * n[0] + r[4] * n[1] + r[7] * n[2]),
         corner[2] * (r[2] * n[0] + r[5] * n[1] + r[8] * n[2]),
     )
+    return largest
 
 
 @compiled

@@ -27,7 +27,7 @@ threads may step models together.
 
 Not corrected, as measured at a margin of 0.15 mm: a round shape that lies along a face and sticks
 out beside it, 18 mrad and 54 µm at an axis tilted by 37 mrad; corners of meshes across an edge,
-with which a peg sank 0.13 mm; ellipsoids, within 1 µm.
+with which a peg sank 0.4 mm; ellipsoids, within 1 µm.
 """
 
 from __future__ import annotations

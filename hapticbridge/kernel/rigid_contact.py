@@ -20,6 +20,8 @@ environment has dissipated,
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
 remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
 moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
+Limits of joints are rows like a contact's without friction and share the tank. Limits of tendons
+and equality constraints stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
@@ -36,10 +38,12 @@ from __future__ import annotations
 
 import math
 
+import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.codes import LIMIT_JOINT, Part, State
 from hapticbridge.kernel.ledger import mocap_contact_work
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
@@ -77,11 +81,16 @@ the velocity that is left in the rows of friction."""
 
 _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 
+_LIMIT_ADDRESSES = ("jnt_solref", "jnt_solimp", "own_solref", "own_solimp", "limit_positions")
+
 RIGID_DTYPE = np.dtype(
     [
         ("is_rigid", "<i8"),
         ("repetitions", "<i8"),
         ("active_contacts", "<i8"),
+        ("is_aimed", "<i8"),
+        ("limit_capacity", "<i8"),
+        *((name, "<i8") for name in _LIMIT_ADDRESSES),
         ("share", "<f8"),
         ("tank", "<f8"),
         ("cap", "<f8"),
@@ -90,19 +99,35 @@ RIGID_DTYPE = np.dtype(
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
-force; ``share`` σ of the last step; ``tank`` D and
-``cap`` in J; ``last_energy`` Σ E_k in J at the last tick."""
+force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
+last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of joint limits: largest count
+of rows, and addresses of the model's parameters, of copies, and of the rows' own positions."""
 
 
-def bind_contact(contact: Part, parameters: RunParameters) -> None:
-    """Fills in the sub-record, with an empty tank."""
+def bind_contact(
+    contact: Part, model: mujoco.MjModel, parameters: RunParameters
+) -> dict[str, NDArray[np.generic]]:
+    """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
+    contact["limit_capacity"] = 2 * int(np.count_nonzero(model.jnt_limited))
+    owned: dict[str, NDArray[np.generic]] = {
+        "own_solref": model.jnt_solref.copy(),
+        "own_solimp": model.jnt_solimp.copy(),
+        "limit_positions": np.zeros(max(2 * model.njnt, 1)),
+    }
+    for name, array in owned.items():
+        contact[name] = array.ctypes.data
+    contact["jnt_solref"] = model.jnt_solref.ctypes.data
+    contact["jnt_solimp"] = model.jnt_solimp.ctypes.data
+    return owned
 
 
 @compiled
 def _aim(s: State) -> None:
-    """Writes the contacts' parameters and positions for ``mj_step2``, for the present share."""
+    """Writes parameters and positions for ``mj_step2``, for the present share."""
+    if s.contact.limit_capacity > 0:
+        _aim_limits(s)
     mj, h, push = s.mj, s.run.timestep, s.contact.share * DEPENETRATION
     d = _IMPEDANCE
     count = ints(mj.nefc, 1)[0]
@@ -132,12 +157,64 @@ def _aim(s: State) -> None:
 
 
 @compiled
+def _aim_limits(s: State) -> None:
+    """Does for the limits of joints what ``_aim`` does for contacts.
+
+    Their parameters are the model's, which has its own values again after the step.
+    """
+    mj, contact, h = s.mj, s.contact, s.run.timestep
+    push, d = contact.share * DEPENETRATION, _IMPEDANCE
+    count = ints(mj.nefc, 1)[0]
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    margins = floats(pointer_at(mj.efc_margin), count)
+    own, found = floats(contact.limit_positions, contact.limit_capacity), 0
+    for row in range(count):
+        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
+            continue
+        if not contact.is_aimed:
+            own[found] = positions[row]
+        wanted = (-push if own[found] < 0.0 else -1.0) * own[found] / h
+        positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
+        margins[row] = 0.0
+        solref = floats(contact.jnt_solref + 16 * ids[row], 2)
+        solref[0], solref[1] = -_EXACT * d * d, -d / h
+        solimp = floats(contact.jnt_solimp + 40 * ids[row], 2)
+        solimp[0] = solimp[1] = d
+        found += 1
+
+
+@compiled
+def _restore_limits(s: State) -> None:
+    mj, contact, found = s.mj, s.contact, 0
+    count = ints(mj.nefc, 1)[0]
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    own = floats(contact.limit_positions, contact.limit_capacity)
+    for row in range(count):
+        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
+            continue
+        positions[row] = own[found]
+        for place, kept, step in (
+            (contact.jnt_solref, contact.own_solref, 16),
+            (contact.jnt_solimp, contact.own_solimp, 40),
+        ):
+            values = floats(place + step * ids[row], 2)
+            before = floats(kept + step * ids[row], 2)
+            values[0], values[1] = before[0], before[1]
+        found += 1
+
+
+@compiled
 def aim_contacts(s: State) -> None:
-    """Makes the contacts of the coming ``mj_step2`` rigid; needs MuJoCo's velocity stage."""
-    if s.contact.is_rigid and ints(s.mj.ncon, 1)[0] > 0:
+    """Makes contacts and limits of the coming ``mj_step2`` rigid; needs the velocity stage."""
+    contact = s.contact
+    if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
-        s.contact.share = 1.0 if has_energy else 0.0
+        contact.share = 1.0 if has_energy else 0.0
         _aim(s)
+        contact.is_aimed = 1
 
 
 @compiled
@@ -147,7 +224,7 @@ def _spendable(s: State) -> float:
 
 @compiled
 def returned_energy(s: State) -> float:
-    """Returns C, the energy in J that the contacts gave in the step that just ended."""
+    """Returns C, the energy in J that contacts and limits gave in the step that just ended."""
     mj, h = s.mj, s.run.timestep
     count = ints(mj.nefc, 1)[0]
     force = floats(pointer_at(mj.efc_force), count)
@@ -163,6 +240,12 @@ def returned_energy(s: State) -> float:
         for i in range(row, row + ints(contact + mj.contact_dim, 1)[0]):
             end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
             total += h * force[i] * end
+    if s.contact.limit_capacity > 0:
+        kinds = ints(pointer_at(mj.efc_type), count)
+        for i in range(count):
+            if kinds[i] == LIMIT_JOINT:
+                end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
+                total += h * force[i] * end
     return total
 
 
@@ -174,7 +257,7 @@ def lower_share(s: State) -> bool:
         True if it did; the step must then be repeated.
     """
     contact = s.contact
-    if not contact.is_rigid or contact.share <= 0.0 or ints(s.mj.ncon, 1)[0] == 0:
+    if not contact.is_aimed or contact.share <= 0.0:
         return False
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
@@ -191,8 +274,11 @@ def lower_share(s: State) -> bool:
 
 @compiled
 def finish_contacts(s: State) -> None:
-    """Counts the contacts with a force, and restores the positions of their rows."""
+    """Counts the contacts with a force, and restores positions and the limits' parameters."""
     mj = s.mj
+    if s.contact.is_aimed and s.contact.limit_capacity > 0:
+        _restore_limits(s)
+    s.contact.is_aimed = 0
     count = ints(mj.nefc, 1)[0]
     positions = floats(pointer_at(mj.efc_pos), count)
     force = floats(pointer_at(mj.efc_force), count)

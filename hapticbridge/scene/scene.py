@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
+        changes: Options of the file that were changed, each as ``name: old → new``.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -115,34 +118,43 @@ class Scene:
         self.model.pair_gap += more
         self.model.flex_gap += more
 
-    @property
-    def has_rigid_contact(self) -> bool:
-        """True if the options of rigid contacts are set."""
-        return bool(self._own_contact)
-
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, and a margin of ``MARGIN`` at least.
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the
+        points of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
             return
-        use_exact_points(model, is_used=is_rigid)
         if not is_rigid:
-            for name, value in own.items():
-                setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
-            own.clear()
+            self._restore_contact(model)
+            self._own_contact = {}
             return
-        own |= {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
+        own = {name: getattr(model.opt, name) for name in _CONTACT_OPTIONS}
         own |= {name: getattr(model, name).copy() for name in _MARGINS}
+        self._own_contact = own  # a new object: copies of the scene share the old one
         for name, value in _CONTACT_OPTIONS.items():
             setattr(model.opt, name, value)
         model.opt.o_margin = max(own["o_margin"], MARGIN)
         for name in _MARGINS:
             margins = getattr(model, name)
             margins[:] = np.maximum(margins, MARGIN)
+        use_exact_points(model)
+
+    def _restore_contact(self, model: mujoco.MjModel) -> None:
+        for name, value in self._own_contact.items():
+            setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+        use_exact_points(model, is_used=False)
+
+    def model_with_own_contact(self) -> mujoco.MjModel:
+        """Returns the model if its contacts are the scene's own, else a copy that has these."""
+        if not self._own_contact:
+            return self.model
+        model = copy.copy(self.model)
+        self._restore_contact(model)
+        return model
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]

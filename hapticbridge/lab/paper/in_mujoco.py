@@ -79,7 +79,7 @@ class ImplicitMass:
         state, row = self._binding.state, self._binding.row
         if before_step(state, self._sample, row, 0, self._period) != OK:
             raise SceneError(f"the handle's position {handle!r} m is not finite")
-        mujoco.mj_step(self._scene.model, self._scene.data)
+        self._binding.step(self._scene.model, self._scene.data)
         if after_step(state, row, 0) != OK:
             raise SceneError("MuJoCo's step left a number that is not finite")
         return row
