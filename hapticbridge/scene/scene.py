@@ -120,7 +120,7 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the points
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and points
         of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
