@@ -344,7 +344,7 @@ IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
 hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
 
 SWING_ENERGY, RUNAWAY_SPEED = 8e-3, 0.1
-"""Energy in J per span, and speed in m/s, of the watch for a late or reversed force
+"""Energy in J and speed in m/s above which the watch suspects a late or reversed force
 (``kernel.swing_watch`` has the reasons)."""
 
 JUMP_MARGIN = 2.0

@@ -33,8 +33,9 @@ class TickFlag(IntFlag):
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
         SWINGING: The device's force comes late and swings; the force was lowered before this tick
             and stays lower.
-        RUNS_AWAY: The device gained speed against its force, as with a reversed axis; the force was
-            taken away before this tick.
+        RUNS_AWAY: The device did not move as its force pushed, as with a reversed axis; the force
+            was taken away before this tick.
+        PROBED: The force is lowered for a moment to see whether the device follows it, or returns.
     """
 
     OVERRUN = 1
@@ -50,6 +51,7 @@ class TickFlag(IntFlag):
     REANCHORED = 2048
     SWINGING = 4096
     RUNS_AWAY = 8192
+    PROBED = 16384
 
 
 TICK_DTYPE = np.dtype(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME, Scheme
+from hapticbridge.kernel.codes import WELD_NAME, Scheme, added_id, coupling_ids
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
@@ -497,7 +497,7 @@ def static_load(scene: Scene) -> NDArray[np.float64]:
     dofs = tree_of_tool(model, int(model.site_bodyid[grip])).dofs
     if np.abs(data.qacc[dofs]).max(initial=0.0) < AT_REST:
         return load
-    first = model.actuator_outadr[model.actuator(COUPLING_ACTUATORS[0]).id]
+    first = model.actuator_outadr[coupling_ids(model)[0]]
     momentum, last, earlier = np.zeros(model.nv), 0.0, load
     for step in range(SETTLING_STEPS):
         mujoco.mj_step(model, data)
@@ -553,13 +553,14 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
         raise SceneError(f"method '{method.name}' requires the integrator {method.integrator}")
     if method.is_rigid and not has_rigid_contact(model):
         raise SceneError("rigid contacts require an elliptic cone, impratio 1000 and a margin")
-    has_weld = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) >= 0
+    weld_id = added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
+    has_weld = weld_id >= 0
     if has_weld != method.is_weld:
         raise SceneError(
             f"method '{method.name}' requires {'a' if method.is_weld else 'no'} weld to the handle"
         )
     if has_weld:
-        gains = -model.eq_solref[model.equality(WELD_NAME).id]
+        gains = -model.eq_solref[weld_id]
         coupling = parameters.coupling
         if gains.tolist() != [coupling.stiffness, coupling.damping]:
             raise SceneError(

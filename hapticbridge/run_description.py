@@ -235,6 +235,7 @@ def describe_run(
         "device": device.to_json(),
         "scene": scene.name,
         "scene_file": scene.path.name,
+        "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
         "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),
         "versions": json.dumps(versions(), sort_keys=True),

@@ -19,7 +19,7 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, Scheme
+from hapticbridge.kernel.codes import Scheme, coupling_ids
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
@@ -35,16 +35,14 @@ def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
     References:
         ``kernel.lossless.ToolTree.is_never_free`` lists the causes.
     """
-    own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
-    return tree_of_tool(model, int(model.site(grip).bodyid[0]), own).is_never_free
+    return tree_of_tool(model, int(model.site(grip).bodyid[0]), coupling_ids(model)).is_never_free
 
 
 def coarse_spring(model: mujoco.MjModel, grip: str, method: Method) -> str:
     """Returns the spring that makes a lossless coupling first order; empty if none does."""
     if method.scheme != Scheme.MIDPOINT:
         return ""
-    own = [model.actuator(name).id for name in COUPLING_ACTUATORS]
-    tree = tree_of_tool(model, int(model.site(grip).bodyid[0]), own)
+    tree = tree_of_tool(model, int(model.site(grip).bodyid[0]), coupling_ids(model))
     return "" if tree.is_never_free else spring_at_the_end(model, tree)
 
 

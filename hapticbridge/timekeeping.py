@@ -74,12 +74,13 @@ def watch_sentence(flags: int) -> str:
     """
     if flags & int(TickFlag.RUNS_AWAY):
         return (
-            "the force was taken away because the device gained speed against it: an axis is "
-            "reversed (check the axes and signs of the device) or the force comes very late"
+            "the force was taken away because the device did not move as it was pushed: an axis is "
+            "reversed or exchanged (check the axes and signs of the device) or the force comes "
+            "very late"
         )
     if flags & int(TickFlag.SWINGING):
         return (
-            "the force was lowered because it swung as that of a late device does: lower "
+            "the force was lowered because the device answered late and swung: lower "
             "--stiffness, and measure the device's delay ('hapticbridge identify')"
         )
     return ""

@@ -220,9 +220,9 @@ PATHS = {
     "point_mass": HandPath(figure_eight, axes=(1, 1, 1, 1, 1, 1), seed=2),
     # The paths of the pegs: come down tilted and off centre, so that one corner of the peg's end is
     # the lowest and enters the hole whatever the error; push that corner against the hole's walls;
-    # go down a little; straighten; go down to 3 mm above the bottom; push against a wall; wiggle;
-    # press on the bottom; withdraw. While it straightens l deep, a peg of width w is up to l²/2w
-    # wider across; so l is below 0.6 mm, for clearances of 5 µm a side.
+    # go down by 0.6 mm, no further: a peg of width w is wider across when it stands l deep and
+    # tilted, by l²/2w, and would not straighten in a clearance below l²/4w; straighten; go down to
+    # 3 mm above the bottom; push against a wall; wiggle; press on the bottom; withdraw.
     "planar_peg": HandPath(
         reaching(
             Reach(0.3, 1.0, (0.4, 0, -10.2), (0, 3.0, 0)),

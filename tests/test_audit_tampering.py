@@ -170,8 +170,8 @@ def test_a_model_that_is_signed_anew_must_still_fit_the_metadata(
         return verdict_of(tap, folder, meta=meta, attachments={MODEL_ATTACHMENT: content}).reason
 
     content = tap.attachments[MODEL_ATTACHMENT]
-    name = b"coupling_force_x"
-    assert "has no 'coupling_force_x'" in reason(content.replace(name, name.upper()))
+    name = b"hapticbridge/coupling_force_x"
+    assert "has no 'hapticbridge/coupling_force_x'" in reason(content.replace(name, name.upper()))
     model = mujoco.MjModel.from_binary_path("a.mjb", assets={"a.mjb": content})
     model.opt.timestep *= 0.5
     assert "timestep is 0.0005 s" in reason(compiled_model(model))

@@ -13,6 +13,7 @@ from bridge_runs import fast, still, sway
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.recording import read_recording
 
 INPUTS = """<mujoco>
@@ -79,17 +80,17 @@ def test_inputs_act_are_recorded_and_repeat_bit_for_bit(inputs_scene: Path, tmp_
     ("inputs", "message"),
     [
         ({"ctrl": {"lft": 1.0}}, "'lift'"),
-        ({"ctrl": {"coupling_force_x": 1.0}}, "'lift'"),
+        ({"ctrl": {COUPLING_ACTUATORS[0]: 1.0}}, "'lift'"),
         ({"ctrl": {"lift": [1.0, 2.0]}}, "1 finite"),
         ({"ctrl": {"lift": float("nan")}}, "1 finite"),
-        ({"mocap": {"handle": [0, 0, 0]}}, "'plate'"),
+        ({"mocap": {HANDLE: [0, 0, 0]}}, "'plate'"),
         ({"mocap": {"arm": [0, 0, 0]}}, "'plate'"),
         ({"mocap": {"plate": [0, 0]}}, "3 or 7"),
         ({"mocap": {"plate": [0, 0, 0, 2, 0, 0, 0]}}, "norm 2"),
         ({"joint_force": {"hinge": 1.0}}, "'arm', 'tool'"),
         ({"joint_force": {"tool": [1.0]}}, "6 finite"),
         ({"joint_force": {"arm": float("inf")}}, "1 finite"),
-        ({"body_wrench": {"handle": [0] * 6}}, "'arm', 'plate', 'tool'"),
+        ({"body_wrench": {HANDLE: [0] * 6}}, "'arm', 'plate', 'tool'"),
         ({"body_wrench": {"world": [0] * 6}}, "'arm', 'plate', 'tool'"),
         ({"body_wrench": {"arm": [0] * 5}}, "6 finite"),
         ({"ctrl": {"lift": "fast"}}, "'fast'; it must be numbers"),

@@ -16,6 +16,7 @@ from PIL import Image
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, draw, still
 from hapticbridge.film_process import Stage, film_ticks, force_colour, write_film
+from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.recording import read_recording
 
 SCENE = """<mujoco model="two">
@@ -135,7 +136,7 @@ def test_stage_stands_where_a_second_run_of_the_scene_does(sway: Path) -> None:
         recorded_at = read_recording(sway).ticks["tool_position"][tick]
         np.testing.assert_allclose(stage.data.site("grip").xpos, recorded_at, atol=1e-12)
         assert stage.row["tick"][0] == tick
-    handle = stage.data.mocap_pos[stage.model.body("handle").mocapid[0]]
+    handle = stage.data.mocap_pos[stage.model.body(HANDLE).mocapid[0]]
     np.testing.assert_allclose(handle, stage.row["handle_position"][0], atol=1e-12)
 
 

@@ -152,3 +152,25 @@ def test_a_device_far_from_its_workspace_is_refused_before_force() -> None:
     ):
         pass
     assert not device.forces or max(device.forces) == 0.0
+
+
+MOTOR = """<mujoco><option timestep="0.001" integrator="discrete" gravity="0 0 0"/><worldbody>
+<body name="tool"><joint name="rail" type="slide" axis="1 0 0"/>
+<geom size="0.01" mass="0.1"/><site name="grip"/></body></worldbody>
+<actuator><motor name="pull" joint="rail" ctrllimited="false"/></actuator></mujoco>
+"""
+"""A motor on the tool's own joint, stronger than the force level."""
+
+
+@pytest.mark.parametrize("method", ["lossless", "implicit"])
+def test_a_motors_work_is_that_of_the_step_that_counted(method: str) -> None:
+    scene = hb.load_scene(mujoco.MjSpec.from_string(MOTOR))
+    limits = hb.Limits(force=1.0, torque=0.1, stretch=math.inf)
+    clock = hb.SimulatedClock()
+    with hb.Bridge(scene, Still(), clock=clock, limits=limits, method=method) as bridge:
+        bridge.set_input(ctrl={"pull": 3.0})
+        summary = bridge.run(0.2)
+        x = bridge.latest_records(200)["tool_position"][:, 0]
+    assert summary.limits_reached == ("force",)
+    assert summary.energies["actuator_work"] == pytest.approx(3.0 * x[-1], rel=1e-9)
+    assert summary.environment == "strict"

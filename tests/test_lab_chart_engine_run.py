@@ -18,8 +18,10 @@ from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import Chart, measure_chart
 from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
 from hapticbridge.lab.chart.output import summary_of
-from hapticbridge.lab.chart.setting import Setting
+from hapticbridge.lab.chart.peg import JammedPeg
+from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import PeerWork, Workload
+from hapticbridge.lab.engines import mujoco as mujoco_engine
 from hapticbridge.lab.engines.base import ENGINES, Engine, Simulation, Task, composed, open_engine
 from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
@@ -112,11 +114,29 @@ def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: s
     work = workload("peg_in_hole").peer_work()
     run = EngineRun(engine, work, Setting(METHODS["explicit"], FINE))
     settled = run.scores()["settled"]
-    assert settled.verdict == "not metered"  # it touches at the end of every hold
+    # a verdict on its energy: it touches at the end of every hold
+    assert settled.verdict in ("strict", "within slack", "active")
     # 31 µm where PhysX keeps the contacts of the upright peg; Drake's compliant ones give way
     assert settled.position_peak < (20e-6 if name.startswith("drake") else 5e-6)
     rod = EngineRun(engine, workload("rod_impact").peer_work(), Setting(METHODS["explicit"], FINE))
-    assert rod.scores()["impact"].verdict == "not metered"
+    assert rod.scores()["impact"].verdict in ("strict", "within slack", "active")
+
+
+def test_meter_of_a_peer_reads_as_the_ledger_of_the_bridge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # with the impedance of the scene, MuJoCo as a peer is the bridge's own held force
+    monkeypatch.setattr(mujoco_engine, "IMPEDANCE", (0.9, 0.95, 0.001, 0.5, 2.0))
+    jam = JammedPeg(mass=0.1, friction=0.0, stiffness=6000.0, hand=0)
+    held = METHODS["explicit:implicitfast"]
+    own, peer = (jam.take(Setting(held, FINE, engine=name)) for name in (OWN, "mujoco"))
+    energies = [take.records["environment_energy"] for take in (own, peer)]
+    assert np.abs(energies[0]).max() > 1e-3
+    assert energies[1] == pytest.approx(energies[0], abs=5e-5)
+    assert peer.meter.slack_share == pytest.approx(own.meter.slack_share, rel=1e-3)
+    assert (own.environment, peer.environment) == ("within slack", "within slack")
+    # the contacts create nothing here: it is the held force that does
+    assert peer.engine.verdict == "strict"
 
 
 def test_spinning_body_spins_in_another_engine_too() -> None:
@@ -132,9 +152,8 @@ def test_peers_are_points_at_every_step_and_only_where_the_reference_is_true() -
     chart = measure_chart(workload("peg_in_hole"), settings[1:], repeats=1)
     assert {each.panel for each in chart.measurements} == {"settled"}
     (point,) = chart.measurements
-    assert point.score.verdict == "not metered"
+    assert point.score.verdict == "strict"
     assert point.score.jnd < 0.5
-    assert not point.is_sound
     assert "implicitfast" in str(point.chosen["engine_settings"])
     assert "documentation" in str(point.chosen["engine_settings"])
 
@@ -194,7 +213,7 @@ def test_engine_that_fails_on_the_way_is_a_mark_with_its_reason(
     whole, broken = (each for each in chart.measurements if each.setting.engine == "altered")
     assert (whole.setting.period, whole.score.verdict, whole.score.reason) == (
         GRID,
-        "not metered",
+        "strict",
         "",
     )
     assert broken.score.verdict == "failed"

@@ -20,6 +20,7 @@ from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import Score, Workload
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import load_scene
 from hapticbridge.theory.impact import ImpactBody, resolve_impact
 
@@ -277,12 +278,17 @@ def test_methods_without_dynamics_of_the_tool_can_neither_spin_nor_fall() -> Non
             falling.run(Setting(METHODS[name], 1e-3))
 
 
-def test_rod_that_meets_a_damped_contact_is_nearer_to_an_impact_without_rebound() -> None:
+OF_THE_SCENE = METHODS["implicit"].with_contact("scene")
+
+
+def test_rod_that_meets_a_damped_or_rigid_contact_is_nearer_to_an_impact_without_rebound() -> None:
     workload = contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, GRID)
     key = workload.panels[0].key
-    shipped = workload.run(Setting(METHODS["implicit"], 1e-3)).scores()[key]
-    damped = workload.run(Setting(METHODS["implicit"], 1e-3, contact="damped")).scores()[key]
+    shipped = workload.run(Setting(OF_THE_SCENE, 1e-3)).scores()[key]
+    damped = workload.run(Setting(OF_THE_SCENE, 1e-3, contact="damped")).scores()[key]
+    rigid = workload.run(Setting(METHODS["implicit"], 1e-3)).scores()[key]
     assert damped.jnd < shipped.jnd / 2
+    assert rigid.jnd < damped.jnd / 2
 
 
 @lru_cache
@@ -293,14 +299,40 @@ def quick_peg() -> peg.PegInHole:
 
 def test_settled_peg_is_nearer_to_the_rigid_one_the_stiffer_its_contacts() -> None:
     stiff, soft = (
-        quick_peg().run(Setting(METHODS["implicit"], 1e-3, contact=contact)).scores()["settled"]
+        quick_peg().run(Setting(OF_THE_SCENE, 1e-3, contact=contact)).scores()["settled"]
         for contact in ("2 steps", "soft")
     )
+    rigid = quick_peg().run(Setting(METHODS["implicit"], 1e-3)).scores()["settled"]
+    assert rigid.position_peak < 2e-7
     assert stiff.position_peak < 2e-5
     assert stiff.jnd < 0.2
     assert abs(stiff.stiffness) < 0.02
     assert soft.position_peak > 10 * stiff.position_peak
     assert soft.jnd > 1
+
+
+def test_jammed_peg_gains_energy_from_the_contacts_of_the_scene_and_none_from_rigid_ones() -> None:
+    jam = peg.JammedPeg(mass=0.03, friction=0.0, stiffness=6000.0, hand=1)
+    rigid, stock = (
+        jam.take(Setting(METHODS["implicit"].with_contact(contact), 1e-3))
+        for contact in ("rigid", "scene")
+    )
+    assert (rigid.environment, rigid.created) == ("strict", 0.0)
+    assert stock.environment == "active"
+    assert stock.created > 0.01
+    assert peg.penetrations(rigid.records).max() < 3e-5
+    assert peg.penetrations(stock.records).max() > 5e-4
+
+
+def test_penetration_of_a_peg_is_that_of_its_deepest_corner() -> None:
+    records = np.zeros(3, TICK_DTYPE)
+    records["tool_quaternion"][:, 0] = 1.0
+    records["tool_position"][1] = (peg.CLEARANCE + 1e-5, 0.0, 0.0)
+    # turned about its upright axis, a corner moves out by w (cos a + sin a − 1)
+    angle = 0.1
+    records["tool_quaternion"][2] = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2))
+    turned = peg.HALF_WIDTH * (np.cos(angle) + np.sin(angle) - 1) - peg.CLEARANCE
+    assert peg.penetrations(records) == pytest.approx([0.0, 1e-5, turned], abs=1e-12)
 
 
 def test_peg_that_never_reaches_its_hole_has_lost_contact() -> None:

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene import scene_names
 
 SCENES = scene_names()
@@ -66,9 +67,9 @@ def test_solver_settings_are_written_in_the_file_not_left_to_defaults(name: str)
 def test_tool_starts_clear_of_everything_and_the_handle_at_its_grip(name: str) -> None:
     _, data = runs.scene_with_handle(name)
     assert data.ncon == 0
-    assert np.array_equal(data.site("grip").xpos, data.site("handle").xpos)
+    assert np.array_equal(data.site("grip").xpos, data.site(HANDLE).xpos)
     # the pliers rest 2e-6 rad in their stop
-    np.testing.assert_allclose(data.site("grip").xmat, data.site("handle").xmat, atol=2.1e-6)
+    np.testing.assert_allclose(data.site("grip").xmat, data.site(HANDLE).xmat, atol=2.1e-6)
 
 
 @pytest.mark.parametrize("name", SCENES)

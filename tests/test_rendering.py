@@ -34,7 +34,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.codes import OK, WELD_NAME
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
@@ -552,7 +552,7 @@ def test_weld_carries_over_what_was_changed_in_the_scenes_own_constraints() -> N
         assert scene.model.stat.meaninertia == inertia
         if felt is not None:
             assert felt.stiffness == pytest.approx(0.2 * 2000 / 0.05, rel=1e-6)
-            assert scene.model.equality("handle_weld").solref.tolist() == [-2000, -2]
+            assert scene.model.equality(WELD_NAME).solref.tolist() == [-2000, -2]
 
 
 def test_a_device_that_bears_a_weld_is_still_not_called_certified() -> None:

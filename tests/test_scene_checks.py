@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mujoco
@@ -14,7 +15,14 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.inputs import input_writes
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    HANDLE,
+    PREFIX,
+    WELD_NAME,
+    added_id,
+    coupling_ids,
+)
 from hapticbridge.scene import load_scene, scene_names, scene_path
 
 
@@ -48,16 +56,13 @@ def test_a_file_goes_before_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ("<mujoco>\n\n<worldbody><body pos='a b c'/></worldbody></mujoco>", ["'pos'", "line 3"]),
         ("<mujoco><include file='gone.xml'/></mujoco>", ["'gone.xml'", "line 1"]),
         ("<mujoco><include file='part.xml'/></mujoco>", ["line 3 is not well-formed XML"]),
-        ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["grip"]),
+        ("<mujoco><asset><mesh file='gone.stl'/></asset></mujoco>", ["'gone.stl'"]),
         (mjcf("<asset><mesh name='m' file='gone.stl'/></asset>"), ["'gone.stl'"]),
         (mjcf("<asset><texture name='t' type='2d' file='gone.png'/></asset>"), ["'gone.png'"]),
         (mjcf(world="<body name='tool'/>"), ["repeated name 'tool'"]),
         (mjcf("<size memory='1P'/>"), ["memory", "<size>"]),
-        # what breaks the implicit step
-        (mjcf("<option solver='PGS'/>"), ["PGS", "use Newton"]),
-        (mjcf("<option noslip_iterations='3'/>"), ["noslip_iterations=3", "set it to 0"]),
+        # what switches the coupling off or cannot be simulated again
         (mjcf("<option><flag ipc='enable'/></option>"), ["flag ipc", "disable it"]),
-        (mjcf("<option><flag sleep='enable'/></option>"), ["flag sleep", "disable it"]),
         (mjcf("<option><flag actuation='disable'/></option>"), ["actuation", "enable it"]),
         (mjcf("<option actuatorgroupdisable='30 0 4'/>"), ["0, 4, 30", "remove actuatorgr"]),
     ],
@@ -69,45 +74,33 @@ def test_unreadable_file_is_told_with_line(tmp_path: Path, text: str, words: lis
     assert "must end in .xml" in refusal(scene_file(tmp_path, text, "scene.mjcf"))
 
 
-def test_grip_that_does_not_exist_is_refused_with_the_sites_that_do(tmp_path: Path) -> None:
-    body = "<body><freejoint/><geom size='.01'/><site name='tip'/><site/><site name='heel'/></body>"
-    message = refusal_of(tmp_path, mjcf(body=body))
-    assert "no site 'grip' to grip the tool by; sites: 'heel', 'tip'; name one of them" in message
-    assert "--grip" in message
-    none = refusal_of(tmp_path, mjcf(body=body.replace("site name", "geom size='.01' name")))
-    assert none.endswith('sites: none exist; put <site name="grip"/> into the tool\'s body')
-    path = scene_file(tmp_path, mjcf(body=body))
-    assert load_scene(path, grip="heel").grip == "heel"
-    assert "no site ''" in refusal(path, "")
+def test_scene_may_use_any_name_but_under_our_prefix(tmp_path: Path) -> None:
+    body = HINGE_TOOL.format(joint="").replace("elbow", "handle").replace('"arm"', '"handle"')
+    names = ("handle", *(name.removeprefix(PREFIX) for name in COUPLING_ACTUATORS))
+    motors = "".join(f"<motor name='{name}' joint='handle'/>" for name in names)
+    world = "<site name='handle'/><body name='hapticbridge'/>"
+    weld = "<equality><weld name='handle_weld' body1='handle'/></equality>"
+    text = mjcf(f"<actuator>{motors}</actuator>{weld}", body=body, world=world)
+    model = load_scene(scene_file(tmp_path, text)).model
+    assert coupling_ids(model) == tuple(range(7, 13))
+    assert model.body_mocapid[added_id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE)] == 0
+    assert added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) == -1
+    for kind in ("<body name='{}'/>", "<site name='{}'/>"):
+        world = kind.format(f"{PREFIX}x")
+        assert f"name '{PREFIX}x'" in refusal_of(tmp_path, mjcf(world=world))
 
 
-WELD = "<weld name='handle_weld' body1='arm'/>"
-
-
-@pytest.mark.parametrize(
-    ("world", "actuator", "culprit"),
-    [
-        ("<body name='handle'/>", "", "body 'handle'"),
-        ("<site name='handle'/>", "", "site 'handle'"),
-        ("", f"<equality>{WELD}</equality>", "equality constraint 'handle_weld'"),
-        *[
-            ("", f"<actuator><motor name='{name}' joint='elbow'/></actuator>", f"actuator '{name}'")
-            for name in COUPLING_ACTUATORS
-        ],
-    ],
-)
-def test_our_names_are_refused(tmp_path: Path, world: str, actuator: str, culprit: str) -> None:
-    text = mjcf(actuator, body=HINGE_TOOL.format(joint=""), world=world)
-    message = refusal_of(tmp_path, text)
-    assert culprit in message
-    assert "rename it" in message
-
-
-def test_names_of_ours_are_free_for_other_kinds_of_things(tmp_path: Path) -> None:
-    body = HINGE_TOOL.format(joint="").replace("elbow", "handle").replace('"arm"', '"coupling_x"')
-    actuator = "<actuator><motor name='coupling_left' joint='handle'/></actuator>"
-    world = "<geom name='handle' size='.01' pos='1 0 0'/><body name='hapticbridge_handle'/>"
-    assert load_scene(scene_file(tmp_path, mjcf(actuator, body=body, world=world))).model.nu == 7
+def test_names_of_earlier_recordings_are_found() -> None:
+    motors = "".join(
+        f"<motor name='{name.removeprefix(PREFIX)}' site='grip'/>" for name in COUPLING_ACTUATORS
+    )
+    weld = "<equality><weld name='handle_weld' body1='tool'/></equality>"
+    handle = "<body name='handle' mocap='true'><site name='handle'/></body>"
+    text = mjcf(f"<actuator><motor joint='tool'/>{motors}</actuator>{weld}", world=handle)
+    model = mujoco.MjModel.from_xml_string(text)
+    assert coupling_ids(model) == tuple(range(1, 7))
+    assert added_id(model, mujoco.mjtObj.mjOBJ_SITE, HANDLE) == model.site("handle").id
+    assert added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME) == 0
 
 
 @pytest.mark.parametrize(
@@ -131,15 +124,36 @@ def test_grip_on_a_rigid_part_of_a_moving_body_is_accepted(tmp_path: Path) -> No
     assert scene.grip_pose()[:3] == (0.1, 0.0, 0.0)
 
 
-def test_rk4_runs_under_discrete_with_warning_and_other_integrators_without(tmp_path: Path) -> None:
-    path = scene_file(tmp_path, mjcf("<option integrator='RK4'/>"))
-    with pytest.warns(UserWarning, match="RK4; it runs under 'discrete'") as caught:
-        scene = load_scene(path)
-    assert len(caught) == 1
-    assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
-    for name in ("Euler", "implicit", "implicitfast", "discrete"):
-        scene = load_scene(scene_file(tmp_path, mjcf(f"<option integrator='{name}'/>")))
-        assert scene.model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+@pytest.mark.parametrize(
+    ("option", "change", "is_needed"),
+    [
+        ("<option solver='PGS'/>", "solver: PGS → Newton", True),
+        ("<option noslip_iterations='3'/>", "noslip_iterations: 3 → 0", True),
+        ("<option><flag sleep='enable'/></option>", "flag sleep: enable → disable", True),
+        ("<option solver='CG'/>", "solver: CG → Newton", False),
+        ("<option integrator='RK4'/>", "integrator: RK4 → discrete", False),
+        ("<option integrator='implicitfast'/>", "integrator: implicitfast → discrete", False),
+    ],
+)
+def test_options_that_exclude_the_coupling_are_changed_and_told(
+    tmp_path: Path, option: str, change: str, *, is_needed: bool
+) -> None:
+    path = scene_file(tmp_path, mjcf(option))
+    scene = load_scene(path)
+    assert change in scene.changes
+    assert len(scene.changes) == 1 + ("integrator" not in change)  # Euler, MuJoCo's default
+    opt = scene.model.opt
+    assert opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    assert opt.noslip_iterations == 0
+    assert not opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
+    if is_needed:
+        with pytest.raises(hb.SceneError, match=re.escape(change)):
+            load_scene(path, as_is=True)
+    else:
+        assert load_scene(path, as_is=True).changes == scene.changes
+    fitting = mjcf("<option integrator='discrete'/>")
+    assert load_scene(scene_file(tmp_path, fitting), as_is=True).changes == ()
 
 
 def test_what_does_unmetered_work_is_warned_of(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from outside_scenes import FREE_TOOL, GRIPPED, RICH, hand_file, mjcf, scene_file, ticks
 
 import hapticbridge as hb
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
 from hapticbridge.scene import load_scene
 
 
@@ -22,7 +22,7 @@ def pose(data: Any, site: str) -> NDArray[np.float64]:
 
 
 def assert_at_grip(data: Any) -> None:
-    assert pose(data, "handle") == pytest.approx(pose(data, "grip"), abs=1e-15)
+    assert pose(data, HANDLE) == pytest.approx(pose(data, "grip"), abs=1e-15)
 
 
 TURNED = FREE_TOOL.replace(
@@ -46,7 +46,7 @@ def test_handle_stands_at_the_grip_whatever_the_default_of_sites(tmp_path: Path,
     text = mjcf(f"<default><site {site}/></default>", body=FREE_TOOL if "from" in site else TURNED)
     scene = load_scene(scene_file(tmp_path, text))
     assert_at_grip(scene.data)
-    handle = scene.model.site("handle")
+    handle = scene.model.site(HANDLE)
     assert [*handle.pos, *handle.quat] == [0, 0, 0, 1, 0, 0, 0]
     assert "from" not in site or scene.data.site("grip").xpos == pytest.approx([0.05] * 3)
 
@@ -81,15 +81,15 @@ def test_handle_weighs_nothing_whatever_the_compiler_is_told(tmp_path: Path) -> 
     scene = load_scene(scene_file(tmp_path, mjcf(bound, geom)))
     model, data = scene.model, scene.data
     assert model.body("tool").mass == 0.5
-    assert model.body("handle").mass == 0
-    assert not model.body("handle").inertia.any()
+    assert model.body(HANDLE).mass == 0
+    assert not model.body(HANDLE).inertia.any()
     # else the potential energy of the ledger would follow the hand
     mujoco.mj_energyPos(model, data)
     before = data.energy[0]
     data.mocap_pos[-1] += 1.0
     mujoco.mj_forward(model, data)
     assert data.energy[0] == before
-    assert model.body("handle").geomnum == 0
+    assert model.body(HANDLE).geomnum == 0
 
 
 def test_scene_gives_the_handle_six_actuators_and_nothing_else(tmp_path: Path) -> None:

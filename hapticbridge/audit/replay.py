@@ -18,7 +18,7 @@ from hapticbridge.commands import EventApplier
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.inputs import apply_writes
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, coupling_ids
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -60,21 +60,22 @@ def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoc
         )
     except ValueError as error:
         raise RecordingError(f"the attached model cannot be loaded: {error}") from None
-    for name in (*COUPLING_ACTUATORS, parameters.grip):
-        kind = mujoco.mjtObj.mjOBJ_SITE if name == parameters.grip else mujoco.mjtObj.mjOBJ_ACTUATOR
-        if mujoco.mj_name2id(model, kind, name) < 0:
-            raise RecordingError(f"the attached model has no '{name}'")
+    actuators = coupling_ids(model)
+    ids = dict(zip(COUPLING_ACTUATORS, actuators, strict=True))
+    ids[parameters.grip] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, parameters.grip)
+    if lacking := [name for name, id_ in ids.items() if id_ < 0]:
+        raise RecordingError(f"the attached model has no '{lacking[0]}'")
     method = method_of(recording.meta)
     step = parameters.period / parameters.substeps
     forces, torques = method.gains(parameters.coupling, step)
-    for axis, name in enumerate(COUPLING_ACTUATORS):
-        actuator_id = model.actuator(name).id
+    for axis, actuator_id in enumerate(actuators):
         factor, stiffness, damping = forces if axis < 3 else torques
         bias = model.actuator_biasprm[actuator_id].tolist()
         gain = float(model.actuator_gainprm[actuator_id, 0])
         if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
             raise RecordingError(
-                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in {name}, "
+                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in "
+                f"{COUPLING_ACTUATORS[axis]}, "
                 f"the metadata say {stiffness!r}, {factor!r}"
             )
     try:

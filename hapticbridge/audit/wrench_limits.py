@@ -165,7 +165,10 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     off = np.where(is_let_go(ticks, parameters), fallen, risen)
     off = np.where(has_flag(ticks, TickFlag.STALE_SAMPLE), np.minimum(fallen, risen), off)
     # the watch's cap lies between the two, and the re-simulation checks it
-    is_capped = has_flag(ticks, TickFlag.SWINGING | TickFlag.RUNS_AWAY)
+    is_capped = has_flag(ticks, TickFlag.SWINGING | TickFlag.RUNS_AWAY | TickFlag.PROBED)
+    is_probed = has_flag(ticks, TickFlag.PROBED)
+    highest = np.where(is_probed, np.minimum(before + 1 / fade, 1.0), highest)
+    lowest = np.where(has_flag(ticks, TickFlag.RUNS_AWAY), 0.0, lowest)
     off = np.where(is_capped, np.maximum(np.maximum(share - highest, lowest - share), 0.0), off)
     yield Deviation("share", off, TOLERANCE, "", "buttons, events and flags")
     yield _wrench_deviation(block, parameters)

@@ -86,7 +86,8 @@ def _limits(case: SceneUnderCheck) -> Iterator[Fault]:
         is_slide = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
         solver = model.jnt_solref[joint], model.jnt_solimp[joint]
         found.append((case.places.joint(joint), *solver, inertia, is_slide))
-    for tendon in np.flatnonzero(model.tendon_limited).tolist():
+    can_move = model.tendon_invweight0 > 0
+    for tendon in np.flatnonzero(model.tendon_limited & can_move).tolist():
         solver = model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon]
         inertia = 1.0 / float(model.tendon_invweight0[tendon])
         found.append((case.places.tendon(tendon), *solver, inertia, True))

@@ -296,7 +296,8 @@ class Check:
     ] = ()
     """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3."""
     grip: str = "grip"
-    """Site on the tool that the hand holds."""
+    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
+    body's frame. If the scene has none of that name, the most plausible ones are listed."""
     motion: Path | None = None
     """Motion of the handle (CSV or recording); by default NAME.csv beside the scene, or else the
     simulated hand's own: slow, 1 cm."""

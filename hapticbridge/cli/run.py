@@ -51,6 +51,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}, "
         f"{method.contact} contacts"
     )
+    if setup.scene.changes:
+        err.print(f"  options changed in the scene: {escape(', '.join(setup.scene.changes))}")
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
@@ -235,7 +237,11 @@ class Run:
     """Set a parameter of the scene, as in --set clearance=0.1e-3. 'hapticbridge scenes NAME' lists
     the parameters with units and ranges."""
     grip: str = "grip"
-    """Site on the tool that the hand holds."""
+    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
+    body's frame. If the scene has none of that name, the most plausible ones are listed."""
+    as_is: bool = False
+    """Refuse a scene with options that exclude the coupling (solver PGS, noslip_iterations, sleep);
+    by default they are changed, and a line lists them."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
@@ -339,7 +345,7 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        scene = load_scene(self.scene, self.grip, **settings_from(self.settings))
+        scene = load_scene(self.scene, self.grip, as_is=self.as_is, **settings_from(self.settings))
         with ExitStack() as stack:
             callbacks = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, TypeAlias
 
+import mujoco
+
 from hapticbridge.record import TickFlag
 
 State: TypeAlias = Any
@@ -15,16 +17,35 @@ reference."""
 Part: TypeAlias = Any
 """One sub-record of the state, such as ``energy``, by reference. Only one module writes to it."""
 
-HANDLE = "handle"
+PREFIX = "hapticbridge/"
+"""Start of every name that the bridge adds to a scene, so that no name of the scene is taken."""
+
+HANDLE = f"{PREFIX}handle"
 """Name of the mocap body, and of its site, that the bridge adds to a scene."""
 
-WELD_NAME = "handle_weld"
+WELD_NAME = f"{PREFIX}handle_weld"
 """Name of the equality constraint that joins grip and handle for the method ``weld``."""
 
 COUPLING_ACTUATORS = tuple(
-    f"coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
+    f"{PREFIX}coupling_{kind}_{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")
 )
 """Names of the six actuators that couple the grip to the handle, in the order of a wrench."""
+
+
+def added_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    """Returns the id of something that the bridge added, or -1.
+
+    The models in earlier recordings have the names without ``PREFIX``.
+    """
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE) < 0:
+        name = name.removeprefix(PREFIX)
+    return int(mujoco.mj_name2id(model, kind, name))
+
+
+def coupling_ids(model: mujoco.MjModel) -> tuple[int, ...]:
+    """Returns the ids of the six actuators of the coupling, in the order of a wrench."""
+    kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+    return tuple(added_id(model, kind, name) for name in COUPLING_ACTUATORS)
 
 
 class Scheme(IntEnum):
@@ -111,6 +132,7 @@ REANCHORED = int(TickFlag.REANCHORED)
 LOSSLESS_TICK = int(TickFlag.MIDPOINT)
 SWINGING = int(TickFlag.SWINGING)
 RUNS_AWAY = int(TickFlag.RUNS_AWAY)
+PROBED = int(TickFlag.PROBED)
 """Bits of ``TickFlag`` as integers, because numba cannot compile an ``IntFlag``."""
 
 FORCE_OFF, CLUTCHED = 1 << 40, 1 << 41

@@ -30,6 +30,7 @@ from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.ledger import meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.kernel.rigid_contact import lower_share
 from hapticbridge.pose import Vector, norm, scaled
@@ -191,6 +192,8 @@ def solve_level(s: State) -> bool:
         spend_within_tank(s)
         count += 1
     level.repetitions += count
+    if count > 0:
+        meter_ports_again(s)
     return count > 0
 
 

@@ -74,12 +74,15 @@ ENERGY_DTYPE = np.dtype(
         ("first_unstrict", "<i8"),
         ("first_active", "<i8"),
         ("first_device_excess", "<i8"),
+        ("step_actuator_work", "<f8"),
+        ("step_external_work", "<f8"),
         ("mocap_has_moved", "<i8"),
         ("equality_rows", "<i8"),
     ]
 )
 """Sub-record ``energy``, written by this module alone. Energies and works in J, since the start;
-``first_*`` are the ticks at which a condition first failed, -1 before; the last two hold what a
+``first_*`` are the ticks at which a condition first failed, -1 before; ``step_*`` are works of the
+newest step; the last two hold what a
 moved mocap body leaves until the step is done."""
 
 
@@ -366,12 +369,29 @@ def meter_ports(s: State) -> None:
     Must run before the kinematics are refreshed: the step used moments, Jacobians and points of
     attack of its start.
     """
+    s.energy.step_actuator_work = s.energy.step_external_work = 0.0
+    meter_ports_again(s)
+
+
+@compiled
+def meter_ports_again(s: State) -> None:
+    """Replaces the work of the newest step, which was repeated."""
+    energy = s.energy
     if s.mj.has_actuators:
-        s.energy.actuator_work += _actuator_work(s)
-    s.energy.external_work += _applied_work(s)
-    if s.energy.mocap_has_moved:
-        s.energy.external_work += mocap_work(s)
-        s.energy.mocap_has_moved = 0
+        work = _actuator_work(s)
+        energy.actuator_work += work - energy.step_actuator_work
+        energy.step_actuator_work = work
+    work = _applied_work(s)
+    if energy.mocap_has_moved:
+        work += mocap_work(s)
+    energy.external_work += work - energy.step_external_work
+    energy.step_external_work = work
+
+
+@compiled
+def end_mocap_moves(s: State) -> None:
+    """Notes that the step that follows a move of mocap bodies is metered."""
+    s.energy.mocap_has_moved = 0
 
 
 # Storage, the ports of coupling and device, and the verdict

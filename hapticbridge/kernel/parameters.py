@@ -86,9 +86,9 @@ class GuardParameters:
         hold_torque: Largest torque in N m about axes without motor.
         idle_force: Force in N to which the coupling relaxes while the hand is let go.
         idle_torque: Torque in N m to which it relaxes then.
-        swing_energy: Energy in J that a late force would give in a span of 0.1 s above which the
-            span counts as swinging (``kernel.swing_watch``).
-        runaway_speed: Speed in m/s gained against the force above which the force is taken away.
+        swing_energy: Energy in J that a late force would give within 0.3 s, at a limit of 10 N or
+            0.5 N m, above which the watch suspects the device (``kernel.swing_watch``).
+        runaway_speed: Speed in m/s gained against a limit of 10 N above which it does.
 
     Raises:
         HapticBridgeError: A value is out of range.

@@ -141,7 +141,7 @@ def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector
     power = _largest_power(norm(force), observer.assumed_damping, guard.full_speed)
     power += _largest_power(norm(torque), observer.assumed_rotational_damping, FULL_TURN)
     allowed = AT_FULL_SPEED * guard.max_energy - observer.guarded_energy
-    if s.run.period * power <= allowed:
+    if not s.run.period * power > allowed:  # also for energies that are not numbers
         return force, torque
     observer.flags = CONTROLLER_ACTIVE
     share = max(allowed, 0.0) / (s.run.period * power)

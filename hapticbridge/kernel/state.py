@@ -32,7 +32,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME, Scheme, State
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    HANDLE,
+    WELD_NAME,
+    Scheme,
+    State,
+    added_id,
+    coupling_ids,
+)
 from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
@@ -257,12 +265,13 @@ class BoundKernel:
         for name, value in values.items():
             mj[name] = value
         self._own(owned)
-        first = model.actuator(COUPLING_ACTUATORS[0]).id
-        mj["handle_site_id"] = model.site(HANDLE).id
-        mj["handle_mocap_id"] = model.body_mocapid[model.body(HANDLE).id]
+        first, *_ = coupling_ids(model)
+        mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, HANDLE)
+        handle_id = added_id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE)
+        mj["handle_mocap_id"] = model.body_mocapid[handle_id]
         grip = mj["grip_site_id"] = model.site(parameters.grip).id
         mj["grip_body_id"] = model.site_bodyid[grip]
-        mj["weld_id"] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
+        mj["weld_id"] = added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
@@ -344,7 +353,7 @@ def _whole_gains(model: mujoco.MjModel, parameters: RunParameters) -> tuple[floa
         forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
         return (*forces, *torques)
     gains: list[float] = []
-    first = model.actuator(COUPLING_ACTUATORS[0]).id
+    first, *_ = coupling_ids(model)
     for actuator in (first, first + 3):
         bias = model.actuator_biasprm[actuator]
         gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]

@@ -60,6 +60,7 @@ from hapticbridge.kernel.law import (
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
     close_balance,
+    end_mocap_moves,
     meter_device,
     meter_ports,
     note_moved_mocap_bodies,
@@ -192,7 +193,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
-    watch_device(s, moved, turned)
+    watch_device(s, moved, turned, interval)
     move_device(pose, position, quaternion)
 
     buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
@@ -393,12 +394,14 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
     spend_within_tank(s)
+    is_last = substep + 1 == s.run.substeps
     if scheme != Scheme.MASSLESS:
         meter_ports(s)
-    is_last = substep + 1 == s.run.substeps
     if count == 1 and not is_last:
+        end_mocap_moves(s)
         return OK
     force, torque, moved, turned = _evaluate(s, is_last)
+    end_mocap_moves(s)
     if s.contact.is_rigid:
         finish_contacts(s)
     loop.law_work = dot(force, moved) + dot(torque, turned)

@@ -24,8 +24,10 @@ from hapticbridge.kernel.codes import (
     FORCE_OFF,
     GAVE_ENERGY,
     JUMPED,
+    PROBED,
     RAMPING,
     REANCHORED,
+    RUNS_AWAY,
     STALE_SAMPLE,
     STRETCHED,
     TWISTED,
@@ -178,8 +180,11 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
             guard.rise_ticks = guard.fade_ticks
     elif guard.share > s.watch.max_share:
         guard.share = max(guard.share - 1.0 / guard.fade_ticks, s.watch.max_share)
+        if s.watch.flags & RUNS_AWAY:  # a reversed force must not last for a fade
+            guard.share = s.watch.max_share
     elif guard.share < s.watch.max_share:
-        guard.share = min(guard.share + 1.0 / (guard.rise_ticks + 1.0), s.watch.max_share)
+        rise = guard.fade_ticks if s.watch.flags & PROBED else guard.rise_ticks + 1.0
+        guard.share = min(guard.share + 1.0 / rise, s.watch.max_share)
     if guard.share < 1.0:
         guard.flags |= RAMPING
 

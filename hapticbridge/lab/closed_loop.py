@@ -8,6 +8,7 @@ those of ``Bridge.run`` with the same device.
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,7 +22,9 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.simulated.dynamics import STATE_DTYPE as DEVICE_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.errors import StudyError
-from hapticbridge.jit import compiled_for_threads, direct
+from hapticbridge.jit import compiled, compiled_for_threads, direct
+from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
 from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.options import RunSetup
@@ -119,6 +122,8 @@ class LoopOutcome:
         peak_force: Largest force on the tool in N.
         last_force: Largest signal in the last fifth, force and torque over ``LEVER``, in N.
         device_energy: Energy given to the device in J.
+        seconds: Processor time of the run in s; the device's part is small.
+        depths: Largest penetration of any two bodies at each tick in m, 0 without contact.
         records: ``TICK_DTYPE`` if they were requested; else empty.
     """
 
@@ -132,6 +137,8 @@ class LoopOutcome:
     peak_force: float
     last_force: float
     device_energy: float
+    seconds: float
+    depths: NDArray[np.float64]
     records: NDArray[np.void]
 
 
@@ -202,10 +209,12 @@ class ClosedLoop:
             np.ones(ticks, np.int64) if timing is None or is_even else timing.intervals(ticks)
         )
         records = np.zeros(ticks if keep_records else 0, TICK_DTYPE)
-        signal, most = np.zeros(ticks), np.zeros(1)
+        signal, depths, most = np.zeros(ticks), np.zeros(ticks), np.zeros(1)
+        outputs, began = (signal, depths, most, records), time.thread_time()
         done = _machine_code()(
-            binding.state, *device.stepper, sample, binding.row, intervals, signal, most, records
+            binding.state, *device.stepper, sample, binding.row, intervals, *outputs
         )
+        seconds = time.thread_time() - began
         state, ledger = binding.state, Ledger.of(binding.state)
         last = signal[-(ticks // 5) :] if done == ticks else signal[:done]
         return LoopOutcome(
@@ -219,6 +228,8 @@ class ClosedLoop:
             peak_force=float(state["loop"]["peak_tool_force"][0]),
             last_force=float(last.max(initial=0.0)),
             device_energy=ledger.device_energy,
+            seconds=seconds,
+            depths=depths[:done],
             records=records[: min(done, records.size)],
         )
 
@@ -232,6 +243,7 @@ def _run(
     row: NDArray[np.void],
     intervals: NDArray[np.int64],
     signal: NDArray[np.float64],
+    depths: NDArray[np.float64],
     most: NDArray[np.float64],
     records: NDArray[np.void],
 ) -> int:
@@ -251,12 +263,24 @@ def _run(
         force = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
         torque = w[3] * w[3] + w[4] * w[4] + w[5] * w[5]
         signal[k] = np.sqrt(force + torque / LEVER**2)
+        depths[k] = _deepest(s)
         most[0] = max(most[0], s.energy.environment_energy)
         if records.size > 0:
             records[k] = row[0]
         if not signal[k] < HUGE:
             return k + 1 if k + 1 < intervals.size else k
     return int(intervals.size)
+
+
+@compiled
+def _deepest(s: State) -> float:
+    mj, depth = s.mj, 0.0
+    contacts = pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        if ints(contact + mj.contact_row, 1)[0] >= 0:
+            depth = max(depth, -floats(contact + mj.contact_distance, 1)[0])
+    return depth
 
 
 @cache
@@ -271,6 +295,7 @@ def _machine_code() -> Callable[..., int]:
         np.zeros(1, SAMPLE_DTYPE),
         np.zeros(1, TICK_DTYPE),
         np.zeros(0, np.int64),
+        none,
         none,
         none,
         np.zeros(0, TICK_DTYPE),

@@ -188,7 +188,8 @@ FLAGS = (
     (TickFlag.STALE_SAMPLE, "old sample"),
     (TickFlag.OVERRUN, "late tick"),
     (TickFlag.SWINGING, "lowered: it swings"),
-    (TickFlag.RUNS_AWAY, "taken away: wrong sign"),
+    (TickFlag.RUNS_AWAY, "taken away: wrong way"),
+    (TickFlag.PROBED, "probed: late or not"),
 )
 """Flags shown over time, and their labels."""
 

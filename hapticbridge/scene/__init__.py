@@ -1,13 +1,15 @@
 """MJCF scenes behind a haptic device: loading, handle, coupling and checks.
 
-Read ``load`` first. It reads a scene, adds the handle and its coupling (``handle``), compiles it
-(``compile``) and refuses unsuitable scenes (``checks``). The result is a ``scene.Scene``, which a
-bridge steps. ``source`` keeps the files' bytes for the recording, ``parameters`` the scene's
-settable numbers, ``contacts`` a measured rule for contacts that create energy.
+Read ``load`` first. It reads a scene, finds what the hand holds (``grip``), adds the handle and its
+coupling (``handle``), compiles it (``compile``) and refuses unsuitable scenes (``checks``). The
+result is a ``scene.Scene``, which a bridge steps. ``source`` keeps the files' bytes for the
+recording, ``parameters`` the scene's settable numbers, ``contacts`` a measured rule for contacts
+that create energy.
 """
 
 from hapticbridge.scene.compile import custom_numbers as custom_numbers
 from hapticbridge.scene.compile import custom_text as custom_text
+from hapticbridge.scene.grip import grips as grips
 from hapticbridge.scene.load import SceneSource as SceneSource
 from hapticbridge.scene.load import compile_scene as compile_scene
 from hapticbridge.scene.load import load_scene as load_scene

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, coupling_ids
 from hapticbridge.scene.source import SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
@@ -63,7 +63,7 @@ def check_metered(model: mujoco.MjModel, integrator: str, method: str) -> None:
     velocity. RK4 uses four forces and keeps none.
     """
     names = [model.actuator(i).name or str(i) for i in range(model.nactuator)]
-    own = [i for i, name in enumerate(names) if name not in COUPLING_ACTUATORS]
+    own = [i for i in range(model.nactuator) if i not in coupling_ids(model)]
     if integrator == "implicitfast":
         own = [i for i in own if _depends_on_velocity(model, i)]
     elif integrator != "RK4":
@@ -100,29 +100,13 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
     """Refuses options that are incompatible with the coupling; returns warnings.
 
     Raises:
-        SceneError: An option excludes the coupling from the implicit step (PGS, noslip), has state
-            that is not saved (ipc), or disables actuators or the step.
+        SceneError: An option has state that is not saved (ipc), or disables actuators.
     """
     option = spec.option
-    if option.solver == mujoco.mjtSolver.mjSOL_PGS:
-        raise SceneError(
-            "the scene selects solver PGS, which leaves the coupling out of the implicit step; "
-            "use Newton"
-        )
-    if option.noslip_iterations > 0:
-        raise SceneError(
-            f"the scene sets noslip_iterations={option.noslip_iterations}, which splits the "
-            "implicit step; set it to 0"
-        )
     if option.enableflags & mujoco.mjtEnableBit.mjENBL_IPC:
         raise SceneError(
             "the scene enables flag ipc, whose state cannot be saved and simulated again; "
             "disable it"
-        )
-    if option.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        raise SceneError(
-            "the scene enables flag sleep, under which the coupling would not move a sleeping "
-            "tool; disable it"
         )
     if option.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
         raise SceneError(
@@ -135,11 +119,6 @@ def check_options(spec: mujoco.MjSpec) -> list[str]:
             "coupling off; remove actuatorgroupdisable"
         )
     warnings = []
-    if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        warnings.append(
-            "the scene selects integrator RK4; it runs under 'discrete', the only one that is "
-            "passive behind the coupling"
-        )
     if np.any(np.asarray(option.wind)):
         warnings.append(
             "wind does work on the scene that no port meters; the audit may report the environment "

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
+from hapticbridge.errors import SceneError
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME
 from hapticbridge.scene.compile import go_to_start
 
 # Weld between grip and handle (MuJoCo's equality constraint)
@@ -174,53 +174,31 @@ def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> floa
     return float(0.5 * force if axis >= 3 else force)
 
 
-_PREFIX = "hapticbridge_"
-"""Prefix that separates the handle's default class from the scene's classes."""
-
-
 def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
-    """Adds the mocap body ``handle`` with its site, and the six coupling actuators.
+    """Adds a mocap body, the handle, with its site, and the six coupling actuators.
 
     Args:
         spec: The user's scene; changed in place.
         grip: Name of the site on the tool.
 
     Raises:
-        SceneError: The site does not exist, or the scene uses a name that the bridge adds.
+        SceneError: The scene has a name that starts with ``PREFIX``.
     """
-    sites = [site.name for site in spec.sites if site.name]
-    if grip not in sites:
-        remedy = (
-            "name one of them (--grip, or grip= in Python)"
-            if sites
-            else f'put <site name="{grip or "grip"}"/> into the tool\'s body'
-        )
+    elements = (*spec.bodies, *spec.sites, *spec.actuators, *spec.equalities)
+    if taken := [each.name for each in elements if each.name.startswith(PREFIX)]:
         raise SceneError(
-            f"the scene has no site '{grip}' to grip the tool by; sites: {choices(sites)}; {remedy}"
+            f"the scene has the name '{taken[0]}', and names that start with '{PREFIX}' are those "
+            "that the bridge adds; rename it"
         )
-    _refuse_taken("body", HANDLE, [body.name for body in spec.bodies])
-    _refuse_taken("site", HANDLE, sites)
-    for name in COUPLING_ACTUATORS:
-        _refuse_taken("actuator", name, [actuator.name for actuator in spec.actuators])
-    # a weld is added later and identified by its name only
-    _refuse_taken("equality constraint", WELD_NAME, [each.name for each in spec.equalities])
-
     # in a specification of its own: a <default> of the scene could rotate the handle's site, and
     # boundmass could give it mass
     handle_spec = mujoco.MjSpec()
     handle = handle_spec.worldbody.add_body(name=HANDLE, mocap=True)
     handle.add_site(name=HANDLE)
-    body = spec.worldbody.add_frame().attach_body(handle, _PREFIX, "")
+    body = spec.worldbody.add_frame().attach_body(handle, PREFIX, "")
     body.name = body.sites[0].name = HANDLE
     for axis, name in enumerate(COUPLING_ACTUATORS):
         _add_coupling_actuator(spec, name, axis, grip)
-
-
-def _refuse_taken(kind: str, name: str, taken: list[str]) -> None:
-    if name in taken:
-        raise SceneError(
-            f"the scene already has {kind} '{name}', a name that the bridge adds; rename it"
-        )
 
 
 def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str) -> None:
@@ -246,11 +224,47 @@ def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str)
     actuator.damping = np.zeros(3)
 
 
-def set_options(spec: mujoco.MjSpec) -> None:
-    """Sets the options for an implicit coupling and a known energy of every step."""
-    option = spec.option
+_INTEGRATORS = "Euler", "RK4", "implicit", "implicitfast", "discrete"
+_SOLVERS = "PGS", "CG", "Newton"
+
+
+def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
+    """Sets the options for an implicit coupling and a known energy of every step.
+
+    Solver PGS and ``noslip_iterations`` leave the coupling out of the implicit step, and the
+    coupling does not move a tool that sleeps.
+
+    Args:
+        spec: The user's scene; changed in place.
+        as_is: If true, a scene with one of these three is refused.
+
+    Returns:
+        The options of the scene that were changed, each as ``name: old → new``.
+
+    Raises:
+        SceneError: A change is needed that ``as_is`` forbids.
+    """
+    option, enable = spec.option, mujoco.mjtEnableBit
+    needed, changes = [], []
+    if (solver := int(option.solver)) != mujoco.mjtSolver.mjSOL_NEWTON:
+        changes.append(f"solver: {_SOLVERS[solver]} → Newton")
+        needed += changes if solver == mujoco.mjtSolver.mjSOL_PGS else []
+    if option.noslip_iterations > 0:
+        needed.append(f"noslip_iterations: {option.noslip_iterations} → 0")
+    if option.enableflags & enable.mjENBL_SLEEP:
+        needed.append("flag sleep: enable → disable")
+    if needed and as_is:
+        raise SceneError(
+            f"the scene needs other options to be coupled ({', '.join(needed)}); set them, or let "
+            "them be changed (without --as-is)"
+        )
+    if (integrator := int(option.integrator)) != mujoco.mjtIntegrator.mjINT_DISCRETE:
+        changes.append(f"integrator: {_INTEGRATORS[integrator]} → discrete")
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY | mujoco.mjtEnableBit.mjENBL_DIAGEXACT
+    option.noslip_iterations = 0
+    option.enableflags &= ~int(enable.mjENBL_SLEEP)
+    option.enableflags |= enable.mjENBL_ENERGY | enable.mjENBL_DIAGEXACT
     # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return tuple(dict.fromkeys((*changes, *needed)))

@@ -14,6 +14,7 @@ import mujoco
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
 from hapticbridge.scene.compile import clause, compiled, seat_handle
+from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import attach_handle, set_options
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
@@ -93,7 +94,11 @@ class SceneSource:
 
 
 def load_scene(
-    source: str | Path | mujoco.MjSpec, grip: str = "grip", **parameters: float
+    source: str | Path | mujoco.MjSpec,
+    grip: str = "grip",
+    *,
+    as_is: bool = False,
+    **parameters: float,
 ) -> Scene:
     """Loads an MJCF file, a shipped scene or an ``MjSpec``, and adds a handle and a coupling.
 
@@ -107,7 +112,10 @@ def load_scene(
             with the assets that are in ``MjSpec.assets`` or in a file. The exact compiled model is
             in the recording too, so the audit simulates it again bit for bit. A what-if loads the
             written form.
-        grip: Name of the site on the tool.
+        grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
+            ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``).
+        as_is: If true, a scene with options that exclude the coupling is refused; else they are
+            changed, and ``Scene.changes`` lists them.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
             ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
             has none.
@@ -120,13 +128,13 @@ def load_scene(
         UserWarning: The run deviates from the file in a detail.
     """
     if not isinstance(source, mujoco.MjSpec):
-        return compile_scene(read_scene(source, **parameters), grip, stacklevel=3)
+        return compile_scene(read_scene(source, **parameters), grip, as_is=as_is, stacklevel=3)
     if parameters:
         raise SceneError(
             f"a specification has no parameters, and {choices(parameters)} cannot be set; change "
             "the specification itself"
         )
-    return compile_scene(spec_source(source), grip, stacklevel=3)
+    return compile_scene(spec_source(source), grip, as_is=as_is, stacklevel=3)
 
 
 def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
@@ -183,6 +191,7 @@ def compile_scene(
     source: SceneSource,
     grip: str = "grip",
     *,
+    as_is: bool = False,
     warns: bool = True,
     checks_start: bool = True,
     stacklevel: int = 2,
@@ -191,7 +200,8 @@ def compile_scene(
 
     Args:
         source: Result of ``read_scene``, possibly with a changed specification; it is not modified.
-        grip: Name of the site on the tool.
+        grip: Site, ``BODY`` or ``BODY@x,y,z``.
+        as_is: If true, a scene with options that exclude the coupling is refused.
         warns: If true, deviations of the run from the file are issued as warnings.
         checks_start: If true, a start in penetration or that is not finite is refused.
         stacklevel: Stack level of the warnings.
@@ -203,14 +213,16 @@ def compile_scene(
         UserWarning: The run deviates from the file in a detail.
     """
     path, spec = source.path, source.spec.copy()
+    with _refused(path):
+        about_grip = add_grip(spec, grip, source.sources)
     attach_handle(spec, grip)
-    set_options(spec)
+    changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = compiled(spec, source.sources)
-        concerns = [*source.concerns, *check_model(model, grip)]
+        concerns = [*source.concerns, *about_grip, *check_model(model, grip)]
         seat_handle(model, grip)
         data, values = mujoco.MjData(model), dict(source.parameters)
-        scene = Scene(path, grip, model, data, source.sources, values, spec)
+        scene = Scene(path, grip, model, data, source.sources, values, changes, spec)
         scene.reset()
     if checks_start:
         check_start(model, scene.data, grip)

@@ -31,7 +31,7 @@ KINDS = {
 }
 """Elements that a parameter may set, and the attribute of MjSpec that lists them."""
 
-TAKEN = ("path_or_name", "grip")
+TAKEN = ("path_or_name", "grip", "as_is")
 """Arguments of ``load_scene`` that are not parameters."""
 
 

@@ -48,6 +48,7 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
+        changes: Options of the file that were changed, each as ``name: old → new``.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class Scene:
     data: mujoco.MjData
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -120,8 +122,8 @@ class Scene:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
 
         Rigid contacts have an elliptic cone of friction, the regularisation of friction divided by
-        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and points
-        of ``kernel.colliders``.
+        ``IMPRATIO``, no pass of the solver ``noslip``, a margin of ``MARGIN`` at least, and the
+        points of ``kernel.colliders``.
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):

@@ -413,20 +413,35 @@ FINGERS = Hand(mass=0.06, damping=3.5, stiffness=39.0)
 PRESSES = {DEFAULT_HAND: 0.0804, FINGERS: 0.181}
 """Where a hand wants to be in m: it presses on the wall with 9.5 N, fingers with 6.7 N."""
 
+TWO_FINGERS_TURN = Hand(
+    mass=0.05,
+    damping=2.0,
+    stiffness=30.0,
+    rotational_inertia=2e-5,
+    rotational_damping=2e-3,
+    rotational_stiffness=0.3,
+)
+"""Two fingers that turn a ratchet."""
+
 Change = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 
 
-def forced(change: Callable[[], Change], hand: Hand) -> Callable[[Rig], None]:
+def forced(change: Callable[[], Change], hand: Hand, limit: float = 10.0) -> Callable[[Rig], None]:
     """Returns a fault of a device whose motors do not do what they are told, from its start on.
 
     Args:
         change: Makes a function of tick and written wrench that returns the wrench of the motors.
-        hand: Who holds it and presses on the wall.
+        hand: Who holds it and presses on the wall; ``TWO_FINGERS_TURN`` turn a ratchet by 1 rad.
+        limit: Force limit in N, and the press in proportion.
     """
 
     def do(rig: Rig) -> None:
         rig.parameters = {"hand": hand}
-        rig.points = ((0.0, 0.0), (0.2, 0.0), (0.9, PRESSES[hand]), (9.0, PRESSES[hand]))
+        rig.options = {"limits": Limits(force=limit, torque=0.5, ramp=0.2)}
+        reach = PRESSES.get(hand, 1.0) * limit / 10.0
+        rig.points = ((0.0, 0.0), (0.2, 0.0), (0.9, reach), (9.0, reach))
+        if hand is TWO_FINGERS_TURN:
+            rig.scene, rig.turns = "ratchet", True
         act = change()
 
         def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
@@ -500,6 +515,16 @@ def _reversed_x(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     return wrench
 
 
+def _exchanged(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    wrench[:2] = wrench[1], -wrench[0]
+    return wrench
+
+
+def _reversed_torque(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    wrench[3:] *= -1.0
+    return wrench
+
+
 def _coarse(_since: int, sample: NDArray[np.void]) -> None:
     sample["position"] = 4e-3 * np.round(sample["position"] / 4e-3)
 
@@ -514,9 +539,16 @@ RING_FULL = Fault("ring full for 1 s", _full_ring, "goes on")
 """The one that loses records, after its cause; they are counted."""
 
 
-def unseen(name: str, change: Callable[[], Change], hand: Hand, says: str = "lowered") -> Fault:
+def unseen(
+    name: str,
+    change: Callable[[], Change],
+    hand: Hand,
+    says: str = "the force was",
+    limit: float = 10.0,
+) -> Fault:
     """Returns a fault that no energy account sees, because the samples show another one."""
-    return Fault(name, forced(change, hand), "lowers", says, UNWATCHED, within=500, energy=0.3)
+    do = forced(change, hand, limit)
+    return Fault(name, do, "lowers", says, UNWATCHED, within=500, energy=0.3)
 
 
 UNSEEN = (
@@ -532,6 +564,14 @@ UNSEEN = (
     unseen("reversed axis, two fingers", lambda: _reversed_x, FINGERS, "taken away"),
     unseen("frame that rotates by 1 rad/s", turning(1.0), DEFAULT_HAND),
     unseen("frame that rotates by 1 rad/s, fingers", turning(1.0), FINGERS),
+    unseen("exchanged axes", lambda: _exchanged, DEFAULT_HAND, "taken away"),
+    unseen("exchanged axes, two fingers", lambda: _exchanged, FINGERS, "taken away"),
+    unseen("exchanged axes, 5 N", lambda: _exchanged, DEFAULT_HAND, "taken away", 5.0),
+    unseen("reversed axis, 5 N", lambda: _reversed_x, FINGERS, "taken away", 5.0),
+    unseen("force 20 ms late, 5 N", late(lambda _: 20), FINGERS, limit=5.0),
+    unseen("torque 5 ms late", late(lambda _: 5), TWO_FINGERS_TURN),
+    unseen("torque 14 ms late", late(lambda _: 14), TWO_FINGERS_TURN),
+    unseen("reversed torque", lambda: _reversed_torque, TWO_FINGERS_TURN, "taken away"),
 )
 """Faults that only the watch finds (``kernel.swing_watch``)."""
 

@@ -38,9 +38,21 @@ PRESS = ((0.0, 0.0), (0.2, 0.0), (0.9, 0.0804), (9.0, 0.0804))
 rest of the way are 9 N."""
 
 
-def motion_of(points: tuple[tuple[float, float], ...]) -> Motion:
+def motion_of(points: tuple[tuple[float, float], ...], *, turns: bool = False) -> Motion:
     times, along = zip(*points, strict=True)
+    if turns:
+        halves = 0.5 * np.array(along)
+        zero = np.zeros_like(halves)
+        quaternions = np.stack([np.cos(halves), zero, zero, np.sin(halves)], axis=1)
+        return Motion(times, np.zeros((len(times), 3)), quaternions)
     return Motion(times, [(x, 0.0, 0.0) for x in along])
+
+
+def turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the small turn from one unit quaternion to another as a vector in rad."""
+    w, v = before[0], -before[1:]
+    turn = after[0] * v + w * after[1:] + np.cross(after[1:], v)
+    return np.asarray(2.0 * turn * np.sign(w * after[0] - after[1:] @ v))
 
 
 class FaultClock(SimulatedClock):
@@ -74,7 +86,8 @@ class FaultyDevice:
 
     Attributes:
         writes: Every wrench that arrived, by tick.
-        to_the_hand: Σ w·δp − b δp²/T so far in J, by tick, from true poses and accepted wrenches.
+        to_the_hand: Σ w·δp − b δp²/T so far in J, by tick, from true poses and accepted wrenches;
+            of translation and rotation.
     """
 
     def __init__(self, inner: SimulatedDevice) -> None:
@@ -94,11 +107,14 @@ class FaultyDevice:
 
     def move_on(self) -> None:
         """Lets one period of the device's own time pass."""
-        before = self.true["position"][0].copy()
+        before = self.true[0].copy()
         self.inner.read(self.true)
-        moved = self.true["position"][0] - before
+        moved = self.true["position"][0] - before["position"]
+        turned = turn_between(before["quaternion"], self.true["quaternion"][0])
         burnt = (self.info.damping or 0.0) / PERIOD * float(moved @ moved)
-        self.to_the_hand.append(self.to_the_hand[-1] + float(self._held[:3] @ moved) - burnt)
+        burnt += (self.info.rotational_damping or 0.0) / PERIOD * float(turned @ turned)
+        work = float(self._held[:3] @ moved + self._held[3:] @ turned)
+        self.to_the_hand.append(self.to_the_hand[-1] + work - burnt)
 
     def read(self, sample: NDArray[np.void]) -> int:
         self.tick += 1
@@ -132,7 +148,7 @@ class Rig:
     Attributes:
         folder: Where the recording goes.
         scene: Name or path.
-        points: The hand's path along x.
+        points: The hand's path along x in m, or about z in rad if ``turns``.
         parameters: Of the simulated device.
         coupling: None: the default.
         options: Of the bridge.
@@ -144,6 +160,7 @@ class Rig:
     folder: Path
     scene: str | Path = "virtual_wall"
     points: tuple[tuple[float, float], ...] = PRESS
+    turns: bool = False
     parameters: dict[str, Any] = field(default_factory=dict)
     coupling: Coupling | None = None
     options: dict[str, Any] = field(default_factory=dict)
@@ -158,7 +175,9 @@ class Rig:
     @property
     def device(self) -> FaultyDevice:
         if self._device is None:
-            path = None if self.parameters.get("hand", 1) is None else motion_of(self.points)
+            path = None
+            if self.parameters.get("hand", 1) is not None:
+                path = motion_of(self.points, turns=self.turns)
             self._device = FaultyDevice(SimulatedDevice(path=path, **self.parameters))
         return self._device
 

@@ -17,7 +17,7 @@ from hapticbridge.check.observe import quiet
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.lab.chart.engine_run import EngineRun
-from hapticbridge.lab.chart.setting import OWN, SHIPPED, Setting, who
+from hapticbridge.lab.chart.setting import OWN, Setting, who
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
 from hapticbridge.run_description import processor
@@ -191,7 +191,7 @@ class Measurement:
     def is_usual(self) -> bool:
         """True if nothing but method and period was chosen."""
         setting = self.setting
-        is_plain = setting.contact == SHIPPED and setting.iterations is None
+        is_plain = setting.has_usual_contact and setting.iterations is None
         return is_plain and setting.substeps == 1
 
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
@@ -207,7 +207,7 @@ class Measurement:
             "period_s": setting.period,
             "substeps": setting.substeps,
             "timestep_s": setting.timestep,
-            "contact": setting.contact,
+            "contact": setting.contact_name,
             **self.chosen,
             "stiffness": coupling.stiffness,
             "damping": coupling.damping,
@@ -433,7 +433,7 @@ def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
 
     def distance(index: int) -> tuple[bool, bool, bool, float]:
         setting = settings[index]
-        is_plain = setting.substeps == 1 and setting.contact == SHIPPED
+        is_plain = setting.substeps == 1 and setting.has_usual_contact
         return (
             index in failed,  # it may be without a time
             setting.engine != OWN or setting.method.name != "implicit",

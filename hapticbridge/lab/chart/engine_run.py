@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +12,22 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.lab.chart.scene_run import Path
 from hapticbridge.lab.chart.setting import Setting
-from hapticbridge.lab.chart.workload import Judge, PeerWork, Score, Take
-from hapticbridge.lab.engines.base import Engine, Pose, Simulation, Task, Velocity, composed
+from hapticbridge.lab.chart.workload import Judge, PeerWork, Reading, Score, Take, Verdict
+from hapticbridge.lab.engines.base import (
+    Engine,
+    Pose,
+    Simulation,
+    Task,
+    Velocity,
+    Wrench,
+    composed,
+)
 from hapticbridge.lab.engines.from_scene import task_from_scene
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.pose import conjugate, dot, rotated, rotation_between, subtract
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
 
@@ -131,6 +141,18 @@ class EngineRun:
         Raises:
             HapticBridgeError: The engine refuses the task.
         """
+        takes, has_failed = self.takes()
+        found = self._work.judge(takes)
+        if not has_failed:
+            return found
+        return {key: replace(score, verdict="failed") for key, score in found.items()}
+
+    def takes(self) -> tuple[list[Take], bool]:
+        """Runs it with a record and a meter; returns the takes, and True if the engine failed.
+
+        Raises:
+            HapticBridgeError: The engine refuses the task.
+        """
         takes: list[Take] = []
         has_failed = False
         self._ticks = [0] * len(self._ticks)
@@ -140,23 +162,28 @@ class EngineRun:
             self._ticks[index] = take.records.size
             if take.ended:
                 break
-        found = self._work.judge(takes)
-        if not has_failed:
-            return found
-        return {key: replace(score, verdict="failed") for key, score in found.items()}
+        return takes, has_failed
 
     def _take(self, task: Task, poses: Sequence[Pose]) -> tuple[Take, bool]:
         """Follows a motion; returns the take, and True if the engine raised an error."""
         rows = np.zeros(len(poses), TICK_DTYPE)
         done, ended, has_failed, velocity = 0, "", False, Velocity()
+        meters: tuple[Meter, ...] = ()
         try:
             simulation = self.engine.open(task, self._setting.period)
             try:
+                meters = tuple(
+                    Meter(simulation, task, self._setting.period, each)
+                    for each in (simulation.wrench, simulation.applied)
+                )
                 for pose in poses:
                     simulation.step(pose.position, pose.quaternion)
                     ended = _written(rows[done : done + 1], simulation, task.grip)
                     if ended:
                         break
+                    for meter in meters:
+                        meter.close_step()
+                    rows[done]["environment_energy"] = meters[0].energy
                     done += 1
                 velocity = simulation.velocity()
             finally:
@@ -169,15 +196,85 @@ class EngineRun:
             ended = f"raised {type(error).__name__}: {' '.join(str(error).split())}"
         if ended:
             ended += f" after {self._setting.period * done:.4g} s"
+        readings = [meter.reading for meter in meters] or [Reading()] * 2
         take = Take(
             setting=self._setting,
             records=rows[:done],
             ended=ended,
-            environment="not metered",
-            created=float("nan"),
+            meter=readings[0],
+            engine=readings[1],
             velocity=np.array([*velocity.linear, *velocity.angular]),
         )
         return take, has_failed
+
+
+class Meter:
+    """Meter of the energy that an engine creates, from the motion that it reports.
+
+        Σ E_k = S_k − S_0 − Σ (f·δx + τ·δφ),    S = ½ m ‖v‖² + ½ ω·I ω − m g·x
+
+    f and τ are a wrench on the tool in N and N m, δx and δφ the grip's motion in a step in m and
+    rad, v and ω the tool's velocities, x its centre of mass and g the gravity. This is the balance
+    of ``kernel.ledger``, for one free body among fixed shapes, with its tolerance and the slack of
+    the bridge's own coupling, Σ ½ (K + B/T) ‖δx‖² and its rotational counterpart. Energy that
+    contacts store counts as dissipated until they return it.
+
+    Args:
+        simulation: Simulation at its start.
+        task: Its task.
+        period: Step T in s.
+        wrench: Returns the wrench: that of the coupling's law at the end of a step, as the ledger
+            counts it, or that which the engine applied during the step.
+
+    Attributes:
+        energy: Σ E_k in J.
+    """
+
+    def __init__(
+        self, simulation: Simulation, task: Task, period: float, wrench: Callable[[], Wrench]
+    ) -> None:
+        self._simulation, self._task, self._wrench = simulation, task, wrench
+        k = task.coupling or Coupling(1e-30, 0.0, 0.0, 0.0)
+        self._gains = (
+            0.5 * (k.stiffness + k.damping / period),
+            0.5 * (k.rotational_stiffness + k.rotational_damping / period),
+        )
+        self._grip = composed(simulation.pose(), task.grip)
+        self._start = self._stored()
+        self._work = self._throughput = self._slack = 0.0
+        self.energy = self._created = self._share = 0.0
+
+    @property
+    def reading(self) -> Reading:
+        """Reading so far; not metered where the wrench was nan."""
+        if np.isnan(self.energy):
+            return Reading()
+        verdict: Verdict = "active" if self._share > 1.0 else "within slack"
+        return Reading(verdict if self._share > 0.0 else "strict", self._created, self._share)
+
+    def _stored(self) -> float:
+        body, velocity = self._task.body, self._simulation.velocity()
+        centre = composed(self._simulation.pose(), body.inertia_frame)
+        spin = rotated(conjugate(centre.quaternion), velocity.angular)
+        kinetic = body.mass * dot(velocity.linear, velocity.linear)
+        kinetic += sum(i * w * w for i, w in zip(body.inertia, spin, strict=True))
+        return 0.5 * kinetic - body.mass * dot(self._task.gravity, centre.position)
+
+    def close_step(self) -> None:
+        """Closes the balance of the step that just ended."""
+        wrench, before = self._wrench(), self._grip
+        self._grip = grip = composed(self._simulation.pose(), self._task.grip)
+        moved = subtract(grip.position, before.position)
+        turned = rotation_between(before.quaternion, grip.quaternion)
+        work = dot(wrench.force, moved) + dot(wrench.torque, turned)
+        self._work += work
+        self._throughput += abs(work)
+        self._slack += self._gains[0] * dot(moved, moved) + self._gains[1] * dot(turned, turned)
+        self.energy = self._stored() - self._start - self._work
+        allowed = ENERGY_TOLERANCE * (1.0 + self._throughput)
+        if self.energy > allowed:
+            self._created = max(self._created, self.energy)
+            self._share = max(self._share, self.energy / (self._slack + allowed))
 
 
 def _written(row: NDArray[np.void], simulation: Simulation, grip: Pose) -> str:

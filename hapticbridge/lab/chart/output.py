@@ -103,7 +103,7 @@ def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
 
     def settings_but_steps(point: Measurement) -> tuple[object, ...]:
         setting = point.setting
-        return setting.method.name, setting.engine, setting.contact, setting.iterations
+        return setting.method.name, setting.engine, setting.contact_name, setting.iterations
 
     return any(
         other.score.jnd < JND

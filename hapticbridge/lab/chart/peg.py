@@ -1,9 +1,9 @@
-"""Workload ``peg_in_hole``: a peg without friction, pushed against its hole in several ways."""
+"""Workload ``peg_in_hole``, a peg pushed against its hole, and the same peg jammed by a hand."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,15 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.engine_run import work_of
+from hapticbridge.lab.chart.engine_run import EngineRun, work_of
 from hapticbridge.lab.chart.scene_run import (
     REFERENCE_REFINEMENT,
     OwnReferences,
     Stage,
     Staged,
     Stages,
+    path_of,
 )
+from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
+from hapticbridge.lab.engines.base import open_engine
+from hapticbridge.lab.maps.contact_rigs import PEG_START, peg_device, random_push, recorded
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene, load_scene
 
@@ -264,3 +268,54 @@ class PegInHole(Staged):
             created=take.created,
             verdict=take.environment if is_touching else "lost contact",
         )
+
+
+@dataclass(frozen=True, slots=True)
+class JammedPeg:
+    """A peg that a hand jams in its hole, for the bridge and for other engines.
+
+    The handle follows a prescribed path, so that every engine is led alike. The coupling pulls with
+    up to 50 N.
+
+    Attributes:
+        mass: Mass of the peg in kg.
+        friction: Coulomb's coefficient, without unit.
+        stiffness: K in N/m; the rest of the coupling is that of the map ``contact``.
+        hand: 0 for the recorded hand, otherwise the seed of a random one.
+    """
+
+    mass: float
+    friction: float
+    stiffness: float
+    hand: int
+
+    def take(self, setting: Setting) -> Take:
+        """Runs the bridge or another engine with a meter of its energy.
+
+        Raises:
+            HapticBridgeError: The method cannot render the scene, or the engine is not installed.
+        """
+        motion, _ = recorded() if self.hand == 0 else random_push(self.hand)
+        _, coupling = peg_device(self.stiffness, self.hand)
+        scene = load_scene("peg_in_hole", mass=self.mass, friction=self.friction)
+        scene.model.key_qpos[0, 2] = PEG_START
+        path, ticks = path_of(motion), round(motion.duration / setting.period)
+        duration = ticks * setting.period
+        if setting.engine != OWN:
+            work = work_of(scene, path, duration, setting.period, coupling, lambda _: {})
+            return EngineRun(open_engine(setting.engine), work, setting).takes()[0][0]
+        takes: list[Take] = []
+        stage = Stage(scene, path, duration, coupling)
+        stage.play(setting, lambda take: takes.append(replace(take, records=take.records.copy())))
+        return takes[0]
+
+
+def penetrations(records: NDArray[np.void]) -> NDArray[np.float64]:
+    """Returns the deepest penetration of peg and hole at each tick in m, by ``gaps``, 0 without.
+
+    No engine's own contacts enter. The peg must be in its hole (``gaps``).
+    """
+    turns = Rotation.from_quat(records["tool_quaternion"], scalar_first=True).as_rotvec()
+    places = records["tool_position"]
+    depths = [-gaps(place, turn).min() for place, turn in zip(places, turns, strict=True)]
+    return np.maximum(depths, 0.0)

@@ -26,6 +26,7 @@ from hapticbridge.lab.chart.workload import (
     Judge,
     Panel,
     PeerWork,
+    Reading,
     References,
     Run,
     Score,
@@ -138,6 +139,7 @@ class Stage:
             HapticBridgeError: The method cannot render the scene.
         """
         scene, period, method = self._scene, setting.period, setting.method
+        scene.set_contact(is_rigid=False)  # or it would restore what is applied now
         self._shipped.apply(scene, setting)
         effective = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
         # an error inside the C symbol would end the process, so the first step runs in Python
@@ -160,18 +162,20 @@ class Stage:
     def _take(
         self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int
     ) -> Take:
-        warnings = self._scene.data.warning
+        warnings, ledger = self._scene.data.warning, Ledger.of(binding.state)
         ended = ""
         if rows.size < ticks:
             ended = f"a number was not finite after {setting.period * rows.size:.4g} s"
         elif bad := [kind for kind in _BAD if warnings[int(kind)].number > 0]:
             ended = f"MuJoCo gave its state up ({bad[0].name.removeprefix('mjWARN_')})"
+        created = float(rows["environment_energy"].max(initial=0.0))
+        meter = Reading(ledger.environment, created, ledger.slack_share)
         return Take(
             setting=setting,
             records=rows,
             ended=ended,
-            environment=Ledger.of(binding.state).environment,
-            created=float(rows["environment_energy"].max(initial=0.0)),
+            meter=meter,
+            engine=Reading() if setting.method.scheme.properties.holds_wrench else meter,
             velocity=self._scene.data.qvel.copy(),
         )
 

@@ -62,7 +62,7 @@ class Setting:
         method: Rendering method; its integrator is MuJoCo's.
         period: T in s, one tick.
         substeps: MuJoCo steps per tick.
-        contact: One of ``CONTACTS``.
+        contact: One of ``CONTACTS``; a method with rigid contacts leaves it unused.
         iterations: Limit of MuJoCo's solver; None for that of the scene.
         engine: Engine. Any other than ``OWN`` is set as its documentation advises. It holds the
             coupling's force as method ``explicit`` does, unless its name ends with ``SPRING``.
@@ -81,6 +81,16 @@ class Setting:
         return self.period / self.substeps
 
     @property
+    def contact_name(self) -> str:
+        """Contact by its name: ``rigid``, or one of ``CONTACTS``."""
+        return self.method.contact if self.method.is_rigid else self.contact
+
+    @property
+    def has_usual_contact(self) -> bool:
+        """True if contacts are rigid where the method can, otherwise as in the scene's file."""
+        return self.method.is_rigid == self.method.can_be_rigid and self.contact == SHIPPED
+
+    @property
     def label(self) -> str:
         """Setting in words, without the usual values."""
         law = "own spring" if self.engine.endswith(SPRING) else "held force"
@@ -88,7 +98,7 @@ class Setting:
         parts = [who, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")
-        if self.contact != SHIPPED:
+        if not self.has_usual_contact:
             parts.append(f"contact: {self.contact}")
         if self.iterations is not None:
             plural = "" if self.iterations == 1 else "s"
@@ -131,6 +141,8 @@ class ShippedOptions:
         if setting.contact not in (SHIPPED, PYRAMIDAL):
             solimp = _numbers(SOLIMP)
         is_pyramidal = setting.contact == PYRAMIDAL or self.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+        if setting.method.is_rigid:
+            solref, solimp, is_pyramidal = setting.contact_name, setting.contact_name, False
         return {
             "solref": solref,
             "solimp": solimp,
@@ -236,8 +248,9 @@ def settings_for(
 
     Every method runs at every period. At 1 ms, or the period nearest to it, every method also runs
     with 2, 4 and 8 substeps, unless it cannot divide a tick. If bodies can touch, the methods of
-    ``VARIED`` run with every contact setting, and with few solver iterations. The contact settings
-    are tried at the next smaller period too, because a setting may be right at one step by luck.
+    ``VARIED`` run with every contact setting of MuJoCo in place of rigid contacts, and with few
+    solver iterations. The contact settings are tried at the next smaller period too, because a
+    setting may be right at one step by luck.
 
     Args:
         methods: Names of the methods.
@@ -255,10 +268,9 @@ def settings_for(
     if has_contact:
         varied = [method for method in methods if method.name in VARIED]
         points += [
-            Setting(method, period, contact=contact)
+            Setting(method.with_contact("scene"), period, contact=contact)
             for method in varied
             for contact in CONTACTS
-            if contact != SHIPPED
             for period in _with_neighbour(usual, periods)
         ]
         points += [

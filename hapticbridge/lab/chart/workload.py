@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ Verdict = Literal[
     "strict", "within slack", "active", "lost contact", "diverged", "failed", "not metered"
 ]
 """Verdict on the environment (``Ledger.environment``), or another outcome of the run. ``failed``:
-another engine raised an error on the way. ``not metered``: another engine, whose energy is not
-measured."""
+another engine raised an error on the way. ``not metered``: it did not begin, or its own spring does
+not tell its force."""
 
 PASSIVE = ("strict", "within slack")
 
@@ -99,6 +99,20 @@ def diverged(created: float = INF, reason: str = "") -> Score:
     return Score(jnd=INF, created=created, verdict="diverged", reason=reason)
 
 
+class Reading(NamedTuple):
+    """Reading of a meter of energy at the end of a run.
+
+    Attributes:
+        verdict: ``strict``, ``within slack``, ``active`` or ``not metered``.
+        created: Largest Σ E_k in J.
+        slack_share: Largest share of the slack that was used, without unit.
+    """
+
+    verdict: Verdict = "not metered"
+    created: float = NAN
+    slack_share: float = NAN
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
     """One pass along the motion.
@@ -108,17 +122,28 @@ class Take:
         records: ``TICK_DTYPE``, one per completed tick.
         ended: Reason of the divergence, in words: an early end, or a state that MuJoCo rejected;
             else empty.
-        environment: ``strict``, ``within slack`` or ``active``.
-        created: Largest Σ E_k in J.
+        meter: Energy that the environment created, behind the law of the coupling.
+        engine: Energy that the engine created with the wrench that it applied. It is less than
+            ``meter`` by the energy that a held wrench creates.
         velocity: ``qvel`` at the end.
     """
 
     setting: Setting
     records: NDArray[np.void]
     ended: str
-    environment: Verdict
-    created: float
+    meter: Reading
+    engine: Reading
     velocity: NDArray[np.float64]
+
+    @property
+    def environment(self) -> Verdict:
+        """Verdict on the environment."""
+        return self.meter.verdict
+
+    @property
+    def created(self) -> float:
+        """Largest Σ E_k in J."""
+        return self.meter.created
 
     @property
     def has_diverged(self) -> bool:

@@ -344,6 +344,13 @@ class Simulation(Protocol):
     def wrench(self) -> Wrench:
         """Returns the coupling's wrench f_k on the tool, about the grip."""
 
+    def applied(self) -> Wrench:
+        """Returns the coupling's wrench on the tool during the last step, about the grip.
+
+        A held coupling applies f_{k−1}, a spring of the engine's own f_k. It is nan where the
+        engine does not tell its spring's force.
+        """
+
     def contacts(self) -> Contacts:
         """Returns the contacts of the last step."""
 

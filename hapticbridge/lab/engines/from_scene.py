@@ -257,7 +257,7 @@ class HeldSimulation(ABC):
         self._centre = task.body.inertia_frame.position
         self._handle: Frame = _AT_ORIGIN
         self._tool: Frame = _AT_ORIGIN
-        self._wrench = self._at_centre = (ZERO_VECTOR, ZERO_VECTOR)
+        self._wrench = self._at_centre = self._held = (ZERO_VECTOR, ZERO_VECTOR)
 
     def _begin(self, task: base.Task) -> None:
         """Computes the wrench of step 0."""
@@ -288,9 +288,14 @@ class HeldSimulation(ABC):
         """Returns the wrench on the tool about the grip."""
         return base.Wrench(*self._wrench)
 
+    def applied(self) -> base.Wrench:
+        """Returns the wrench that was held in the last step."""
+        return base.Wrench(*self._held)
+
     def _measure(self, handle: Frame) -> None:
         if self._gains is None:
             return
+        self._held = self._wrench
         pose = self.pose()
         self._tool, self._wrench, self._at_centre = _law(
             self._gains,

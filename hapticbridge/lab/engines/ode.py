@@ -433,6 +433,10 @@ class OdeSpringSimulation(OdeSimulation):
             ):
                 ode.dJointSetAMotorParam(self._motor, axis * _GROUP + parameter, value)
 
+    def applied(self) -> base.Wrench:
+        """Returns the wrench of the joints in the last step: the law's at its end."""
+        return self.wrench()
+
     def _couple(self, handle: Frame) -> None:
         """Aims the joints at the handle, and steps."""
         if self._gains is not None:

@@ -214,6 +214,10 @@ class SapienSpringSimulation(SapienSimulation):
         )
         self._body.entity.add_component(drive)
 
+    def applied(self) -> base.Wrench:
+        """Returns nan: the drive's force changes with the solver's iterations."""
+        return base.Wrench((math.nan,) * 3, (math.nan,) * 3)
+
     def _couple(self, handle: Frame) -> None:
         """Aims the drive at the handle, and steps."""
         if self._gains is not None:

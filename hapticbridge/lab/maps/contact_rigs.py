@@ -1,253 +1,301 @@
-"""Contact settings on two rigs: one mass on a wall, and a peg that jams in its hole."""
+"""Rigs with contact: tools that jam, tap, slide and stick, and shipped scenes, in random hands."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 
 import mujoco
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
+from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.device.trajectory import read_motion
 from hapticbridge.guard import UNLIMITED
-from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.scene import scene_path
-from hapticbridge.scene.contacts import ContactNumbers, contact_numbers
+from hapticbridge.scene import Scene, load_scene, scene_path
 
-RECORDED = (3.5, 6.0)
-"""Part of the recorded hand in s: into the hole, to the bottom, and pressing to the sides."""
+PERIOD = 1e-3
+"""Period T in s of a run, unless another is chosen."""
+
+SHIPPED_SOLIMP = (0.9, 0.95, 0.001)
+"""Impedance d₀, d_w and width in m of the shipped scenes."""
+
+# The scenes
+
+_FREE = "<freejoint/>"
+_PLANAR = (
+    '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>'
+    '<joint type="hinge" axis="0 1 0"/>'
+)
 
 
-@cache
-def tapping(frequency: float) -> Motion:
-    """Returns the path of a hand that taps at a frequency in Hz.
+def _scene(
+    tool: str, rest: str, start: str = "0 0 0", joints: str = _FREE, gravity: float = 0.0
+) -> str:
+    return f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 {-gravity}" cone="elliptic"><flag diagexact="enable"/></option>
+  <worldbody>
+    <body name="tool" pos="{start}">{joints}<geom type="box" size="{tool}" mass="0.1"/>
+      <site name="grip"/>
+    </body>{rest}
+  </worldbody>
+</mujoco>"""
 
-    Its target lies up to 6 mm behind the wall's face.
+
+def _box(size: str, place: str, rest: str = "") -> str:
+    return f'<geom type="box" size="{size}" pos="{place}" {rest}/>'
+
+
+def _hole(clearance: float, *, is_planar: bool = False) -> str:
+    """Returns a square peg of 20 mm in a hole 60 mm deep with a clearance in m a side."""
+    half = 0.01 + clearance
+    out = half + 0.02
+    walls = [_box(f"0.02 {out + 0.02} 0.03", f"{side * out} 0 -0.03") for side in (1, -1)]
+    if not is_planar:
+        walls += [_box(f"{half} 0.02 0.03", f"0 {side * out} -0.03") for side in (1, -1)]
+    rest = "".join([*walls, _box("0.03 0.03 0.005", "0 0 -0.065")])
+    return _scene("0.01 0.01 0.03", rest, "0 0 -0.01", _PLANAR if is_planar else _FREE)
+
+
+def _groove() -> str:
+    """Returns a block above a groove of two inclined plates."""
+    plates = [
+        _box("0.005 0.04 0.03", f"{side * 0.0195} 0 -0.012", f'euler="0 {side * 0.3927} 0"')
+        for side in (1, -1)
+    ]
+    return _scene("0.01 0.02 0.01", "".join(plates), "0 0 0.006")
+
+
+def _pile() -> str:
+    """Returns a block beside two others on each other, which it pushes over a floor."""
+    blocks = [
+        f'<body pos="0 0 {0.01 + 0.02 * i}"><freejoint/>'
+        f'<geom type="box" size="0.02 0.02 0.01" mass="{0.1 - 0.05 * i}"/></body>'
+        for i in range(2)
+    ]
+    rest = _box("0.15 0.15 0.01", "0 0 -0.01") + "".join(blocks)
+    return _scene("0.01 0.01 0.01", rest, "-0.0305 0 0.015", gravity=9.81)
+
+
+# The hands
+
+DURATION = 2.5
+"""Duration of a random hand in s."""
+
+
+def wandering(
+    random: Generator,
+    size: tuple[float, float, float] = (4e-3, 4e-3, 4e-3),
+    angle: float = 0.08,
+    *,
+    fastest: float = 6.0,
+    approach: float = 0.0,
+    tap: float = 0.0,
+) -> Motion:
+    """Returns a random path of sums of sines.
+
+    Args:
+        random: Source of the random numbers.
+        size: Amplitude per axis in m.
+        angle: Amplitude of each component of the rotation vector in rad.
+        fastest: Largest frequency in Hz; the smallest is 0.3 Hz.
+        approach: Descent in m within the first 0.3 s.
+        tap: Amplitude in m of 3 Hz along the vertical.
     """
-    return base.swinging(0.008, frequency, duration=1.0, count=301)
+    time = np.arange(0.0, DURATION + 0.001, 0.002)
+
+    def smooth(amplitude: float) -> NDArray[np.float64]:
+        frequency, phase = random.uniform(0.3, fastest, 5), random.uniform(0, 2 * np.pi, 5)
+        weight = random.uniform(0.2, 1.0, 5) / np.sqrt(frequency)
+        angles = 2 * np.pi * frequency[:, None] * time + phase[:, None]
+        wave = (weight / weight.sum()) @ np.sin(angles)
+        return np.asarray(2 * amplitude * (wave - wave[0]) * np.minimum(time / 0.1, 1.0))
+
+    place = np.column_stack([smooth(amplitude) for amplitude in size])
+    place[:, 2] -= approach * np.minimum(time / 0.3, 1.0)
+    place[:, 2] += tap * (np.cos(6 * np.pi * time) - 1.0)
+    turn = Rotation.from_rotvec(np.column_stack([smooth(angle) for _ in range(3)]))
+    return Motion(time, place, turn.as_quat(canonical=True, scalar_first=True))
 
 
-@cache
-def random_taps(seed: int) -> tuple[Motion, Hand]:
-    """Returns a random hand that taps: 1 to 6 Hz, 0 to 6 mm behind the wall's face, 1 s."""
-    random = np.random.default_rng(seed)
-    size, frequency = random.uniform(5e-3, 8e-3), random.uniform(1.0, 6.0)
-    hand = Hand(stiffness=random.uniform(800, 3000), damping=random.uniform(5, 30))
-    return base.swinging(size, frequency, duration=1.0, count=301), hand
-
-
-@cache
-def recorded() -> tuple[Motion, Hand]:
-    """Returns the scene's recorded hand while it is in the hole, with the grip of a firm hand."""
-    table = read_motion(scene_path("peg_in_hole").with_suffix(".csv")).table
-    rows = (table[:, 0] >= RECORDED[0]) & (table[:, 0] <= RECORDED[1])
-    path = Motion(table[rows, 0], table[rows, 1:4], table[rows, 4:]).relative()
-    return path, Hand(
-        stiffness=2000.0, damping=25.0, rotational_stiffness=5.0, rotational_damping=0.05
-    )
-
-
-@cache
-def random_push(seed: int) -> tuple[Motion, Hand]:
-    """Returns a random firm hand and its path.
-
-    Its target moves by up to 8 mm and 0.15 rad, at 0.5 to 3 Hz.
-    """
-    random = np.random.default_rng(seed)
-    time = np.linspace(0.0, 2.0, 81)
-
-    def smooth(size: float) -> NDArray[np.float64]:
-        frequency, phase = random.uniform(0.5, 3.0, 5), random.uniform(0, 2 * np.pi, 5)
-        angle = 2 * np.pi * frequency[:, None] * time + phase[:, None]
-        waves = random.normal(size=5) @ (np.sin(angle) - np.sin(phase)[:, None])
-        return np.asarray(size * waves / np.abs(waves).max())
-
-    position = np.column_stack([smooth(8e-3) for _ in range(3)])
-    turn = Rotation.from_rotvec(np.column_stack([smooth(0.15), smooth(0.15), smooth(0.1)]))
-    hand = Hand(
+def _firm(random: Generator) -> Hand:
+    """Returns a random firm hand."""
+    return Hand(
         mass=random.uniform(0.2, 0.8),
         stiffness=random.uniform(800, 3000),
         damping=random.uniform(5, 30),
         rotational_stiffness=random.uniform(1, 5),
         rotational_damping=random.uniform(0.01, 0.05),
     )
-    return Motion(time, position, turn.as_quat(canonical=True)[:, [3, 0, 1, 2]]), hand
 
 
-PERIOD = 1e-3
-"""Period T in s of every run of the map."""
+def _tapping(random: Generator) -> Motion:
+    """Returns a random hand along x that taps: 1 to 6 Hz, up to 6 mm behind the wall's face."""
+    size, frequency = random.uniform(5e-3, 8e-3), random.uniform(1.0, 6.0)
+    return base.swinging(size, frequency, duration=1.0, count=301)
 
-SHIPPED_SOLIMP = (0.9, 0.95, 0.001)
-"""Impedance d₀, d_w and width in m of the shipped scenes."""
+
+def _astray(name: str, random: Generator) -> Motion:
+    """Returns a shipped scene's own path, with random deviations of 2 mm and 0.1 rad."""
+    own = read_motion(scene_path(name).with_suffix(".csv")).relative().table
+    stray = wandering(random, (2e-3, 2e-3, 2e-3), 0.1, fastest=2.0).table
+    # back and forth through the deviations, so that they last as long as the path
+    index = (500 * own[:, 0]).astype(int) % (2 * len(stray) - 2)
+    stray = stray[np.where(index < len(stray), index, 2 * len(stray) - 2 - index)]
+    turn = Rotation.from_quat(stray[:, 4:], scalar_first=True) * Rotation.from_quat(
+        own[:, 4:], scalar_first=True
+    )
+    quaternions = turn.as_quat(canonical=True, scalar_first=True)
+    return Motion(own[:, 0], own[:, 1:4] + stray[:, 1:4], quaternions)
+
+
+# The rigs
 
 
 @dataclass(frozen=True, slots=True)
-class Treatment:
-    """A treatment of a contact by MuJoCo.
+class Rig:
+    """A scene with a random hand.
 
     Attributes:
-        solref: (timeconst in s, dampratio) or (−k in 1/s², −b in 1/s).
-        solimp: d₀, d_w and width in m.
-        cone: ``elliptic`` or ``pyramidal``.
-        diagexact: True for the exact diagonal of the constraint inertia.
-        refsafe: True if MuJoCo may replace rows that the step cannot resolve.
-        speculative: True if contacts are added before impact.
-        condim: 1 removes friction; else 3.
-        impratio: Ratio of friction to normal impedance.
-        margin: Distance in m at which contacts begin.
-        substeps: MuJoCo steps per tick.
-        method: Rendering method.
+        load: Returns the scene.
+        path: Returns a hand's path from random numbers.
+        is_shipped: True for a shipped scene with its own mass, friction and hand.
+        damping: Damping B of the coupling in N s/m; low, so that it hides little created energy.
     """
 
-    solref: tuple[float, float] = (0.002, 1.0)
-    solimp: tuple[float, float, float] = SHIPPED_SOLIMP
-    cone: str = "elliptic"
-    diagexact: bool = True
-    refsafe: bool = True
-    speculative: bool = False
-    condim: int = 3
-    impratio: float = 1.0
-    margin: float = 0.0
-    substeps: int = 1
-    method: str = "implicit"
-
-    @property
-    def relaxation(self) -> float:
-        """Time constant τ in s of the contact's return after a push, b/k."""
-        return self.numbers.relaxation * self._step
-
-    @property
-    def static_depth(self) -> float:
-        """Static penetration relative to the shipped settings: (1 − d) d_w²/(d² k)."""
-        depth = self._depth(self.numbers, self.solimp[1], self._step)
-        shipped = contact_numbers((0.002, 1.0), SHIPPED_SOLIMP, PERIOD)
-        return depth / self._depth(shipped, SHIPPED_SOLIMP[1], PERIOD)
-
-    @staticmethod
-    def _depth(numbers: ContactNumbers, last: float, step: float) -> float:
-        impedance = numbers.impedance
-        return (1 - impedance) * (last * numbers.resolved * step / impedance) ** 2
-
-    @property
-    def numbers(self) -> ContactNumbers:
-        """Input of the rule for this setting."""
-        return contact_numbers(self.solref, self.solimp, self._step, refsafe=self.refsafe)
-
-    @property
-    def is_ruled(self) -> bool:
-        """True if the rule covers it: implicit, elliptic, with the exact diagonal."""
-        return self.method == "implicit" and self.cone == "elliptic" and self.diagexact
-
-    @property
-    def _step(self) -> float:
-        return PERIOD / self.substeps
-
-    def apply(self, model: mujoco.MjModel, friction: float) -> None:
-        """Sets a model's contacts through MuJoCo's global override; needs no compilation."""
-        option = model.opt
-        option.o_solref[:] = self.solref
-        option.o_solimp[:3] = self.solimp
-        option.o_friction[:2] = friction
-        option.o_margin = self.margin
-        option.impratio = self.impratio
-        model.geom_condim[:] = self.condim
-        elliptic, pyramidal = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtCone.mjCONE_PYRAMIDAL
-        option.cone = int(elliptic if self.cone == "elliptic" else pyramidal)
-        enable, disable = mujoco.mjtEnableBit, mujoco.mjtDisableBit
-        option.enableflags = _with_bits(
-            option.enableflags,
-            {
-                enable.mjENBL_OVERRIDE: True,
-                enable.mjENBL_DIAGEXACT: self.diagexact,
-                enable.mjENBL_SPECULATIVE: self.speculative,
-            },
-        )
-        option.disableflags = _with_bits(
-            option.disableflags, {disable.mjDSBL_REFSAFE: not self.refsafe}
-        )
+    load: Callable[[], Scene]
+    path: Callable[[Generator], Motion]
+    is_shipped: bool = False
+    damping: float = 0.5
 
 
-def _with_bits(flags: int, bits: Mapping[object, bool]) -> int:
-    for bit, is_set in bits.items():
-        number = int(bit)  # type: ignore[call-overload]
-        flags = flags | number if is_set else flags & ~number
-    return flags
+def _made(text: str, path: Callable[[Generator], Motion]) -> Rig:
+    return Rig(partial(base.scene_of, text), path)
 
 
-SHIPPED = "as shipped: 0.002 1"
+def _shipped(name: str) -> Rig:
+    return Rig(partial(load_scene, name), partial(_astray, name), is_shipped=True)
 
-TREATMENTS: Mapping[str, Treatment] = {
-    SHIPPED: Treatment(),
-    "pyramidal cone": Treatment(cone="pyramidal"),
-    "diagexact off": Treatment(diagexact=False),
-    "refsafe off, 0.0002 1": Treatment((0.0002, 1.0), refsafe=False),
-    "speculative contacts": Treatment(speculative=True),
-    "impratio 10": Treatment(impratio=10.0),
-    "margin 0.1 mm": Treatment(margin=1e-4),
-    "no friction (condim 1)": Treatment(condim=1),
-    "impedance 0.5 throughout": Treatment(solimp=(0.5, 0.5, 0.001)),
-    "impedance 0.99 throughout": Treatment(solimp=(0.99, 0.99, 0.001)),
-    "impedance 0.999 throughout": Treatment(solimp=(0.999, 0.999, 0.001)),
-    "0.002 2, impedance 0.95": Treatment((0.002, 2.0), (0.95, 0.95, 0.001)),
-    "0.002 2, impedance 0.99": Treatment((0.002, 2.0), (0.99, 0.99, 0.001)),
-    "0.004 2, impedance 0.99": Treatment((0.004, 2.0), (0.99, 0.99, 0.001)),
-    "0.004 8, impedance 0.99": Treatment((0.004, 8.0), (0.99, 0.99, 0.001)),
-    "0.000125 8, imp. 0.999": Treatment((0.000125, 8.0), (0.999, 0.999, 0.001)),
-    "0.002 1, imp. 0.9 to 0.99": Treatment(solimp=(0.9, 0.99, 0.001)),
-    "damped, imp. 0 to 0.99 at once": Treatment((0.0005, 8.0), (0.0001, 0.99, 0.00001)),
-    "0.0005 4": Treatment((0.0005, 4.0)),
-    "0.00025 8": Treatment((0.00025, 8.0)),
-    "timeconst T: 0.001 1": Treatment((0.001, 1.0)),
-    "0.003 1": Treatment((0.003, 1.0)),
-    "0.002 1.5": Treatment((0.002, 1.5)),
-    "MuJoCo's default 0.02 1": Treatment((0.02, 1.0)),
-    "direct -20000 -50": Treatment((-20_000.0, -50.0)),
-    "direct -1000000 -500": Treatment((-1e6, -500.0)),
-    "4 substeps, 0.002 1": Treatment(substeps=4),
-    "4 substeps, 0.0005 4": Treatment((0.0005, 4.0), substeps=4),
-    "implicitfast": Treatment(method="implicitfast"),
-    "damped: 0.0005 8": Treatment((0.0005, 8.0)),
-    "default 0.02 1, pyramidal": Treatment((0.02, 1.0), cone="pyramidal"),
-    "damped, pyramidal cone": Treatment((0.0005, 8.0), cone="pyramidal"),
-    "damped hard: 0.00002 100": Treatment((0.00002, 100.0)),
+
+_dragged = partial(wandering, size=(0.02, 0.02, 1.5e-3), angle=0.03, fastest=2.5, approach=1.5e-3)
+_pushed = partial(wandering, size=(3e-3, 4e-3, 4e-3), angle=0.1, approach=8e-3)
+_shoved = partial(wandering, size=(0.012, 6e-3, 8e-3), angle=0.1, fastest=3.0)
+_tapped = partial(wandering, size=(4e-3, 4e-3, 6e-3), angle=0.15, approach=6e-3, tap=4e-3)
+_FLOOR = _box("0.1 0.1 0.01", "0 0 -0.02")
+
+RIGS: Mapping[str, Rig] = {
+    "peg": _made(_hole(2e-4), wandering),
+    "tight peg": _made(_hole(5e-5), wandering),
+    "planar peg": _made(_hole(2e-4, is_planar=True), wandering),
+    "tight planar peg": _made(_hole(5e-5, is_planar=True), wandering),
+    "taps": _made(_scene("0.01 0.01 0.02", _box("0.05 0.05 0.01", "0 0 -0.04")), _tapped),
+    "slide": _made(_scene("0.015 0.015 0.01", _FLOOR, "0 0 0.0001", gravity=9.81), _dragged),
+    "wedge": _made(_groove(), _pushed),
+    "stack": _made(_pile(), _shoved),
+    **{name: _shipped(name) for name in ("lock", "hex_key", "ratchet", "pliers", "drawer")},
+    "wall": Rig(partial(load_scene, "virtual_wall"), _tapping, damping=2.0),
 }
-"""Treatments of the peg's contact in the search at 1 kHz, all but one under ``implicit``."""
+"""Rigs by name. The peg has a clearance of 0.2 mm a side, the tight one 0.05 mm. ``slide`` is
+dragged over a floor and sticks and slips, ``wedge`` pushed into a groove; ``stack`` pushes two
+blocks."""
 
+COMPARED_RIGS = tuple(name for name in RIGS if name != "wall")
+"""Rigs on which treatments are compared; the wall is for the settings of the grid."""
+
+MASSES = (0.03, 0.1, 0.3)
+"""Tool masses in kg."""
+
+STIFFNESSES = (1000.0, 6000.0)
+"""Stiffnesses K in N/m."""
+
+FRICTIONS = (0.0, 0.1, 0.4)
+"""Coefficients of friction."""
+
+ROTATION = (1e-3, 5e-4)
+"""Ratio K_r/K in m²/rad, and B_r in N m s/rad: the README's 2 N m/rad at 2000 N/m."""
 
 DEVICE_MARGIN = 1.25
 """Ratio of the device damping to KT/2 + B of (6), without unit. The device never limits these
 runs."""
 
-WALL_DAMPING = 2.0
-"""Damping B on the wall, in N s/m."""
 
-PEG_DAMPING = 0.5
-"""Damping B on the peg, in N s/m; low, so that the coupling hides little of the created energy."""
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A run on a rig.
 
-PEG_ROTATION = (1e-3, 5e-4)
-"""Ratio K_r/K in m²/rad, and B_r in N m s/rad: the README's 2 N m/rad at 2000 N/m."""
+    Attributes:
+        rig: Name of the rig.
+        stiffness: K in N/m.
+        mass: Mass of the tool in kg; a shipped scene has its own.
+        friction: Coefficient of friction, 0 for none; a shipped scene has its own.
+        hand: Seed of the random hand; 0 on a shipped scene is its own path.
+    """
 
-PEG_START = 0.005
-"""Height of the peg's centre at the start in m: 25 mm of the 60 mm peg stand in the hole."""
+    rig: str
+    stiffness: float = 2400.0
+    mass: float = 0.1
+    friction: float = 0.4
+    hand: int = 1
 
-DEPTH_EVERY = 20
-"""Ticks in contact between two samples of the depth. The peak of a push lasts longer, and every
-sample costs as much as five ticks."""
 
-WALL_RUNS = tuple(itertools.product((0.01, 0.05, 0.2), (0, 1)))
-"""Cases of the wall, tool mass in kg and hand, the most often active first."""
+@dataclass(frozen=True, slots=True)
+class Treatment:
+    """A treatment of the contacts.
 
-PEG_RUNS = tuple(itertools.product((0.03, 0.1), (0.0, 0.42), (1, 2)))
-"""Cases of the peg, tool mass in kg, friction and hand (0 is the recorded one, others are seeds),
-the most often active first."""
+    Attributes:
+        contact: ``rigid``, or ``scene`` for MuJoCo's with the settings below.
+        method: Rendering method.
+        solref: (timeconst in s, dampratio) or (−k in 1/s², −b in 1/s).
+        cone: ``elliptic`` or ``pyramidal``.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+    """
+
+    contact: str = "scene"
+    method: str = "implicit"
+    solref: tuple[float, float] = (0.002, 1.0)
+    cone: str = "elliptic"
+    period: float = PERIOD
+    substeps: int = 1
+
+    def apply(self, scene: Scene, case: Case) -> None:
+        """Sets contacts, mass and friction of a rig that is no shipped scene."""
+        model = scene.model
+        scene.set_contact(is_rigid=False)
+        if RIGS[case.rig].is_shipped:
+            return
+        model.geom_solref[:] = self.solref
+        model.geom_solimp[:, :3] = SHIPPED_SOLIMP
+        model.geom_friction[:, :] = case.friction, 0.0, 0.0
+        model.geom_condim[:] = 3 if case.friction > 0 else 1
+        elliptic, pyramidal = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtCone.mjCONE_PYRAMIDAL
+        model.opt.cone = int(elliptic if self.cone == "elliptic" else pyramidal)
+        base.set_tool_mass(model, "tool", case.mass)
+        mujoco.mj_setConst(model, scene.data)
+
+
+SCENE, RIGID = Treatment(), Treatment("rigid")
+
+TREATMENTS: Mapping[str, Treatment] = {
+    "as shipped, 0.002 1": SCENE,
+    "damped, 0.0005 8": Treatment(solref=(0.0005, 8.0)),
+    "MuJoCo's default, 0.02 1": Treatment(solref=(0.02, 1.0)),
+    "rigid": RIGID,
+    "rigid, lossless": Treatment("rigid", "lossless"),
+}
+"""Treatments that the map compares on every rig; the numbers are ``solref``. Shipped scenes have
+their own ``solref``, which is the first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +308,9 @@ class ContactRun:
         slack_share: Largest share of the slack that was used.
         first_active: Tick at which the environment exceeded the slack, −1 for none.
         peak_force: Largest force in N.
+        median_depth: Median penetration of the ticks with contact in m.
         depth: Largest penetration in m.
+        cost: Processor time of a tick in s.
     """
 
     environment: str
@@ -268,14 +318,15 @@ class ContactRun:
     slack_share: float
     first_active: int
     peak_force: float
+    median_depth: float
     depth: float
+    cost: float = field(compare=False)
 
 
 def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
     """Returns the number of runs per verdict, with their worst and median values."""
     verdicts = [run.environment for run in runs]
     failed = [run.first_active for run in runs if run.first_active >= 0]
-    depths = [run.depth for run in runs]
     return {
         "runs": len(runs),
         "strict": verdicts.count("strict"),
@@ -285,8 +336,9 @@ def summary(runs: Sequence[ContactRun]) -> dict[str, float | int]:
         "slack_share": max(run.slack_share for run in runs),
         "first_active": min(failed, default=-1),
         "peak_force": max(run.peak_force for run in runs),
-        "median_depth": float(np.median(depths)),
-        "largest_depth": max(depths),
+        "median_depth": float(np.median([run.median_depth for run in runs])),
+        "largest_depth": max(run.depth for run in runs),
+        "cost": float(np.median([run.cost for run in runs])),
     }
 
 
@@ -303,109 +355,89 @@ def until_active(runs: Iterable[ContactRun]) -> list[ContactRun]:
     return made
 
 
-def wall_runs(
-    treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, int]] = WALL_RUNS
-) -> Iterator[ContactRun]:
-    """Runs masses (kg) against a wall with hands (0 slow and deep, 1 fast) at K in N/m.
-
-    Each run is made on demand.
-    """
-    loop = base.loop_in("virtual_wall", "contact")
-    coupling = Coupling(stiffness, WALL_DAMPING, 1.0, 1e-3)  # the rail prevents rotation
-    for mass, hand in cases:
-        treatment.apply(loop.scene.model, 0.0)
-        set_mass(loop, "tool", mass)
-        device = firm_device(
-            coupling, tapping((3.0, 6.0)[hand]), Hand(stiffness=2000.0, damping=25.0)
-        )
-        records, run = run_once(loop, device, coupling, treatment, 1000)
-        # the face is 10 mm from where the tool's surface starts
-        depth = max(0.0, float(records["tool_position"][:, 0].max()) - 0.01)
-        yield replace(run, depth=depth)
+def run_cases(treatment: Treatment, cases: Iterable[Case]) -> Iterator[ContactRun]:
+    """Runs a treatment through cases, each on demand."""
+    for case in cases:
+        yield contact_run(run_case(treatment, case))
 
 
-def peg_runs(
-    treatment: Treatment, stiffness: float, cases: Iterable[tuple[float, float, int]] = PEG_RUNS
-) -> Iterator[ContactRun]:
-    """Runs pegs by mass (kg), friction and hand in the hole at K in N/m, as ``wall_runs`` does."""
-    loop = base.loop_in("peg_in_hole", "contact", start_in_hole)
-    for mass, friction, hand in cases:
-        treatment.apply(loop.scene.model, friction)
-        set_mass(loop, "peg", mass)
-        device, coupling = peg_device(stiffness, hand)
-        records, run = run_once(loop, device, coupling, treatment, ticks_of(device))
-        yield replace(run, depth=deepest(loop, records))
-
-
-def peg_device(stiffness: float, hand: int) -> tuple[SimulatedDevice, Coupling]:
-    """Returns a hand (0 is the recorded one, others are seeds) and the coupling by K in N/m."""
-    per_k, rotational_damping = PEG_ROTATION
-    coupling = Coupling(stiffness, PEG_DAMPING, per_k * stiffness, rotational_damping)
-    path, holder = recorded() if hand == 0 else random_push(hand)
-    return firm_device(coupling, path, holder), coupling
-
-
-def ticks_of(device: SimulatedDevice) -> int:
-    """Returns the number of ticks of a hand's path."""
-    return int((device.info.duration or 0.0) / PERIOD)
-
-
-def run_once(
-    loop: ClosedLoop, device: SimulatedDevice, coupling: Coupling, treatment: Treatment, ticks: int
-) -> tuple[NDArray[np.void], ContactRun]:
-    """Returns a run's records, and its outcome without the depth."""
-    outcome = loop.run(
-        device,
-        coupling,
-        METHODS[treatment.method],
-        period=PERIOD,
-        ticks=ticks,
-        substeps=treatment.substeps,
-        keep_records=True,
-    )
-    run = ContactRun(
+def contact_run(outcome: LoopOutcome) -> ContactRun:
+    """Returns the summary of one outcome."""
+    deep = outcome.depths[outcome.depths > 0]
+    return ContactRun(
         outcome.environment,
         outcome.created,
         outcome.slack_share,
         outcome.first_active,
         outcome.peak_force,
-        0.0,
+        float(np.median(deep)) if deep.size else 0.0,
+        float(deep.max(initial=0.0)),
+        outcome.seconds / max(outcome.ticks, 1),
     )
-    return outcome.records, run
 
 
-def firm_device(coupling: Coupling, path: Motion, hand: Hand) -> SimulatedDevice:
-    """Returns a hand with a device that bears the coupling with a margin."""
-    half = PERIOD / 2
-    return SimulatedDevice(
-        damping=DEVICE_MARGIN * (coupling.stiffness * half + coupling.damping),
+def run_case(
+    treatment: Treatment, case: Case, *, keep_records: bool = False, same_law: bool = False
+) -> LoopOutcome:
+    """Runs a treatment on a rig in a hand.
+
+    Args:
+        treatment: Contact and method.
+        case: Rig, coupling, tool and hand.
+        keep_records: True returns the records.
+        same_law: True requests the coupling for which the method's law has the K and B' of
+            ``lossless``, and thus needs the same device. By default the requested K and B are equal
+            for all methods.
+    """
+    rig, period = RIGS[case.rig], treatment.period
+    loop = base.loop_in(rig.load, "contact")
+    treatment.apply(loop.scene, case)
+    path, hand = _path_and_hand(case)
+    per_k, rotational_damping = ROTATION
+    requested = Coupling(case.stiffness, rig.damping, per_k * case.stiffness, rotational_damping)
+    coupling, method = requested, METHODS[treatment.method].with_contact(treatment.contact)
+    if same_law:
+        law = METHODS["lossless"].law_coupling(requested, period)
+        coupling = method.requested_coupling(law, period)
+    device = SimulatedDevice(
+        damping=DEVICE_MARGIN * (requested.stiffness * period / 2 + requested.damping),
         rotational_damping=DEVICE_MARGIN
-        * (coupling.rotational_stiffness * half + coupling.rotational_damping),
-        hand=hand,
+        * (requested.rotational_stiffness * period / 2 + requested.rotational_damping),
+        hand=hand if hand is not None else scene_hand(loop.scene.model, loop.scene.path),
         path=path,
         force_limit=UNLIMITED.force,
         torque_limit=UNLIMITED.torque,
     )
+    return loop.run(
+        device,
+        coupling,
+        method,
+        period=period,
+        ticks=math.floor(path.duration / period),
+        substeps=treatment.substeps,
+        keep_records=keep_records,
+    )
 
 
-def set_mass(loop: ClosedLoop, body: str, mass: float) -> None:
-    """Sets the mass of a tool in kg."""
-    base.set_tool_mass(loop.scene.model, body, mass)
-    mujoco.mj_setConst(loop.scene.model, loop.scene.data)
+@cache
+def _path_and_hand(case: Case) -> tuple[Motion, Hand | None]:
+    """Returns path and hand; None is the hand that a shipped scene asks for."""
+    rig = RIGS[case.rig]
+    if rig.is_shipped and case.hand == 0:
+        return read_motion(scene_path(case.rig).with_suffix(".csv")).relative(), None
+    if case.rig == "wall" and case.hand in TAPPING:
+        path = base.swinging(0.008, TAPPING[case.hand], duration=1.0, count=301)
+        return path, Hand(stiffness=2000.0, damping=25.0)
+    random = np.random.default_rng(case.hand)
+    return rig.path(random), None if rig.is_shipped else _firm(random)
 
 
-def start_in_hole(model: mujoco.MjModel) -> None:
-    """Lets runs of ``peg_in_hole`` start with the peg in the hole."""
-    model.key_qpos[0, 2] = PEG_START
+TAPPING = {-1: 3.0, -2: 6.0}
+"""Frequencies in Hz of the hands −1 and −2 on the wall, slow and deep, and fast."""
 
 
-def deepest(loop: ClosedLoop, records: NDArray[np.void]) -> float:
-    """Returns the largest penetration in m, from the poses that were recorded."""
-    model, data = loop.scene.model, loop.scene.data
-    depth = 0.0
-    for row in records[records["contacts"] > 0][::DEPTH_EVERY]:
-        data.qpos[:3], data.qpos[3:7] = row["tool_position"], row["tool_quaternion"]
-        mujoco.mj_fwdPosition(model, data)
-        if data.ncon:
-            depth = max(depth, -float(data.contact.dist.min()))
-    return depth
+def in_period(treatment: Treatment, period: float) -> Treatment:
+    """Returns a treatment at another period T in s, with contacts that are as many steps long."""
+    time_constant, ratio = treatment.solref
+    solref = (time_constant * period / treatment.period, ratio)
+    return replace(treatment, period=period, solref=solref)

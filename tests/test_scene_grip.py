@@ -1,0 +1,83 @@
+"""Claims about what a hand may hold in a scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import pytest
+from cli_cases import Called
+from outside_scenes import mjcf, refusal_of, scene_file
+
+import hapticbridge as hb
+from hapticbridge.scene import grips
+from hapticbridge.whatif import what_if
+
+ARM = """<body name="base" pos="0 0 .5">
+  <geom name="plate" size=".05" mass="4"/>
+  <body name="upper" pos="0 0 .1"><joint name="shoulder" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
+    <site name="imu" pos=".1 0 0"/>
+    <body name="hand" pos=".3 0 0"><joint name="wrist" axis="0 1 0"/><joint type="slide"/>
+      <geom size=".02" pos=".04 0 0" mass=".2"/>
+      {site}
+    </body>
+  </body>
+</body>"""
+TURNED = "<default><site pos='1 2 3' euler='90 0 0'/></default>"
+
+
+def arm(site: str = "") -> str:
+    box = "<body pos='1 0 0'><freejoint/><geom size='.1' mass='50'/></body>"
+    return mjcf(TURNED, "<compiler angle='degree'/>", body=ARM.format(site=site), world=box)
+
+
+def test_without_a_grip_the_most_plausible_are_offered(tmp_path: Path, call: Called) -> None:
+    path = scene_file(tmp_path, arm('<site name="tcp"/>'))
+    found = [grip.name for grip in grips(mujoco.MjModel.from_xml_path(str(path)))]
+    assert found == ["tcp", "hand", "imu", "4", "upper"]
+    for command in ("run", "check"):
+        code, _, err = call(command, str(path))
+        words = " ".join(err.split())
+        assert code == 2
+        assert "no site or body 'grip' to hold; choose one (--grip" in words
+        assert "'tcp' (site of 'hand', 0.2 kg, 2 of 6 free), 'hand' (body, " in words
+        assert " and 1 more" in words
+    fixed = mjcf(body="<body name='shelf'><geom size='.01'/></body>")
+    assert refusal_of(tmp_path, fixed).endswith("nothing in it can move; give a body a joint")
+
+
+def test_grip_is_a_site_then_a_body_at_its_centre_of_mass_then_a_point(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, arm())
+    for grip, place in {
+        "hand": (0.34, 0, 0.6),
+        "hand@0,0,.1": (0.3, 0, 0.7),
+        "4": (1.0, 0, 0),
+        "4@-.1,0,1e-3": (0.9, 0, 0.001),
+    }.items():
+        pose = hb.load_scene(path, grip=grip).grip_pose()
+        assert pose == pytest.approx((*place, 1, 0, 0, 0), abs=1e-12), grip
+    both = scene_file(tmp_path, arm('<site name="hand" pos="0 0 0" euler="0 0 0"/>'))
+    with pytest.warns(UserWarning, match="'hand' is a site and a body, and the hand holds the"):
+        assert hb.load_scene(both, "hand").grip_pose()[:3] == pytest.approx((0.3, 0, 0.6))
+    for wrong in ("hand@", "hand@1,2", "hand@0,0,inf", "hand@a,b,c"):
+        assert "three finite numbers in m" in refusal_of(tmp_path, arm(), wrong)
+    for unknown in ("foot@0,0,0", "@0,0,0", "1"):
+        assert f"no site or body '{unknown}'" in refusal_of(tmp_path, arm(), unknown)
+
+
+def test_run_that_holds_a_point_of_a_body_is_simulated_again(tmp_path: Path, call: Called) -> None:
+    text = mjcf("<option gravity='0 0 0' noslip_iterations='2'/>", body=ARM.format(site=""))
+    path, file = scene_file(tmp_path, text), tmp_path / "run.mcap"
+    options = ("--fast", "--duration", "0.2", "--record", str(file))
+    code, out, err = call("run", str(path), "--grip", "hand@.04,0,.02", *options)
+    assert (code, "passive" in out) == (0, True), err
+    changes = ["integrator: Euler → discrete", "noslip_iterations: 2 → 0"]
+    assert f"options changed in the scene: {', '.join(changes)}" in err
+    assert json.loads(hb.read_recording(file).meta["scene_changes"]) == changes
+    report = hb.audit(file)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    ticks = hb.read_recording(file).ticks
+    assert ticks["tool_position"][0] == pytest.approx((0.34, 0, 0.62), abs=1e-5)
+    assert any("in every bit" in note for note in what_if(file, {}).notes)
