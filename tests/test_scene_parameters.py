@@ -197,7 +197,7 @@ def test_hole_of_the_planar_peg_is_20_mm_less_deep_than_the_peg_is_long(length: 
 def test_a_value_out_of_range_is_told_the_range_and_all_there_is(value: float) -> None:
     message = refusal("peg_in_hole", clearance=value)
     assert f"'clearance' of scene 'peg_in_hole' is {value!r}" in message
-    assert "5e-05 to 0.001 m" in message
+    assert "5e-06 to 0.001 m" in message
     assert "friction (0 to 1, default 0.42)" in message
     for wrong in (True, "1e-4", None, [1e-4]):
         assert "must be a number" in refusal("peg_in_hole", clearance=wrong)  # type: ignore[arg-type]
@@ -206,7 +206,7 @@ def test_a_value_out_of_range_is_told_the_range_and_all_there_is(value: float) -
 def test_an_unknown_name_is_told_what_exists(tmp_path: Path) -> None:
     message = refusal("peg_in_hole", clearence=1e-4)
     assert "no parameter 'clearence'" in message
-    assert "clearance (5e-05 to 0.001 m, default 0.0002)" in message
+    assert "clearance (5e-06 to 0.001 m, default 0.0002)" in message
     path = scene_with(tmp_path, "")
     assert refusal(path, mass=1.0).startswith("scene 'bench' has no parameters, so 'mass' cannot")
 
