@@ -30,8 +30,10 @@ def test_task_in_the_bridge_is_audited_passive(
     name: str, method: str, contact: str, tmp_path: Path
 ) -> None:
     file, device = tmp_path / "run.mcap", f"trajectory:{reference.MODELS / name / name}.csv"
-    rendering = {"method": method, "contact": contact, "clock": hb.SimulatedClock()}
-    with hb.Bridge(name, device, **rendering, recording=file) as bridge:
+    clock = hb.SimulatedClock()
+    with hb.Bridge(
+        name, device, method=method, contact=contact, clock=clock, recording=file
+    ) as bridge:
         summary = bridge.run(duration=8.0)
         assert not any(warning.number for warning in bridge.scene.data.warning)
         ended = bridge.scene.data.qpos.copy()
