@@ -349,8 +349,9 @@ def default_method(substeps: int = 1) -> Method:
     order: 0.49 % for 1 kg on a tendon with slack, where ``implicit`` errs by 2.5 %.
 
     ``implicit`` dissipates some energy on the way to a contact and ``lossless`` does not, so energy
-    created by contacts uses more slack: at most 7.2 % instead of 7.0 % when tapping on a wall, and
-    equal shares with jamming pegs (``scripts/bench_methods --same device``). Near contact
+    created by the scene's own contacts uses more slack: at most 1.2 % instead of 1.1 % when
+    tapping, and equal shares with jamming pegs (``scripts/bench_methods --same device``). Rigid
+    contacts create none by either. Near contact
     ``lossless`` adds K T to B', but reports K T/2. When tapping at 6 Hz it is 54 µm RMS off its
     reported effective coupling. ``implicit`` is 26 µm off its own report, B + K T/2, and 116 µm off
     B (``scripts/bench_front``).

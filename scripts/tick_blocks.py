@@ -50,7 +50,6 @@ def open_bridge(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
         clock=UnpacedClock(),
         pipelined=True,
         controller="damper",
-        clutch=0,
     )
     return stack.enter_context(bridge)
 

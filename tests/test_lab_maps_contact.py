@@ -116,7 +116,7 @@ def test_every_rig_touches_in_every_hand_and_moves_its_tool() -> None:
         for case in contact.cases_of(name)[:2]:
             outcome = rigs.run_case(rigs.RIGID, case, keep_records=True)
             assert (outcome.depths > 0).mean() > 0.02, case
-            assert outcome.peak_force > 1.0, case
+            assert outcome.peak_force > 0.3, case
             assert np.ptp(outcome.records["tool_position"], axis=0).max() > 1e-4, case
 
 

@@ -86,7 +86,7 @@ def norms(wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("name", "values", "first", "least"), HANDS, ids=str)
 def test_hands_leave_it_whole(name: str, values: Values, first: float, least: int) -> None:
-    loop = ClosedLoop(hb.load_scene(name, "grip", **values))
+    loop = ClosedLoop(hb.load_scene(name, "grip", as_is=False, **values))
     contacts, strongest, worst = 0, -1.0, 0
     begin = SEED.get(name, 0)
     for seed in range(begin, begin + 8):
@@ -107,7 +107,7 @@ def test_hands_leave_it_whole(name: str, values: Values, first: float, least: in
 def within_limits(name: str, values: Values, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Runs the bridge as its user does; returns what it sent, shape (n, 6), and its flags."""
     device = SimulatedDevice(path=motion)
-    scene = hb.load_scene(name, "grip", **values)
+    scene = hb.load_scene(name, "grip", as_is=False, **values)
     with hb.Bridge(scene, device, clock=hb.SimulatedClock()) as bridge:
         summary = bridge.run(duration=motion.duration)
         rows = bridge.latest_records(round(motion.duration / T))
@@ -131,7 +131,7 @@ def test_both_ends_of_a_parameter_are_strict_in_any_hand(
 ) -> None:
     used = 0
     for value in (parameter.minimum, parameter.maximum):
-        loop = ClosedLoop(hb.load_scene(name, "grip", **{parameter.name: value}))
+        loop = ClosedLoop(hb.load_scene(name, "grip", as_is=False, **{parameter.name: value}))
         for seed in (0, 7):
             rows = random_motion(seed, first=FIRST.get(name, 0.0)).table
             towards = smooth(rows[:, :1]) * np.array(TOWARDS.get(name, [0.0, 0.0, 0.0]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import mujoco
 import numpy as np
@@ -76,6 +76,10 @@ class Phase:
     height: Callable[[Array], Array]
 
 
+def height_of(solution: Callable[[Array], Array], t: Array) -> Array:
+    return np.asarray(solution(t)[0])
+
+
 @cache
 def phases() -> list[Phase]:
     """Returns free and held phases: m x'' = K (h − x) + B (h' − x') down to an inelastic floor."""
@@ -86,7 +90,7 @@ def phases() -> list[Phase]:
             motion, (time, END + 0.1), [height, 0.0], events=touches, rtol=1e-10, atol=1e-13,
             dense_output=True,
         )  # fmt: skip
-        found.append(Phase(time, flight.t[-1], lambda t, s=flight.sol: s(t)[0]))
+        found.append(Phase(time, flight.t[-1], partial(height_of, flight.sol)))
         time = flight.t[-1]
         pulls = np.flatnonzero([pull(t) > 0 for t in np.arange(time, END + 1, 1e-3)])
         release = brentq(pull, time + 1e-3 * (pulls[0] - 1), time + 1e-3 * pulls[0])
@@ -117,12 +121,12 @@ def flown(period: float, method: str, contact: str) -> tuple[Array, Array]:
     prepare(scene, coupling, period, 1, chosen, warns=False)
     parameters = unlimited(scene, coupling, period, scheme=chosen.scheme, is_rigid=chosen.is_rigid)
     run = run_of(scene, BoundKernel(scene.model, scene.data, parameters), parameters)
-    time = period * np.arange(1, round(END / period) + 1)
+    time = np.asarray(period * np.arange(1.0, round(END / period) + 1.0), dtype=np.float64)
     places = np.zeros((len(time), 3))
     places[:, 2] = handle(time) - start
     run.ticks = np.zeros(len(time), TICK_DTYPE)
     assert simulate(run.binding.state, samples_of(places), run.binding.row, run.ticks) == len(time)
-    return time, run.ticks["tool_position"][:, 2].copy()
+    return time, np.array(run.ticks["tool_position"][:, 2], dtype=np.float64)
 
 
 def errors(period: float, method: str, contact: str = "rigid") -> Array:

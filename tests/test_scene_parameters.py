@@ -65,7 +65,7 @@ def scene_with(folder: Path, text: str) -> Path:
 
 def refusal(path: str | Path, **values: float) -> str:
     with pytest.raises(hb.SceneError) as caught:
-        load_scene(path, "grip", **values)
+        load_scene(path, "grip", as_is=False, **values)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -117,7 +117,7 @@ def test_numbers_add_up(tmp_path: Path, values: dict[str, float], stiffness: flo
     more = table(SLIDE + ", factor = 1000.0 }", default="0.03")
     less = table(SLIDE + ", offset = 20, factor = -1000.0 }", name="less", default="0.03")
     path = scene_with(tmp_path, more + less)
-    scene = load_scene(path, "grip", **values)
+    scene = load_scene(path, "grip", as_is=False, **values)
     assert scene.model.joint("slide").stiffness[0] == pytest.approx(stiffness, rel=1e-12)
     assert scene.parameters == {"gap": 0.03, "less": 0.03} | values
 
@@ -132,7 +132,10 @@ FIELDS = (
 def test_a_shipped_default_gives_the_scene_of_the_file(
     name: str, parameter: scenes.Parameter
 ) -> None:
-    plain, asked = load_scene(name), load_scene(name, "grip", **{parameter.name: parameter.default})
+    plain, asked = (
+        load_scene(name),
+        load_scene(name, "grip", as_is=False, **{parameter.name: parameter.default}),
+    )
     assert plain.parameters == asked.parameters
     for field in FIELDS:
         expected = pytest.approx(getattr(plain.model, field), rel=1e-9, abs=1e-12)
@@ -143,8 +146,8 @@ def test_a_shipped_default_gives_the_scene_of_the_file(
 def test_both_ends_of_a_shipped_range_load_and_differ(
     name: str, parameter: scenes.Parameter
 ) -> None:
-    low = load_scene(name, "grip", **{parameter.name: parameter.minimum})
-    high = load_scene(name, "grip", **{parameter.name: parameter.maximum})
+    low = load_scene(name, "grip", as_is=False, **{parameter.name: parameter.minimum})
+    high = load_scene(name, "grip", as_is=False, **{parameter.name: parameter.maximum})
     assert low.parameters[parameter.name] == parameter.minimum
     assert compiled_model(low.model) != compiled_model(high.model)
     assert parameter.about

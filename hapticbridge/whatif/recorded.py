@@ -219,7 +219,7 @@ class RecordedRun:
         values = {n: v for n, v in settings.scene.items() if defaults.get(n) != v}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-            return load_scene(self.scene_file, self.parameters.grip, **values)
+            return load_scene(self.scene_file, self.parameters.grip, as_is=False, **values)
 
     def is_scene_as_recorded(self) -> bool:
         """Returns True if the attached sources compile to the recorded model.

@@ -11,6 +11,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion
+from hapticbridge.device.trajectory import read_motion
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart.engine_run import EngineRun, work_of
 from hapticbridge.lab.chart.scene_run import (
@@ -24,9 +26,9 @@ from hapticbridge.lab.chart.scene_run import (
 from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.engines.base import open_engine
-from hapticbridge.lab.maps.contact_rigs import PEG_START, peg_device, random_push, recorded
+from hapticbridge.lab.maps.contact_rigs import ROTATION
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene import Scene, load_scene, scene_path
 
 HOME = np.array([0.0, 0.0, 0.04])
 """Start of the peg's centre in m, 10 mm above the mouth."""
@@ -270,6 +272,38 @@ class PegInHole(Staged):
         )
 
 
+JAM_DAMPING = 0.5
+"""Damping B in N s/m; low, so that the coupling hides little of the created energy."""
+
+JAM_START = 0.005
+"""Height of the peg's centre at the start in m: 25 mm of the 60 mm peg stand in the hole."""
+
+RECORDED = (3.5, 6.0)
+"""Part of the recorded hand in s: into the hole, to the bottom, and pressing to the sides."""
+
+
+def jamming_path(hand: int) -> Motion:
+    """Returns the path of a hand in the hole: 0 is the recorded one, others are seeds.
+
+    A random hand moves by up to 8 mm and 0.15 rad, at 0.5 to 3 Hz, for 2 s.
+    """
+    if hand == 0:
+        table = read_motion(scene_path("peg_in_hole").with_suffix(".csv")).table
+        rows = table[(table[:, 0] >= RECORDED[0]) & (table[:, 0] <= RECORDED[1])]
+        return Motion(rows[:, 0], rows[:, 1:4], rows[:, 4:]).relative()
+    random, time = np.random.default_rng(hand), np.linspace(0.0, 2.0, 81)
+
+    def smooth(size: float) -> NDArray[np.float64]:
+        frequency, phase = random.uniform(0.5, 3.0, 5), random.uniform(0, 2 * np.pi, 5)
+        angle = 2 * np.pi * frequency[:, None] * time + phase[:, None]
+        waves = random.normal(size=5) @ (np.sin(angle) - np.sin(phase)[:, None])
+        return np.asarray(size * waves / np.abs(waves).max())
+
+    place = np.column_stack([smooth(8e-3) for _ in range(3)])
+    turn = Rotation.from_rotvec(np.column_stack([smooth(0.15), smooth(0.15), smooth(0.1)]))
+    return Motion(time, place, turn.as_quat(canonical=True, scalar_first=True))
+
+
 @dataclass(frozen=True, slots=True)
 class JammedPeg:
     """A peg that a hand jams in its hole, for the bridge and for other engines.
@@ -280,7 +314,7 @@ class JammedPeg:
     Attributes:
         mass: Mass of the peg in kg.
         friction: Coulomb's coefficient, without unit.
-        stiffness: K in N/m; the rest of the coupling is that of the map ``contact``.
+        stiffness: K in N/m; the rotation's gains are those of the map ``contact``.
         hand: 0 for the recorded hand, otherwise the seed of a random one.
     """
 
@@ -295,10 +329,10 @@ class JammedPeg:
         Raises:
             HapticBridgeError: The method cannot render the scene, or the engine is not installed.
         """
-        motion, _ = recorded() if self.hand == 0 else random_push(self.hand)
-        _, coupling = peg_device(self.stiffness, self.hand)
+        motion = jamming_path(self.hand)
+        coupling = Coupling(self.stiffness, JAM_DAMPING, ROTATION[0] * self.stiffness, ROTATION[1])
         scene = load_scene("peg_in_hole", mass=self.mass, friction=self.friction)
-        scene.model.key_qpos[0, 2] = PEG_START
+        scene.model.key_qpos[0, 2] = JAM_START
         path, ticks = path_of(motion), round(motion.duration / setting.period)
         duration = ticks * setting.period
         if setting.engine != OWN:

@@ -26,14 +26,12 @@ SHIPPED = "as shipped"
 
 PYRAMIDAL = "pyramidal cone"
 SOFT = "soft"
-DIRECT_CONTACT = "direct"
 
 CONTACTS: dict[str, tuple[float, float] | None] = {
     SHIPPED: None,
     "2 steps": (2.0, 1.0),
     "damped": (0.5, 8.0),
     SOFT: None,
-    DIRECT_CONTACT: None,
     PYRAMIDAL: None,
 }
 """Contact settings by name; a pair is (timeconst in time steps, dampratio). ``2 steps`` is what the
@@ -42,16 +40,8 @@ shipped scenes have at 1 kHz, ``damped`` the setting that ``scene.contacts`` cal
 SOFT_SOLREF = (0.02, 1.0)
 """MuJoCo's default: timeconst in s and dampratio."""
 
-DIRECT_SOLREF = (-1e6, -2e3)
-"""Contact stiffness and damping in 1/s² and 1/s, as MuJoCo's negative solref. They are those of
-timeconst 1 ms and dampratio 1, four times as stiff as ``2 steps`` at 1 kHz. MuJoCo raises a time
-constant below two steps, but leaves these values. In one of twenty random hands a peg in its hole
-then creates 0.5 mJ, 9 % of the slack, where ``2 steps`` creates nothing."""
-
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 """Impedance of the named settings, that of the shipped scenes and MuJoCo's default."""
-
-_GIVEN = {SOFT: SOFT_SOLREF, DIRECT_CONTACT: DIRECT_SOLREF}
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,8 +126,8 @@ class ShippedOptions:
         in_steps = CONTACTS[setting.contact]
         if in_steps is not None:
             solref = _numbers((in_steps[0] * setting.timestep, in_steps[1]))
-        elif setting.contact in _GIVEN:
-            solref = _numbers(_GIVEN[setting.contact])
+        elif setting.contact == SOFT:
+            solref = _numbers(SOFT_SOLREF)
         if setting.contact not in (SHIPPED, PYRAMIDAL):
             solimp = _numbers(SOLIMP)
         is_pyramidal = setting.contact == PYRAMIDAL or self.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
@@ -165,8 +155,8 @@ class ShippedOptions:
         if in_steps is not None:
             model.geom_solref[:] = (in_steps[0] * setting.timestep, in_steps[1])
             model.geom_solimp[:] = SOLIMP
-        elif setting.contact in _GIVEN:
-            model.geom_solref[:] = _GIVEN[setting.contact]
+        elif setting.contact == SOFT:
+            model.geom_solref[:] = SOFT_SOLREF
             model.geom_solimp[:] = SOLIMP
 
 

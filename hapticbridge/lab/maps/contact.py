@@ -160,7 +160,8 @@ Array = NDArray[np.float64]
 def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     """Draws verdicts over timeconst and dampratio with the rule, and the comparison below."""
     figure = new_figure(8, 14)
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 0.95))
+    parts = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 0.95))
+    above, below = parts[:, 0]
     rows = above.add_gridspec(2, 3)
     for column, (rig, method, stiffness, title) in enumerate(PANELS):
         for row, k in enumerate(stiffness):
@@ -172,8 +173,7 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
             if column == 0:
                 axes.set_ylabel("dampratio")
     panels = below.subplots(2, 2, height_ratios=(1, 1.6))
-    everywhere = [one for one in boundary["compared"] if not one["rig"]]
-    _draw_bars(panels[0, 0], everywhere)
+    _draw_bars(panels[0, 0], [one for one in boundary["compared"] if not one["rig"]])
     _draw_energy(panels[0, 1])
     _draw_depths(panels[1, 0], boundary["compared"], "median_depth", "median penetration in µm")
     _draw_depths(panels[1, 1], boundary["compared"], "largest_depth", "largest penetration in µm")
@@ -218,20 +218,14 @@ def _draw_energy(axes: Axes) -> None:
 
 
 def _draw_depths(axes: Axes, found: Sequence[Mapping[str, Any]], quantity: str, words: str) -> None:
+    depth = {(one["treatment"], one["rig"]): 1e6 * one[quantity] for one in found}
     for place, treatment in enumerate(TREATMENTS):
-        depths = [
-            1e6 * next((o[quantity] for o in found if _is(o, treatment, rig)), np.nan)
-            for rig in COMPARED_RIGS
-        ]
+        depths = [depth.get((treatment, rig), np.nan) for rig in COMPARED_RIGS]
         axes.plot(np.maximum(depths, 1e-4), COMPARED_RIGS, "osv^D"[place], ms=4, label=treatment)
     axes.set(xscale="log", xlabel=words)
     axes.invert_yaxis()
-    if quantity == "median_depth":
-        axes.legend(fontsize="x-small")
-
-
-def _is(one: Mapping[str, Any], treatment: str, rig: str) -> bool:
-    return bool(one["treatment"] == treatment and one["rig"] == rig)
+    if quantity == "largest_depth":
+        axes.legend(fontsize="x-small", loc="upper left")
 
 
 def _legend(figure: Figure, verdicts: Sequence[int]) -> None:

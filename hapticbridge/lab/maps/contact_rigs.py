@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, partial
 
 import mujoco
@@ -434,10 +434,3 @@ def _path_and_hand(case: Case) -> tuple[Motion, Hand | None]:
 
 TAPPING = {-1: 3.0, -2: 6.0}
 """Frequencies in Hz of the hands −1 and −2 on the wall, slow and deep, and fast."""
-
-
-def in_period(treatment: Treatment, period: float) -> Treatment:
-    """Returns a treatment at another period T in s, with contacts that are as many steps long."""
-    time_constant, ratio = treatment.solref
-    solref = (time_constant * period / treatment.period, ratio)
-    return replace(treatment, period=period, solref=solref)
