@@ -294,14 +294,16 @@ SEATED = -0.0165  # m, of the hand: half a millimetre beyond the key's shoulder
 TRIED = 15.0  # degrees that a hand turns to try; the lock lets it or not
 
 
-def tried(pushed: float = SEATED, **values: float) -> tuple[float, float]:
+def tried(
+    pushed: float = SEATED, bitting_error: float = 0.0, clearance: float = 1e-4
+) -> tuple[float, float]:
     """Pushes the key in, turns the hand by 15 degrees; returns plug in degrees, torque in N m."""
     times = np.linspace(0.0, 1.9, 191)
     s = np.clip([times, (times - 1.2) / 0.7], 0.0, 1.0)
     push, turn = s**3 * (10 - 15 * s + 6 * s**2)
     turns = Rotation.from_rotvec(np.outer(turn, [-np.radians(TRIED), 0.0, 0.0]))
     hand = Motion(times, np.outer(push, [pushed, 0.0, 0.0]), turns.as_quat(scalar_first=True))
-    scene = hb.load_scene("lock", **values)
+    scene = hb.load_scene("lock", bitting_error=bitting_error, clearance=clearance)
     with hb.Bridge(scene, TrajectoryDevice(hand), clock=hb.SimulatedClock()) as bridge:
         assert bridge.run(duration=1.9).environment == "strict"
         torque = bridge.latest_records(1)["wrench_on_tool"][0, 3]
