@@ -225,7 +225,7 @@ def _draw_depths(axes: Axes, found: Sequence[Mapping[str, Any]], quantity: str, 
     axes.set(xscale="log", xlabel=words)
     axes.invert_yaxis()
     if quantity == "largest_depth":
-        axes.legend(fontsize="x-small", loc="upper left")
+        axes.legend(fontsize="x-small", ncols=2, loc="upper right", bbox_to_anchor=(1.0, -0.2))
 
 
 def _legend(figure: Figure, verdicts: Sequence[int]) -> None:
