@@ -162,7 +162,7 @@ class Done:
 def default_run(name: str, **values: float) -> Done:
     joints: list[Array] = []
     deepest: list[float] = []
-    scene = hb.load_scene(name, **values)
+    scene = hb.load_scene(name, "grip", as_is=False, **values)
     with hb.Bridge(scene, "simulated", clock=hb.SimulatedClock()) as bridge:
 
         def observe(_: object) -> None:
