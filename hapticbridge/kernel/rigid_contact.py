@@ -62,8 +62,8 @@ IMPRATIO = 1000.0
 creeps less below the limit of friction: 3 nm/s at half of it where 100 creeps by 31 nm/s (3 N on
 0.1 kg)."""
 
-MARGIN = 1.5e-4
-"""Distance in m at which a contact takes part in the step before it closes. A tool at 0.15 m/s
+MARGIN = 3e-4
+"""Distance in m at which a contact takes part in the step before it closes. A tool at 0.3 m/s
 moves so far in 1 ms. Faster contacts are first seen in penetration, which the tank then pays for.
 A larger margin costs time for contacts without force."""
 
