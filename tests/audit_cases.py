@@ -124,7 +124,8 @@ def without_model(recording: Recording) -> Recording:
 
 def without_share(recording: Recording) -> NDArray[np.void]:
     """Returns the records as an earlier version wrote them."""
-    names = [name for name in recording.ticks.dtype.names or () if name != "share"]
+    later = ("share", "contact_tank")
+    names = [name for name in recording.ticks.dtype.names or () if name not in later]
     record = np.dtype([(name, recording.ticks.dtype[name]) for name in names])
     ticks = np.zeros(len(recording.ticks), record)
     for name in names:

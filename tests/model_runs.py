@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from hapticbridge.kernel.codes import HANDLE
+
 Array: TypeAlias = NDArray[np.float64]
 Edit: TypeAlias = Callable[[Any], None]
 
@@ -46,12 +48,12 @@ def scene_with_handle(name: str, edit: Edit | None = None) -> tuple[Any, Any]:
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
     mujoco.mj_forward(model, data)
     position = data.site("grip").xpos.copy()
-    handle = spec.worldbody.add_body(name="handle", mocap=True, pos=position)
-    handle.add_site(name="handle")
+    handle = spec.worldbody.add_body(name=HANDLE, mocap=True, pos=position)
+    handle.add_site(name=HANDLE)
     for axis in range(6):
         stiffness, damping = (K, B) if axis < 3 else (K_R, B_R)
         kind = mujoco.mjtTrn.mjTRN_SITE
-        actuator = spec.add_actuator(trntype=kind, target="grip", refsite="handle")
+        actuator = spec.add_actuator(trntype=kind, target="grip", refsite=HANDLE)
         actuator.gear = np.eye(6)[axis]
         actuator.gainprm[0] = damping
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE

@@ -84,7 +84,7 @@ def active_by_method(folder: Path) -> Path:
 def active_by_contact(folder: Path) -> Path:
     """A ball pushed onto a floor that is far stiffer than the step resolves."""
     path, device = folder / "floor.mcap", ScriptedDevice(_tapping)
-    return made_in(path, HARD_FLOOR, device, LOOSE, duration=1.0)
+    return made_in(path, HARD_FLOOR, device, LOOSE, duration=1.0, contact="scene")
 
 
 def _held_to_an_anvil(path: Path, stiffness: float, duration: float, **sheet: Any) -> Path:
@@ -116,7 +116,8 @@ def active_by_quantisation(folder: Path) -> Path:
 def active_by_mocap(folder: Path) -> Path:
     """A body that is put elsewhere tick by tick and knocks against a tool at rest."""
     path, device = folder / "push.mcap", ScriptedDevice(_resting)
-    return made_in(path, PUSHED, device, LOOSE, duration=0.05, on_tick=_knock("pusher"))
+    options = {"duration": 0.05, "on_tick": _knock("pusher"), "contact": "scene"}
+    return made_in(path, PUSHED, device, LOOSE, **options)
 
 
 def active_beside_a_fan(folder: Path) -> Path:
@@ -124,7 +125,8 @@ def active_beside_a_fan(folder: Path) -> Path:
     path, device = folder / "fan.mcap", ScriptedDevice(_tapping)
     fan = '<body name="fan" mocap="true" pos="1 0 0"><geom size="0.02"/></body>'
     floor = HARD_FLOOR.replace("<worldbody>", f"<worldbody>{fan}")
-    return made_in(path, floor, device, LOOSE, duration=0.06, on_tick=_knock("fan", 1.0))
+    options = {"duration": 0.06, "on_tick": _knock("fan", 1.0), "contact": "scene"}
+    return made_in(path, floor, device, LOOSE, **options)
 
 
 def active_by_rotation(folder: Path) -> Path:

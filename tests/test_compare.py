@@ -205,9 +205,9 @@ def test_a_recording_without_the_share_is_compared_and_exported_in_what_it_holds
         found = compare(*pair)
         assert found.is_same
         assert found.compared == len(recording.ticks)
-        assert found.notes == (f"{old} is of an earlier version, without share",)
+        assert found.notes == (f"{old} is of an earlier version, without share, contact_tank",)
     written = export(old, "csv").files[0].read_text().splitlines()
     assert len(written) == len(recording.ticks) + 1
     assert written[0].endswith("injected_rotational_damping")
     target = export(tap, "csv", tmp_path / "new.csv").files[0]
-    assert target.read_text().splitlines()[0].endswith(",share")
+    assert target.read_text().splitlines()[0].endswith(",share,contact_tank")

@@ -37,8 +37,8 @@ def test_behind_the_coupling_the_limit_is_that_of_6_at_every_length(length: floa
     found = geometry.evaluate(
         {"what": "limit", "method": "implicit", "length": length, "stiffness": 0.0}
     )
-    # 2 (b_θ − B_r)/T = 3; the peg's and its contacts' own give leave 3 %, always on the safe side
-    assert 3.0 <= float(found["limit"]) <= 3.1
+    # 2 (b_θ − B_r)/T = 3; the peg and its contacts give by 3 %, and the search is 0.2 % wide
+    assert 2.99 <= float(found["limit"]) <= 3.1
 
 
 @pytest.mark.parametrize("length", geometry.LENGTH)

@@ -260,5 +260,6 @@ def energy_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[D
         if name not in (ticks.dtype.names or ()):
             continue  # recorded by an earlier version, with the contacts of the scene
         amount = np.abs(ticks[name] - getattr(balance, name))
-        allowed = TOLERANCE * (1 + throughput + np.abs(ticks["potential"]))
+        size = throughput + np.abs(ticks["potential"]) + np.abs(balance.environment_energy)
+        allowed = TOLERANCE * (1 + size)
         yield Deviation(name, amount, allowed, "J", "recorded poses and wrenches")

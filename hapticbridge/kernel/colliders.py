@@ -112,7 +112,7 @@ def box_box(model: int, data: int, contacts: int, first: int, second: int, margi
 @compiled
 def round_flat(model: int, data: int, contacts: int, first: int, second: int, margin: float) -> int:
     """Finds the contact points of a capsule or cylinder with a box or mesh, as ``box_box``."""
-    count = int(_mjc_convex(model, data, contacts, first, second, margin))
+    count = int(_mjc_convex(model, data, contacts, first, second, margin)) + 0  # 64 bits
     if count == 0 or not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return count
     points = floats(contacts, POINT * count)
@@ -240,7 +240,7 @@ def _face_along(flat: Any, placed: Any, n: Any) -> tuple[float, float, float]:
 @compiled
 def flat_flat(model: int, data: int, contacts: int, first: int, second: int, margin: float) -> int:
     """Finds the contact points of a box or mesh with a mesh, as ``box_box``."""
-    count = int(_mjc_convex(model, data, contacts, first, second, margin))
+    count = int(_mjc_convex(model, data, contacts, first, second, margin)) + 0  # 64 bits
     if count == 0 or not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return count
     one, other = _flat(model, first), _flat(model, second)

@@ -91,7 +91,7 @@ class FaultyDevice:
     """
 
     def __init__(self, inner: SimulatedDevice) -> None:
-        self.inner, self.info = inner, inner.info
+        self.inner, self.info = inner, replace(inner.info, buttons=None)
         self.corrupt: Callable[[int, NDArray[np.void]], int] = lambda _tick, _sample: 0
         self.refuse: Callable[[int, NDArray[np.float64]], None] = lambda _tick, _wrench: None
         self.tick = -1
