@@ -204,7 +204,7 @@ SHOWN: list[tuple[str, slice, int, float, float]] = [
     ("round_peg", END, 2, HOME_HEIGHT, 1e-3),
     ("drawer", slice(3800, 4300), 0, 0.2, 1e-4),
     ("drawer", END, 0, -0.001, 1e-4),
-    ("hammer", END, 0, -7.2e-3, 0.4e-3),
+    ("hammer", END, 0, -6.5e-3, 0.4e-3),
     ("open_wrench", END, 0, math.radians(60.0), math.radians(2.0)),
     *(("open_wrench", END, joint, 0.0, 2e-4) for joint in (2, 3, 4)),
     ("ratchet", END, 0, math.radians(-88.0), math.radians(2.0)),

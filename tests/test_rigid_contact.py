@@ -317,11 +317,11 @@ def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
 
 
 def drumming(count: int) -> np.ndarray:
-    """Returns samples of a hand that drums on the floor at 40 Hz, too fast for an empty tank."""
+    """Returns samples of a hand that drums on the floor at 20 Hz, too fast for an empty tank."""
     time = T * np.arange(1, count + 1)
     places, turns = np.zeros((count, 3)), np.zeros((count, 3))
     places[:, 0] = 0.004 * np.sin(2 * np.pi * 1.3 * time)
-    places[:, 2] = 0.004 * np.sin(2 * np.pi * 40 * time) * np.minimum(time / 0.1, 1.0) - 0.002
+    places[:, 2] = 0.02 * np.sin(2 * np.pi * 20 * time) * np.minimum(time / 0.1, 1.0) - 0.01
     turns[:, 1] = 0.1 * np.sin(9 * time)
     return samples_of(places, Rotation.from_rotvec(turns))
 

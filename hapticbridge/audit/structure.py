@@ -242,7 +242,7 @@ def _flag_faults(
         (TickFlag.CONTACT, is_touching, is_touching),
         (TickFlag.CLUTCH, is_released, is_released),
         (TickFlag.RAMPING, is_partial, is_partial),
-        (TickFlag.CONTROLLER_ACTIVE, none, every & controls),
+        (TickFlag.CONTROLLER_ACTIVE, none, every & (controls or math.isfinite(guarding.energy))),
         (TickFlag.SWINGING, none, every & math.isfinite(guarding.swing_energy)),
         (TickFlag.RUNS_AWAY, none, every & math.isfinite(guarding.runaway_speed)),
         (TickFlag.PROBED, none, every & math.isfinite(guarding.runaway_speed)),
