@@ -93,8 +93,8 @@ works in J. Wrenches (force in N, torque in N m) are in the world frame about th
 and ``injected_rotational_damping`` in N m s/rad are the passivity controller's largest on any axis
 of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
 the wrench that was sent, and of the device's motion to the next sample that the handle makes.
-``contact_tank`` is the energy that may pay for the depenetration of rigid contacts (``kernel.
-rigid_contact``)."""
+``contact_tank`` is the energy in J that may pay for the depenetration of rigid contacts
+(``kernel.rigid_contact``)."""
 
 LATER_FIELDS = ("share", "contact_tank")
 """Fields that recordings of earlier versions lack; such a recording is read without them.

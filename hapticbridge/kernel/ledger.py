@@ -82,8 +82,7 @@ ENERGY_DTYPE = np.dtype(
 )
 """Sub-record ``energy``, written by this module alone. Energies and works in J, since the start;
 ``first_*`` are the ticks at which a condition first failed, -1 before; ``step_*`` are works of the
-newest step; the last two hold what a
-moved mocap body leaves until the step is done."""
+newest step; the last two hold what a moved mocap body leaves until the step is done."""
 
 
 def start_energies(energy: Part) -> None:
