@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -225,7 +226,7 @@ def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: P
     assert hb.audit(tmp_path / "run.mcap").verdict == "passive"
     with (
         started(tmp_path, BEYOND_ITS_LIMIT, contact="scene") as bridge,
-        pytest.raises(hb.SafetyTrip, match="energy|stretch"),
+        pytest.raises(hb.SafetyTrip, match=r"energy|stretch"),
     ):
         bridge.run(duration=0.5)
 
@@ -284,6 +285,81 @@ def test_servo_holds_the_pose_of_a_keyframe_without_controls(tmp_path: Path) -> 
     for text, as_is in ((SERVO_ARM.format(' ctrl="0.1"'), False), (SERVO_ARM.format(""), True)):
         with (
             started(tmp_path, text, as_is=as_is) as bridge,
-            pytest.raises(hb.SafetyTrip, match="energy|stretch"),
+            pytest.raises(hb.SafetyTrip, match=r"energy|stretch"),
         ):
             bridge.run(duration=0.5)
+
+
+# Equality constraints and limits of tendons that are in error at the start
+
+_BAR = '<geom type="capsule" fromto="0 0 0 {}" size=".01" mass=".1" contype="0" conaffinity="0"/>'
+_BALL = (
+    '<body name="t" pos="0 0 .1"><freejoint/><geom size=".02" mass=".1"/><site name="grip"/></body>'
+)
+_STRETCHED = {
+    "connect": (
+        f"""<body><joint axis="0 1 0"/>{_BAR.format("0 0 .2")}
+          <body pos="0 0 .2"><joint axis="0 1 0"/>{_BAR.format(".2 0 0")}
+            <site name="grip" pos=".1 0 0"/>
+            <body pos=".2 0 0"><joint axis="0 1 0"/>{_BAR.format("0 0 -.2")}
+              <site name="a" pos=".005 0 -.2"/></body></body></body>
+          <site name="b" pos=".2 0 0"/>""",
+        '<equality><connect site1="a" site2="b" {0}/></equality>',
+    ),
+    "joint": (
+        """<body pos="0 0 .1"><joint name="j" type="slide"/><geom size=".02" mass=".1"/>
+             <site name="grip"/></body>
+           <body pos="0 .2 .1"><joint name="k" type="slide"/><geom size=".02" mass=".3"/></body>""",
+        '<equality><joint joint1="j" joint2="k" polycoef=".005 1 3 0 0" {0}/></equality>',
+    ),
+    "weld": (
+        f'{_BALL}<body name="x" pos="0 .1 .1"><freejoint/><geom size=".02" mass=".2"/></body>',
+        '<equality><weld body1="t" body2="x" relpose=".005 .1 0 1 0 0 0" {0}/></equality>',
+    ),
+    "limit of a tendon": (
+        f'{_BALL}<site name="w" pos="0 0 .3"/>',
+        """<tendon><spatial range="0 .195" {1}><site site="w"/><site site="grip"/></spatial>
+           </tendon>""",
+    ),
+    "tendon": (
+        f'{_BALL}<site name="w" pos="0 0 .3"/>',
+        """<tendon><spatial name="T"><site site="w"/><site site="grip"/></spatial></tendon>
+           <equality><tendon tendon1="T" polycoef="-.005 0 0 0 0" {0}/></equality>""",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", _STRETCHED)
+@pytest.mark.parametrize("solref", ["0.02 1", "0.002 1", "-20000 -50"])
+def test_error_at_the_start_creates_no_energy_with_rigid_constraints_alone(
+    tmp_path: Path, kind: str, solref: str
+) -> None:
+    body, constraint = _STRETCHED[kind]
+    constraint = constraint.format(f'solref="{solref}"', f'solreflimit="{solref}"')
+    text = f'<mujoco><option gravity="0 0 0"/><worldbody>{body}</worldbody>{constraint}</mujoco>'
+    with started(tmp_path, text) as bridge:
+        assert bridge.run(duration=0.5).environment == "strict"
+    assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+    # MuJoCo's own constraint pulls the error together, which no port pays
+    with started(tmp_path, text, contact="scene") as bridge:
+        with suppress(hb.SafetyTrip):
+            bridge.run(duration=0.5)
+        assert bridge.ledger.first_active is not None
+
+
+def test_body_welded_to_a_moved_mocap_body_follows_and_its_mover_pays(tmp_path: Path) -> None:
+    text = f"""<mujoco><worldbody><body name="m" mocap="true" pos="0 .2 .1"/>{_BALL}
+      <body name="x" pos="0 .2 .1"><freejoint/><geom size=".02" mass=".2"/></body></worldbody>
+      <equality><weld body1="m" body2="x"/></equality></mujoco>"""
+    with started(tmp_path, text) as bridge:
+
+        def lift(tick: int) -> None:
+            if tick < 1000:
+                bridge.set_input(mocap={"m": [0.0, 0.2, 0.1 + 1e-4 * tick]})
+
+        summary = bridge.run(duration=1.2, on_tick=lift)
+        assert summary.environment == "strict"
+        # 0.1 m/s over the five steps in which a share of 0.2 removes an error
+        assert bridge.scene.data.body("x").xpos[2] == pytest.approx(0.1999, abs=6e-4)
+        weight = 0.2 * 9.81 * 0.0999
+        assert bridge.ledger.external_work == pytest.approx(weight, rel=0.02)
