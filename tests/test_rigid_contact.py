@@ -94,6 +94,17 @@ LIFT = (
   </worldbody>
 </mujoco>"""
 )
+WELDED = (
+    HEAD
+    + """
+    <body name="tool" pos="0 0 0.0305"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="{mass}"/><site name="grip"/></body>
+    <body name="plate" mocap="true"/>
+    <body name="hand"><freejoint/><geom type="box" size="0.03 0.03 0.02" mass="0.2"/></body>
+  </worldbody>
+  <equality><weld body1="hand" body2="plate"/></equality>
+</mujoco>"""
+)
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
 
 
@@ -242,14 +253,23 @@ def test_a_file_with_a_hasty_solver_is_solved_as_mujoco_does(
     assert not all(results[True])
 
 
-def test_a_moving_mocap_body_pays_for_its_push_and_gives_nothing_by_receding() -> None:
+@pytest.mark.parametrize("xml", [LIFT, WELDED])
+def test_a_moving_mocap_body_pays_for_its_push_and_gives_nothing_by_receding(xml: str) -> None:
     results: dict[str, list[bool]] = {"rigid": [], "scene": []}
     for contact, stroke in product(results, (0.0005, 0.002, 0.005)):
-        run = prepared(scene(LIFT, mass=0.05, g=-9.81), contact=contact)
+        run = prepared(scene(xml, mass=0.05, g=-9.81), contact=contact)
         plate = run.scene.model.body("plate").mocapid[0]
+        start = run.scene.data.mocap_pos[plate].copy()
 
-        def move(k: int, data: mujoco.MjData, plate: int = plate, stroke: float = stroke) -> None:
-            data.mocap_pos[plate, 2] = -0.01 + stroke * np.sin(k / 15)
+        def move(
+            k: int,
+            data: mujoco.MjData,
+            plate: int = plate,
+            start: Array = start,
+            by: float = stroke,
+        ) -> None:
+            sideways = by * (np.cos(k / 15) - 1.0)
+            data.mocap_pos[plate] = start + np.array([sideways, 0.0, by * np.sin(k / 15)])
 
         samples = jamming(1, 800)
         samples["position"][:, 2] -= 0.002 * np.minimum(T * np.arange(800) / 0.1, 1.0)

@@ -175,11 +175,12 @@ def mocap_work(s: State) -> float:
     """
     mj = s.mj
     force = floats(pointer_at(mj.efc_force), ints(mj.nefc, 1)[0])
-    residual = floats(pointer_at(mj.efc_pos), force.size)
-    kinds, ids = (
-        ints(pointer_at(mj.efc_type), force.size),
-        ints(pointer_at(mj.efc_id), force.size),
-    )
+    count = force.size
+    residual = floats(pointer_at(mj.efc_pos), count)
+    if s.contact.is_aimed and s.contact.row_capacity > 0:
+        count = min(count, s.contact.row_capacity)
+        residual = floats(s.contact.row_positions, count)
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     work = 0.0
     if ints(mj.ne, 1)[0] == s.energy.equality_rows:
         before = floats(mj.equality_before, s.energy.equality_rows)
@@ -193,7 +194,7 @@ def mocap_work(s: State) -> float:
             floats(mj.tendon_before, mj.ntendon),
         )
         ranges = floats(mj.tendon_range, 2 * mj.ntendon)
-        for i in range(force.size):
+        for i in range(count):
             if kinds[i] == LIMIT_TENDON:
                 t = ids[i]
                 to_lower = abs(residual[i] - (lengths[t] - ranges[2 * t]))

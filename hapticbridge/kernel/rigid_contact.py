@@ -26,8 +26,11 @@ moved mocap body pays for its own push: its work, of the external port, is subtr
 that recedes by δ takes δ/h from ŵ: what rests on it follows, and its energy goes into that port.
 All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before it closes:
 margins follow the speed (``follow_speed``).
-Limits of joints are rows like a contact's without friction and share the tank. Limits of tendons
-and equality constraints stay MuJoCo's.
+
+Limits of joints and tendons are rows like a contact's without friction, and equality constraints
+rows with ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign, of which a moved mocap body
+adds δp; all share the tank. What they hold stretched at the start is thus not pushed together for
+nothing. Equality constraints of a flex stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
@@ -49,8 +52,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import LIMIT_JOINT, Part, State
-from hapticbridge.kernel.ledger import mocap_contact_work, opened_by_mocap
+from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
+from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
@@ -92,14 +95,23 @@ the velocity that is left in the rows of friction."""
 
 _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 
+_LAST_ROWS = int(mujoco.mjtEq.mjEQ_TENDON)
+"""Last kind of equality constraint that is rigid; the later ones are those of a flex."""
+
+_PARAMETERS = (
+    *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
+    *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
+)
+"""Arrays of the model that a run writes to, and puts back."""
+
 _OF_MODEL = (
-    *("jnt_solref", "jnt_solimp", "geom_margin", "geom_rbound", "pair_margin", "pair_geom1"),
-    *("pair_geom2", "body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
+    *("geom_rbound", "pair_geom1", "pair_geom2"),
+    *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
 )
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof")
 _OWNED = (
-    *("own_solref", "own_solimp", "limit_positions", "own_margin", "own_pair_margin"),
-    *("moving_geoms", "body_velocity"),
+    *(f"own_{name}" for name in _PARAMETERS),
+    *("eq_type", "row_positions", "moving_geoms", "body_velocity"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -108,8 +120,8 @@ RIGID_DTYPE = np.dtype(
         ("repetitions", "<i8"),
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
-        ("limit_capacity", "<i8"),
-        *((name, "<i8") for name in (*_OF_MODEL, *_OF_DATA, *_OWNED)),
+        ("row_capacity", "<i8"),
+        *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
         ("pair_count", "<i8"),
         ("share", "<f8"),
@@ -121,9 +133,10 @@ RIGID_DTYPE = np.dtype(
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
-last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of joint limits: largest count
-of rows, and addresses of the model's parameters, of copies, and of the rows' own positions. Of
-margins: addresses and counts of the geoms that move, of pairs, and of the bodies' velocities."""
+last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of limits and equality
+constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
+of copies, and of the rows' own positions. Of margins: addresses and counts of the geoms that move,
+of pairs, and of the bodies' velocities."""
 
 
 def bind_contact(
@@ -132,23 +145,24 @@ def bind_contact(
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
-    contact["limit_capacity"] = 2 * int(np.count_nonzero(model.jnt_limited))
+    is_rigid = model.eq_type <= _LAST_ROWS
+    if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
+        flex_rows = data.ne if np.any(~is_rigid) else 0
+        contact["row_capacity"] = (
+            max(6 * model.neq, flex_rows) + model.nv + 2 * model.njnt + 3 * model.ntendon
+        )
     owned: dict[str, NDArray[np.generic]] = {
-        "own_solref": model.jnt_solref.copy(),
-        "own_solimp": model.jnt_solimp.copy(),
-        "limit_positions": np.zeros(max(2 * model.njnt, 1)),
+        f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
     }
+    owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
+    owned["row_positions"] = np.zeros(max(int(contact["row_capacity"]), 1))
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
     owned["moving_geoms"] = np.flatnonzero(meets & is_moving).astype(np.int32)
-    owned["own_margin"], owned["own_pair_margin"] = (
-        model.geom_margin.copy(),
-        model.pair_margin.copy(),
-    )
     owned["body_velocity"] = np.zeros((model.nbody, 6))
     contact["moving_count"], contact["pair_count"] = owned["moving_geoms"].size, model.npair
-    for name in _OF_MODEL:
+    for name in (*_PARAMETERS, *_OF_MODEL):
         contact[name] = getattr(model, name).ctypes.data
     for name in _OF_DATA:
         contact[name] = getattr(data, name).ctypes.data
@@ -157,17 +171,17 @@ def bind_contact(
     return owned
 
 
-def restore_contact(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
+def restore_model(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
     """Puts back what a run writes to the model, from the arrays of ``bind_contact``."""
-    model.jnt_solref[:], model.jnt_solimp[:] = owned["own_solref"], owned["own_solimp"]
-    model.geom_margin[:], model.pair_margin[:] = owned["own_margin"], owned["own_pair_margin"]
+    for name in _PARAMETERS:
+        getattr(model, name)[...] = owned[f"own_{name}"]
 
 
 @compiled
 def _aim(s: State) -> None:
     """Writes parameters and positions for ``mj_step2``, for the present share."""
-    if s.contact.limit_capacity > 0:
-        _aim_limits(s)
+    if s.contact.row_capacity > 0:
+        _aim_rows(s)
     mj, h, push = s.mj, s.run.timestep, s.contact.share * DEPENETRATION
     d = _IMPEDANCE
     count = ints(mj.nefc, 1)[0]
@@ -202,58 +216,86 @@ def _aim(s: State) -> None:
 
 
 @compiled
-def _aim_limits(s: State) -> None:
-    """Does for the limits of joints what ``_aim`` does for contacts.
+def _parameters_of(s: State, kind: int) -> tuple[int, int, int, int]:
+    """Returns the addresses of ``solref`` and ``solimp`` of a kind of row, and of their copies."""
+    contact = s.contact
+    if kind == EQUALITY:
+        return contact.eq_solref, contact.eq_solimp, contact.own_eq_solref, contact.own_eq_solimp
+    if kind == LIMIT_JOINT:
+        own = contact.own_jnt_solref, contact.own_jnt_solimp
+        return contact.jnt_solref, contact.jnt_solimp, own[0], own[1]
+    own = contact.own_tendon_solref_lim, contact.own_tendon_solimp_lim
+    return contact.tendon_solref_lim, contact.tendon_solimp_lim, own[0], own[1]
+
+
+@compiled
+def _is_held(s: State, kind: int, i: int) -> bool:
+    """Returns True for a row of a limit or of an equality constraint that is rigid."""
+    if kind == EQUALITY:
+        return bool(ints(s.contact.eq_type, i + 1)[i] <= _LAST_ROWS)
+    return bool(kind in (LIMIT_JOINT, LIMIT_TENDON))
+
+
+@compiled
+def _aim_rows(s: State) -> None:
+    """Does for limits and equality constraints what ``_aim`` does for contacts.
 
     Their parameters are the model's, which has its own values again after the step.
     """
     mj, contact, h = s.mj, s.contact, s.run.timestep
     push, d = contact.share * DEPENETRATION, _IMPEDANCE
-    count = ints(mj.nefc, 1)[0]
+    count = min(ints(mj.nefc, 1)[0], contact.row_capacity)
     kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
-    own, found = floats(contact.limit_positions, contact.limit_capacity), 0
+    own = floats(contact.row_positions, count)
+    before = floats(mj.equality_before, s.energy.equality_rows)
+    has_moved = s.energy.mocap_has_moved and ints(mj.ne, 1)[0] == s.energy.equality_rows
+    if not contact.is_aimed:
+        for row in range(count):
+            own[row] = positions[row]
     for row in range(count):
-        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
+        kind, i = kinds[row], ids[row]
+        if not _is_held(s, kind, i):
             continue
-        if not contact.is_aimed:
-            own[found] = positions[row]
-        wanted = (-push if own[found] < 0.0 else -1.0) * own[found] / h
+        is_in_error = own[row] < 0.0 or kind == EQUALITY
+        wanted = (-push if is_in_error else -1.0) * own[row] / h
+        if kind == EQUALITY and has_moved:
+            wanted -= (1.0 - contact.share) * (own[row] - before[row]) / h
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
-        solref = floats(contact.jnt_solref + 16 * ids[row], 2)
+        place, impedances, _, _ = _parameters_of(s, kind)
+        solref, solimp = floats(place + 16 * i, 2), floats(impedances + 40 * i, 2)
         solref[0], solref[1] = -_EXACT * d * d, -d / h
-        solimp = floats(contact.jnt_solimp + 40 * ids[row], 2)
         solimp[0] = solimp[1] = d
-        found += 1
 
 
 @compiled
-def _restore_limits(s: State) -> None:
-    mj, contact, found = s.mj, s.contact, 0
-    count = ints(mj.nefc, 1)[0]
+def _restore_rows(s: State) -> None:
+    mj, contact = s.mj, s.contact
+    count = min(ints(mj.nefc, 1)[0], contact.row_capacity)
     kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
     positions = floats(pointer_at(mj.efc_pos), count)
-    own = floats(contact.limit_positions, contact.limit_capacity)
+    own = floats(contact.row_positions, count)
     for row in range(count):
-        if kinds[row] != LIMIT_JOINT or found == contact.limit_capacity:
-            continue
-        positions[row] = own[found]
-        for place, kept, step in (
-            (contact.jnt_solref, contact.own_solref, 16),
-            (contact.jnt_solimp, contact.own_solimp, 40),
-        ):
-            values = floats(place + step * ids[row], 2)
-            before = floats(kept + step * ids[row], 2)
-            values[0], values[1] = before[0], before[1]
-        found += 1
+        kind, i = kinds[row], ids[row]
+        if _is_held(s, kind, i):
+            positions[row] = own[row]
+            place, impedances, own_place, own_impedances = _parameters_of(s, kind)
+            for target, source in (
+                (floats(place + 16 * i, 2), floats(own_place + 16 * i, 2)),
+                (floats(impedances + 40 * i, 2), floats(own_impedances + 40 * i, 2)),
+            ):
+                target[0], target[1] = source[0], source[1]
 
 
 @compiled
 def aim_contacts(s: State) -> None:
-    """Makes contacts and limits of the coming ``mj_step2`` rigid; needs the velocity stage."""
+    """Makes contacts, limits and equality constraints of the coming ``mj_step2`` rigid.
+
+    Needs the velocity stage.
+    """
     contact = s.contact
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
@@ -269,28 +311,19 @@ def _spendable(s: State) -> float:
 
 @compiled
 def returned_energy(s: State) -> float:
-    """Returns C, the energy in J that contacts and limits gave in the step that just ended."""
+    """Returns C, the energy in J that rigid constraints gave in the step that just ended."""
     mj, h = s.mj, s.run.timestep
     count = ints(mj.nefc, 1)[0]
     force = floats(pointer_at(mj.efc_force), count)
     velocities = floats(pointer_at(mj.efc_vel), count)
     reference = floats(pointer_at(mj.efc_aref), count)
     regularisation = floats(pointer_at(mj.efc_R), count)
-    contacts, total = pointer_at(mj.contact), 0.0
-    for c in range(ints(mj.ncon, 1)[0]):
-        contact = contacts + c * mj.contact_size
-        row = ints(contact + mj.contact_row, 1)[0]
-        if row < 0:
-            continue
-        for i in range(row, row + ints(contact + mj.contact_dim, 1)[0]):
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    total = 0.0
+    for i in range(count):
+        if kinds[i] > LIMIT_TENDON or _is_held(s, kinds[i], ids[i]):
             end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
             total += h * force[i] * end
-    if s.contact.limit_capacity > 0:
-        kinds = ints(pointer_at(mj.efc_type), count)
-        for i in range(count):
-            if kinds[i] == LIMIT_JOINT:
-                end = velocities[i] + h * (reference[i] - regularisation[i] * force[i])
-                total += h * force[i] * end
     return total
 
 
@@ -306,7 +339,7 @@ def lower_share(s: State) -> bool:
         return False
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
-        allowed += mocap_contact_work(s)  # the external port pays for it
+        allowed += mocap_work(s)  # the external port pays for it
     if returned <= allowed:
         return False
     # C is nearly proportional to the share while the forces stay; a second excess ends it
@@ -319,10 +352,10 @@ def lower_share(s: State) -> bool:
 
 @compiled
 def finish_contacts(s: State) -> None:
-    """Counts the contacts with a force, and restores positions and the limits' parameters."""
+    """Counts the contacts with a force, and restores positions and the model's parameters."""
     mj = s.mj
-    if s.contact.is_aimed and s.contact.limit_capacity > 0:
-        _restore_limits(s)
+    if s.contact.is_aimed and s.contact.row_capacity > 0:
+        _restore_rows(s)
     s.contact.is_aimed = 0
     count = ints(mj.nefc, 1)[0]
     positions = floats(pointer_at(mj.efc_pos), count)
@@ -348,7 +381,10 @@ def follow_speed(s: State) -> None:
     _move_bodies(s)
     velocities, centres = floats(contact.body_velocity, 6 * mj.nbody), contact.geom_xpos
     bodies, roots = ints(mj.geom_bodyid, mj.ngeom), ints(contact.body_rootid, mj.nbody)
-    margins, at_rest = floats(contact.geom_margin, mj.ngeom), floats(contact.own_margin, mj.ngeom)
+    margins, at_rest = (
+        floats(contact.geom_margin, mj.ngeom),
+        floats(contact.own_geom_margin, mj.ngeom),
+    )
     radii = floats(contact.geom_rbound, mj.ngeom)
     for geom in ints(contact.moving_geoms, contact.moving_count):
         body = bodies[geom]
