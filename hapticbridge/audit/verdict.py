@@ -339,6 +339,7 @@ def _time_facts(
         fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
+        mean_jitter=timing.jitter / max(timing.ticks, 1),
         delay_energy=timing.most_uncovered,
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
         flags=recording.flags,

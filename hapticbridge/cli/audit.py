@@ -270,7 +270,7 @@ def _print_report(report: AuditReport) -> None:
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
-    rate = "" if kept is None or kept.share == 1.0 else f", {kept.words}"
+    rate = f", {kept.remark}" if kept is not None and kept.remark else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}")
     energies = [
         f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
