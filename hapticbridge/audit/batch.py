@@ -64,6 +64,7 @@ def audit_all(
     paths: Sequence[Path],
     *,
     strict: bool = False,
+    accepts_unverified: bool = False,
     jobs: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
@@ -81,6 +82,7 @@ def audit_all(
     Args:
         paths: Recordings; different files.
         strict: True accepts only (14) itself; see ``audit``.
+        accepts_unverified: True counts ``unverified`` as a success; see ``audit``.
         jobs: Largest number of processes; 1 uses the present process. The default is the number of
             cores, and 1 for fewer than 8 recordings.
         executor: Executor to use instead of processes.
@@ -99,7 +101,7 @@ def audit_all(
         jobs = 1
     try:
         table = sweep(
-            partial(audit_point, strict=strict),
+            partial(audit_point, strict=strict, accepts_unverified=accepts_unverified),
             [{"file": str(path.absolute() if scheduler else path)} for path in paths],
             chunk=1,
             executor=executor,
@@ -112,10 +114,12 @@ def audit_all(
     return _sorted(_with_failures(table))
 
 
-def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
+def audit_point(
+    point: dict[str, str], *, strict: bool, accepts_unverified: bool = False
+) -> dict[str, Value]:
     """Audits one recording; returns its row."""
     try:
-        report = audit(point["file"], strict=strict)
+        report = audit(point["file"], strict=strict, accepts_unverified=accepts_unverified)
     except RecordingError as error:
         return {
             "margin": math.nan,

@@ -78,14 +78,14 @@ def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjM
     """Compiles a scene from the bytes of its files, independent of their folder.
 
     A compiled model names the files of its meshes and textures. With their paths it would differ
-    from folder to folder, and a recording would reveal the user's folders. Files outside the
-    scene's own folder, and files that only MuJoCo finds, are read from their place.
+    from folder to folder, and a recording would reveal the user's folders. Files that only
+    MuJoCo finds are read from their place.
     """
     main, *assets = sources
-    if not assets or "/" in main.name:
+    if not assets:
         return spec.compile()
     portable = spec.copy()
-    portable.modelfiledir = ""
+    portable.modelfiledir = main.name.rpartition("/")[0]
     portable.assets = {source.name: source.data for source in assets}
     try:
         return portable.compile()
