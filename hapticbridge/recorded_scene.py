@@ -81,6 +81,7 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
     Raises:
         RecordingError: The recording carries no scene, or it cannot be compiled or prepared.
     """
+    folder = ""
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
             main = unpack_scene(recording, Path(folder))
@@ -92,7 +93,8 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
     except RecordingError:
         raise
     except HapticBridgeError as error:
-        raise RecordingError(f"the attached scene does not fit the metadata: {error}") from None
+        reason = str(error).replace(f"{folder}/", "")
+        raise RecordingError(f"the attached scene does not fit the metadata: {reason}") from None
     return scene
 
 

@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.agreement import first_contradiction, scene_statements
+from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.structure import first_row
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import EventApplier
@@ -107,7 +109,8 @@ class Resimulator:
     The recording must have no ``obstacle``. Its events are applied when due.
 
     Attributes:
-        model: The attached scene.
+        scene: The attached scene, at its start.
+        model: Its model.
         data: Its state after the last simulated tick.
         binding: The kernel's state bound to both.
         done: Number of simulated ticks.
@@ -125,7 +128,8 @@ class Resimulator:
         ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.model = model = attached_scene(recording, parameters).model
+        self.scene = attached_scene(recording, parameters)
+        self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
         start = recording.attachments[STATE_ATTACHMENT]
@@ -272,7 +276,7 @@ class ReplayOutcome:
         return self.tick is not None
 
 
-def compare_resimulation(recording: RecordingFile, parameters: RunParameters) -> ReplayOutcome:
+def compare_resimulation(recording: RecordingFile, described: AuditedRun) -> ReplayOutcome:
     """Simulates the recorded device motion again and compares every number except times.
 
     Raises:
@@ -282,9 +286,14 @@ def compare_resimulation(recording: RecordingFile, parameters: RunParameters) ->
     if reason := obstacle(recording):
         return ReplayOutcome(f"{NOT_RUN}: {reason}")
     try:
-        run = Resimulator(recording, parameters)
+        run = Resimulator(recording, described.parameters)
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
+    is_exact = is_same_processor(recording)
+    if fault := first_contradiction(
+        scene_statements(run.scene, recording, described, is_exact=is_exact)
+    ):
+        raise RecordingError(fault.reason)
     names = [name for name in recording.record.names or () if name not in CLOCK_FIELDS]
     off, largest = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     first: tuple[int, str, float] | None = None

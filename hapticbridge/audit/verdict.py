@@ -11,6 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.agreement import (
+    event_statements,
+    first_contradiction,
+    metadata_statements,
+)
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import AuditedRun, RunEvents
 from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation
@@ -233,8 +238,11 @@ def verdict_on(path: str | Path, *, strict: bool, accepts_unverified: bool) -> A
             fault, facts["duration"] = _check_records(recording, run, energies, timing)
             facts["energies"] = energies.energies
             facts |= _time_facts(run, recording, timing, facts["certified"])
+            fault = fault or first_contradiction(
+                chain(metadata_statements(recording, run), event_statements(recording, timing))
+            )
         if fault is None:
-            outcome = compare_resimulation(recording, run.parameters)
+            outcome = compare_resimulation(recording, run)
             facts["resimulation"] = outcome.agreement
             fault = _replay_fault(outcome)
         if fault is None:
