@@ -1,12 +1,12 @@
 """Verdict on a recording, from the recording alone; never imports the bridge.
 
-Read ``verdict`` first; its function decide() alone names the verdict. The
-audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
-(``energy``), checks the wrench against the coupling law (``motion``) and the guard's limits
-(``wrench_limits``), the time that the run kept (``timing``), and simulates the scene again
-(``replay``), and that no part contradicts another (``agreement``). ``state`` is carried from block to block, ``events`` reads external actions during the
-run, ``report`` holds the result, ``batch`` audits folders. Heavy imports are deferred
-to the first call.
+Read ``verdict`` first; its function decide() alone names the verdict. The audit checks that the
+file is whole (``structure``), computes the energies again in plain NumPy (``energy``), checks the
+wrench against the coupling law (``motion``) and the guard's limits (``wrench_limits``), the time
+that the run kept (``timing``), that no part contradicts another (``agreement``), and simulates the
+scene again (``replay``). ``state`` is carried from block to block, ``events`` reads external
+actions during the run, ``report`` holds the result, ``batch`` audits folders. Heavy imports are
+deferred to the first call.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from hapticbridge.audit.structure import Fault
 from hapticbridge.audit.timing import TimingTally
 from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import RealClock, SimulatedClock
+from hapticbridge.errors import DeviceError, RecordingError
 from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.pose import IDENTITY_POSE
@@ -93,7 +94,7 @@ def metadata_statements(recording: RecordingFile, run: AuditedRun) -> Iterator[S
 def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
     parameters, info = run.parameters, run.info
     guard = parameters.guarding
-    if info.is_prescribed and guard == UNGUARDED:
+    if guard == UNGUARDED:  # a study runs without
         return
     needed = required_axis_damping(
         info,
@@ -104,13 +105,16 @@ def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
         parameters.law_evaluations,
         run.method,
     )
-    limits = Limits(
-        force=parameters.force_limit,
-        torque=parameters.torque_limit,
-        angle=guard.angle,
-        energy=guard.energy,
-        reach=guard.reach,
-    )
+    try:
+        limits = Limits(
+            force=parameters.force_limit,
+            torque=parameters.torque_limit,
+            angle=guard.angle,
+            energy=guard.energy,
+            reach=guard.reach,
+        )
+    except DeviceError as error:
+        raise RecordingError(f"metadata 'guard' is out of range: {error}") from None
     names = {code: name for name, code in CONTROLLERS.items()}
     derived = guard_parameters_for(
         info,
@@ -156,7 +160,8 @@ def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[
     for event in events:
         tick = event.get("tick")
         if type(tick) is not int or not 0 <= tick <= count:
-            yield Statement(f"tick of '{event.get('event')}'", tick, None, f"{count} records")
+            name = f"tick of the event '{event.get('event')}'"
+            yield Statement(name, tick, f"0 to {count}", "the records")
     has_tripped = str(stop.get("reason")).startswith(("SafetyTrip: ", "trip"))
     if has_tripped:
         yield Statement("event 'trip'", names["trip"] > 0, True, "reason of the event 'stop'")
