@@ -24,7 +24,11 @@ else:
 
 
 def audit(
-    path: str | Path, *, strict: bool = False, accepts_unverified: bool = False
+    path: str | Path,
+    *,
+    strict: bool = False,
+    accepts_unverified: bool = False,
+    in_process: bool = False,
 ) -> AuditReport:
     """Judges a recording from the file alone.
 
@@ -44,10 +48,15 @@ def audit(
         path: The recording.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
         accepts_unverified: True counts ``unverified`` as a success in ``AuditReport.exit_code``.
+        in_process: True compiles and simulates in this process, without the limits on memory and
+            time that a child process has. It is for recordings of a known origin.
 
     Raises:
         RecordingError: The file is not a recording.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     from hapticbridge.audit.verdict import verdict_on  # noqa: PLC0415 - takes seconds
 
-    return verdict_on(path, strict=strict, accepts_unverified=accepts_unverified)
+    return verdict_on(
+        path, strict=strict, accepts_unverified=accepts_unverified, in_process=in_process
+    )

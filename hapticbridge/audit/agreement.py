@@ -77,9 +77,9 @@ def metadata_statements(recording: RecordingFile, run: AuditedRun) -> Iterator[S
     if run.method.has_coupling:
         stiffness = parameters.contact_stiffness
         yield Statement("metadata 'contact_stiffness'", stiffness, 0.0, "contacts of MuJoCo")
-    clocks = [RealClock.name] if info.is_real else [RealClock.name, SimulatedClock.name]
+    clocks = (RealClock.name, SimulatedClock.name)
     if meta.get("clock") not in clocks:
-        yield Statement("metadata 'clock'", meta.get("clock"), " or ".join(clocks), "the device")
+        yield Statement("metadata 'clock'", meta.get("clock"), " or ".join(clocks), "its two kinds")
     origins = parameters.device_origin, parameters.handle_origin
     if IDENTITY_POSE not in origins:
         start = parameters.device_start

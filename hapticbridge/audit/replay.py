@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -23,7 +23,14 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.recorded_scene import compile_recorded, is_as_recorded
+from hapticbridge.recorded_scene import (
+    SIMULATION_TIME,
+    SLOWEST,
+    compile_recorded,
+    in_bounds,
+    is_as_recorded,
+    unlimited,
+)
 from hapticbridge.recording import RecordingFile
 from hapticbridge.run_description import (
     SOURCE_PREFIX,
@@ -51,14 +58,16 @@ instructions round differently. A larger tolerance would hide tampering, a small
 honest recordings."""
 
 
-def attached_scene(recording: RecordingFile, parameters: RunParameters) -> Scene:
+def attached_scene(
+    recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
+) -> Scene:
     """Compiles the attached sources, which must give the recorded model in every bit.
 
     Raises:
         ForeignModelError: Another processor compiled another model.
         RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
-    scene = compile_recorded(recording, parameters)
+    scene = compile_recorded(recording, parameters, is_trusted=is_trusted)
     if is_as_recorded(scene, recording):
         return scene
     found = "the attached sources do not compile to the recorded model (scene_sha256)"
@@ -120,7 +129,9 @@ class Resimulator:
         RecordingError: The attachments contradict the metadata, so the file was changed.
     """
 
-    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
+    def __init__(
+        self, recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
+    ) -> None:
         events = recording.events
         self._changes = deque(event for event in events if event.get("event") in _CHANGES)
         self._resumed: list[Any] = [
@@ -128,7 +139,7 @@ class Resimulator:
         ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.scene = attached_scene(recording, parameters)
+        self.scene = attached_scene(recording, parameters, is_trusted=is_trusted)
         self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
@@ -276,19 +287,36 @@ class ReplayOutcome:
         return self.tick is not None
 
 
-def compare_resimulation(recording: RecordingFile, described: AuditedRun) -> ReplayOutcome:
+def compare_resimulation(
+    recording: RecordingFile, described: AuditedRun, *, is_trusted: bool = False
+) -> ReplayOutcome:
     """Simulates the recorded device motion again and compares every number except times.
 
+    It is done in a child process with limits (``recorded_scene.in_bounds``), unless the recording
+    is trusted.
+
     Raises:
+        ForeignSceneError: The child process crashed, or exceeded its limits.
         RecordingError: The attachments contradict the metadata, or an event is damaged; the file
             was changed.
     """
     if reason := obstacle(recording):
         return ReplayOutcome(f"{NOT_RUN}: {reason}")
+    if is_trusted:
+        return _compared(recording, described, unlimited)
+    what = f"the scene of '{recording.path}'"
+    found = in_bounds(lambda allow: asdict(_compared(recording, described, allow)), what)
+    return ReplayOutcome(**cast(dict[str, Any], found))
+
+
+def _compared(
+    recording: RecordingFile, described: AuditedRun, allow: Callable[[float], None]
+) -> ReplayOutcome:
     try:
-        run = Resimulator(recording, described.parameters)
+        run = Resimulator(recording, described.parameters, is_trusted=True)
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
+    allow(SIMULATION_TIME + SLOWEST * recording.count * described.parameters.period)
     is_exact = is_same_processor(recording)
     if fault := first_contradiction(
         scene_statements(run.scene, recording, described, is_exact=is_exact)

@@ -208,11 +208,14 @@ def _decide_on_records(
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
-def verdict_on(path: str | Path, *, strict: bool, accepts_unverified: bool) -> AuditReport:
+def verdict_on(
+    path: str | Path, *, strict: bool, accepts_unverified: bool, in_process: bool
+) -> AuditReport:
     """Judges a recording; implements ``audit.audit``.
 
     Raises:
         RecordingError: The file is not a recording.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     recording = open_recording(path)
     facts: dict[str, Any] = {
@@ -242,7 +245,7 @@ def verdict_on(path: str | Path, *, strict: bool, accepts_unverified: bool) -> A
                 chain(metadata_statements(recording, run), event_statements(recording, timing))
             )
         if fault is None:
-            outcome = compare_resimulation(recording, run)
+            outcome = compare_resimulation(recording, run, is_trusted=in_process)
             facts["resimulation"] = outcome.agreement
             fault = _replay_fault(outcome)
         if fault is None:

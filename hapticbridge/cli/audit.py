@@ -124,6 +124,9 @@ class Audit:
     """Accept only passivity itself, not the slack that the device's damping leaves."""
     accept_unverified: bool = False
     """Count 'unverified' as a success: passive in its records, but not simulated again here."""
+    in_process: bool = False
+    """Simulate in this process, for recordings of a known origin: without the child process whose
+    memory and time are limited."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the reports as a JSON list."""
     plot: Path | None = None
@@ -167,7 +170,12 @@ class Audit:
             return self._ask(files[0])
         first = "the first audit on a machine compiles for about 20 s"
         with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
-            report = audit(files[0], strict=self.strict, accepts_unverified=self.accept_unverified)
+            report = audit(
+                files[0],
+                strict=self.strict,
+                accepts_unverified=self.accept_unverified,
+                in_process=self.in_process,
+            )
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json())]))
         else:
@@ -187,6 +195,7 @@ class Audit:
                     files,
                     strict=self.strict,
                     accepts_unverified=self.accept_unverified,
+                    in_process=self.in_process,
                     jobs=self.jobs,
                     scheduler=self.scheduler,
                     progress=show,

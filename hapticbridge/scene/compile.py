@@ -145,9 +145,12 @@ _WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 """Patterns of MuJoCo's error messages, and their wording after a colon."""
 
 
+_LONGEST = 1000  # of a message, which may quote a whole file
+
+
 def clause(error: Exception) -> str:
     """Returns MuJoCo's error message, worded to follow a colon."""
-    text = " ".join(str(error).split())
+    text = " ".join(str(error)[:_LONGEST].split())
     for pattern, wording in _WORDING:
         text = re.sub(pattern, wording, text)
     return text or type(error).__name__

@@ -68,7 +68,7 @@ class LiveRun:
 
     def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
         self.parameters = parameters_of(run.meta)
-        self.model = compile_recorded(run, self.parameters).model
+        self.model = compile_recorded(run, self.parameters, is_trusted=True).model
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
