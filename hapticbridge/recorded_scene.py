@@ -7,6 +7,7 @@ files (``in_bounds``), or tried there first (``compile_recorded``).
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import signal
@@ -43,7 +44,7 @@ SIMULATION_TIME, SLOWEST = 60, 20
 simulation on a machine compiles its functions for 35 s; a scene at its limit takes its run time."""
 
 _LARGEST_FILE = 256 << 20
-_DONE, _REFUSED = 0, 3
+_DONE, _REFUSED, _NO_MEMORY, _FAILED = 0, 3, 4, 5
 
 
 Work = Callable[[Callable[[float], None]], object]
@@ -88,7 +89,8 @@ def in_bounds(work: Work, what: str) -> object:
         if code == _REFUSED:
             raise RecordingError(str(found))
         return found
-    raise ForeignSceneError(f"{what} {_death(code)}")
+    death = f"made MuJoCo fail: {json.loads(text)}" if code == _FAILED else _death(code)
+    raise ForeignSceneError(f"{what} {death}")
 
 
 class ForeignSceneError(HapticBridgeError):
@@ -102,6 +104,7 @@ def unlimited(_seconds: float) -> None:
 def _work_and_exit(work: Work, folder: str, answer: int) -> None:
     code, found = 1, b""
     try:
+        faulthandler.disable()
         tempfile.tempdir = folder
         _limit_this_process()
         found, code = json.dumps(work(_allow)).encode(), _DONE
@@ -110,14 +113,12 @@ def _work_and_exit(work: Work, folder: str, answer: int) -> None:
     except MemoryError:
         code = _NO_MEMORY
     except BaseException as error:
-        found, code = json.dumps(f"{type(error).__name__}: {error}"[:500]).encode(), _REFUSED
+        words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        found, code = json.dumps(words).encode(), _FAILED
     finally:
         while found:
             found = found[os.write(answer, found) :]
         os._exit(code)
-
-
-_NO_MEMORY = 4
 
 
 def _limit_this_process() -> None:
