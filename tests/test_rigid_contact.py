@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -64,6 +65,32 @@ BALL = (
     <geom type="box" size="0.1 0.1 0.01" pos="0 0 -0.02"/>
     <body name="other" pos="0.03 0 0"><freejoint/>
       <geom type="capsule" size="0.01 0.02" euler="1.5708 0 0" mass="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+)
+CLUTTER = (
+    HEAD.replace("<option", '<option iterations="{n}" ls_iterations="{line}"')
+    + """
+    <body name="tool" pos="0 0 0.035"><freejoint/>
+      <geom type="box" size="0.02 0.02 0.01" mass="{mass}"/><site name="grip"/></body>
+    <geom type="box" size="0.3 0.3 0.01" pos="0 0 -0.01"/>
+    <body pos="-0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body pos="0 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body pos="0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+)
+LIFT = (
+    HEAD
+    + """
+    <body name="tool" pos="0 0 0.0105"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="{mass}"/><site name="grip"/></body>
+    <body name="plate" mocap="true" pos="0 0 -0.01"><geom type="box" size="0.1 0.1 0.01"/></body>
+    <body pos="0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
   </worldbody>
 </mujoco>"""
 )
@@ -196,6 +223,41 @@ def test_a_jammed_peg_is_strict_where_the_contact_of_the_scene_creates_energy(co
         assert not strict(results["scene"]), (seed, mass, mu)
 
 
+@pytest.mark.parametrize(("iterations", "line_search"), [(100, 10), (3, 50), (3, 5)])
+def test_a_file_with_a_hasty_solver_is_solved_as_mujoco_does(
+    iterations: int, line_search: int
+) -> None:
+    xml = CLUTTER.replace("{n}", str(iterations)).replace("{line}", str(line_search))
+    results: dict[bool, list[bool]] = {False: [], True: []}
+    for is_hasty, seed in product(results, range(4)):
+        stiff = Coupling(6000.0, 0.5, 6.0, 5e-4)
+        run = prepared(scene(xml, mass=0.05, g=-9.81), coupling=stiff)
+        if is_hasty:
+            option = run.scene.model.opt
+            option.iterations, option.ls_iterations = iterations, line_search
+        samples = jamming(seed, 800)
+        samples["position"][:, 2] -= 0.02 * np.minimum(T * np.arange(800) / 0.1, 1.0)
+        results[is_hasty].append(strict(through(run, samples)))
+    assert all(results[False])
+    assert not all(results[True])
+
+
+def test_a_moving_mocap_body_pays_for_its_push_and_gives_nothing_by_receding() -> None:
+    results: dict[str, list[bool]] = {"rigid": [], "scene": []}
+    for contact, stroke in product(results, (0.0005, 0.002, 0.005)):
+        run = prepared(scene(LIFT, mass=0.05, g=-9.81), contact=contact)
+        plate = run.scene.model.body("plate").mocapid[0]
+
+        def move(k: int, data: mujoco.MjData, plate: int = plate, stroke: float = stroke) -> None:
+            data.mocap_pos[plate, 2] = -0.01 + stroke * np.sin(k / 15)
+
+        samples = jamming(1, 800)
+        samples["position"][:, 2] -= 0.002 * np.minimum(T * np.arange(800) / 0.1, 1.0)
+        results[contact].append(strict(go_on(run, samples, on_tick=move)))
+    assert all(results["rigid"])
+    assert not results["scene"][-1]
+
+
 def test_the_tank_is_filled_by_what_was_dissipated_up_to_its_cap() -> None:
     run = through(prepared(scene(PEG, mass=0.1)), jamming(5))
     created = np.concatenate([[0.0], run.ticks["environment_energy"]])
@@ -293,6 +355,50 @@ def test_a_lifted_tool_is_released_within_10_ms() -> None:
     assert opened[0] <= 10
 
 
+def blow(
+    start: float, velocity: tuple[float, float, float], mass: float = 0.1, force: float = 0.0
+) -> Array:
+    """Returns the penetration in m per tick of a ball in a blow; negative is a gap.
+
+    ``start`` is the ball's height in m above the floor; along x it meets a capsule at height 0. The
+    hand presses with up to 0.3 of ``force`` in N.
+    """
+    loaded = scene(BALL, mass=mass, mu=0.4)
+    loaded.data.qpos[2] = start
+    loaded.data.qvel[:3] = velocity
+    speed = loaded.data.qvel.copy()
+    run = prepared(loaded)
+    loaded.data.qvel[:] = speed
+    depths: list[float] = []
+
+    def note(_: int, data: mujoco.MjData) -> None:
+        depths.append(-min((c.dist for c in data.contact), default=1.0))
+
+    go_on(run, pressed(60, force), after_tick=note)
+    return np.array(depths)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 4.0])
+def test_a_fast_blow_is_met_before_it_sinks_in(speed: float) -> None:
+    assert blow(0.011, (0.0, 0.0, -speed)).max() < 2e-6
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+def test_a_fast_blow_on_a_free_body_is_met_before_it_sinks_in(speed: float) -> None:
+    assert blow(0.0, (speed, 0.0, 0.0)).max() < 0.01 * speed * T  # what the softness leaves
+
+
+def test_a_blow_beyond_the_largest_margin_is_seen_late() -> None:
+    assert blow(0.023, (0.0, 0.0, -8.0), mass=1.0).max() > 2e-4
+
+
+def test_an_oblique_blow_neither_sinks_in_where_it_sticks_nor_floats_where_it_slides() -> None:
+    sticking = blow(0.003, (0.1, 0.0, -0.3))
+    assert -2e-5 < sticking.max() < 2e-6
+    sliding = blow(0.0, (1.0, 0.0, 0.0), mass=30.0, force=30.0)[:25]  # then it meets the capsule
+    assert np.abs(sliding[-10:]).max() < 1e-5
+
+
 @pytest.mark.parametrize("mu", [0.1, 0.4])
 def test_friction_breaks_away_at_coulombs_limit_and_slides_at_it(mu: float) -> None:
     samples = pressed(6000, 3.0)
@@ -317,7 +423,7 @@ def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
 
 
 def drumming(count: int) -> np.ndarray:
-    """Returns samples of a hand that drums on the floor at 20 Hz, too fast for an empty tank."""
+    """Returns samples of a hand that drums on the floor at 20 Hz."""
     time = T * np.arange(1, count + 1)
     places, turns = np.zeros((count, 3)), np.zeros((count, 3))
     places[:, 0] = 0.004 * np.sin(2 * np.pi * 1.3 * time)
@@ -330,11 +436,14 @@ def drumming(count: int) -> np.ndarray:
 def test_compiled_ticks_equal_those_through_mujocos_bindings(method: str) -> None:
     samples = drumming(600)
 
-    def block() -> Scene:
-        return scene(BLOCK, mass=0.03, mu=0.1)
+    def sunken_block() -> Run:
+        block = scene(BLOCK, mass=0.03, mu=0.1)
+        block.data.qpos[2] = -3e-4
+        run = prepared(block, method)
+        run.binding.state["contact"]["cap"] = 1e-6  # too little for the way out
+        return run
 
-    one = go_on(prepared(block(), method), samples)
-    other = through(prepared(block(), method), samples)
+    one, other = go_on(sunken_block(), samples), through(sunken_block(), samples)
     assert one.ticks.tobytes() == other.ticks.tobytes()
     assert int(one.binding.state["contact"]["repetitions"][0]) > 0
     assert strict(one)
@@ -376,12 +485,18 @@ def test_a_recorded_contact_is_read_back_and_repeated(contact: str, tmp_path: Pa
 
 def test_contact_of_the_scene_restores_what_rigid_contact_changed() -> None:
     loaded = scene(PEG, cone="pyramidal")
-    fields = ("geom_margin", "pair_margin", "flex_margin")
+    fields = ("geom_margin", "pair_margin", "flex_margin", "body_margin")
     before = [getattr(loaded.model, name).copy() for name in fields]
     own = loaded.model.opt.cone, loaded.model.opt.impratio, loaded.model.opt.o_margin
     prepared(loaded)
     assert loaded.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert (loaded.model.geom_margin > 0).all()
+    resting = loaded.model.geom_margin.copy()
+    run = go_on(prepared(loaded), drumming(300))
+    assert loaded.model.geom_margin.max() > resting.max()
+    assert (loaded.model.body_margin >= loaded.model.geom_margin.max()).any()
+    run.binding.release()
+    assert (loaded.model.geom_margin == resting).all()
     prepared(loaded, contact="scene")
     after = [getattr(loaded.model, name) for name in fields]
     assert all((a == b).all() for a, b in zip(before, after, strict=True))
