@@ -130,7 +130,7 @@ class Resimulator:
     """
 
     def __init__(
-        self, recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
+        self, recording: RecordingFile, parameters: RunParameters, scene: Scene | None = None
     ) -> None:
         events = recording.events
         self._changes = deque(event for event in events if event.get("event") in _CHANGES)
@@ -139,7 +139,7 @@ class Resimulator:
         ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.scene = attached_scene(recording, parameters, is_trusted=is_trusted)
+        self.scene = scene or attached_scene(recording, parameters)
         self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
@@ -313,10 +313,11 @@ def _compared(
     recording: RecordingFile, described: AuditedRun, allow: Callable[[float], None]
 ) -> ReplayOutcome:
     try:
-        run = Resimulator(recording, described.parameters, is_trusted=True)
+        scene = attached_scene(recording, described.parameters, is_trusted=True)
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
     allow(SIMULATION_TIME + SLOWEST * recording.count * described.parameters.period)
+    run = Resimulator(recording, described.parameters, scene)
     is_exact = is_same_processor(recording)
     if fault := first_contradiction(
         scene_statements(run.scene, recording, described, is_exact=is_exact)

@@ -313,7 +313,7 @@ def touched_pairs(
     ticks, total = evidence.ticks, float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        run = Resimulator(evidence.recording, evidence.parameters, is_trusted=True)
+        run = Resimulator(evidence.recording, evidence.parameters)
         for begin in range(0, window.start, BLOCK):
             run.add(ticks[begin : min(begin + BLOCK, window.start)])
         for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):
