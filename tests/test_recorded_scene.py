@@ -116,22 +116,27 @@ def chunk(content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "count", "words"),
     [
-        (bytes(1 << 26), "more than 100 times the file"),
-        (bytes(1 << 23), "is beyond"),
-        (struct.pack("<BQ", 0x7F, 0) * 400_000, "holds a record of kind 127"),
-        (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, "does not match"),
+        (bytes(1 << 22), 20, "more than 100 times the file"),
+        (bytes(1 << 23), 20, "is beyond"),
+        (struct.pack("<BQ", 0x7F, 0) * 400_000, 1, "holds a record of kind 127"),
+        (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, 1, "does not match"),
     ],
-    ids=["64 MB of zeros", "8 MB of zeros", "unknown records", "messages of no topic"],
+    ids=[
+        "80 MB in small chunks",
+        "160 MB in large chunks",
+        "unknown records",
+        "messages of no topic",
+    ],
 )
 def test_a_small_file_that_unpacks_to_much_is_not_unpacked(
-    content: bytes, words: str, honest: Recording, tmp_path: Path
+    content: bytes, count: int, words: str, honest: Recording, tmp_path: Path
 ) -> None:
     data, at, path = honest.path.read_bytes(), 8, tmp_path / "bomb.mcap"
     while data[at] != 6:
         at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
-    path.write_bytes(data[:at] + chunk(content) + data[at:])
+    path.write_bytes(data[:at] + count * chunk(content) + data[at:])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     assert words in "; ".join(read_recording(path).problems)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < PROCESSOR_TIME

@@ -266,6 +266,7 @@ class Container:
                 if opcode == Opcode.CHUNK:
                     count += 1
                     size = self._claimed_size(body, stop)
+                    size = 0 if size > MAX_CHUNK_SIZE else size  # refused by itself
                     if size > room:
                         self.problems.append(
                             f"chunk {count} (at byte {start}) is not read: it claims {size} bytes, "
