@@ -234,15 +234,59 @@ def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_
     assert message.startswith("part.xml, line 2: mass of <geom> is 'nan'")
 
 
-def test_force_limit_of_joint_is_refused_on_tool_and_accepted_elsewhere(tmp_path: Path) -> None:
+ARM_UNDER_LIMIT = HINGE_TOOL.format(joint="actuatorfrcrange='-0.3 0.2'")
+
+
+def turning(model: mujoco.MjModel, control: float, pull: float = 0.0) -> float:
+    """Returns the torque in N m on the elbow under a motor's control and a coupling's pull."""
+    data = mujoco.MjData(model)
+    data.ctrl[0] = control
+    if pull:
+        data.mocap_pos[-1, 1] += pull
+    mujoco.mj_forward(model, data)
+    return float(data.qfrc_actuator[0])
+
+
+@pytest.mark.parametrize("gear", [1.0, -4.0])
+@pytest.mark.parametrize("own", ["", "forcerange='-0.04 0.1'"])
+def test_force_limit_of_a_joint_bites_its_motor_and_not_the_coupling(
+    tmp_path: Path, gear: float, own: str
+) -> None:
+    motor = f"<actuator><motor name='m' joint='elbow' gear='{gear}' {own}/></actuator>"
+    text = mjcf("<option gravity='0 0 0'/>", motor, body=ARM_UNDER_LIMIT)
+    scene, plain = load_scene(scene_file(tmp_path, text)), mujoco.MjModel.from_xml_string(text)
+    assert scene.changes[-1].startswith("force limit of joint 'elbow': on all actuators")
+    assert scene.changes[-1].endswith("→ on its actuator")
+    for control in (-10.0, -0.05, 0.01, 0.04, 10.0):
+        # MuJoCo's own limit of the scene without a coupling
+        assert turning(scene.model, control) == pytest.approx(turning(plain, control), abs=1e-15)
+    assert max(turning(scene.model, 10.0), turning(scene.model, -10.0)) <= 0.2
+    scene.set_gains((0.0, 1000.0, 0.0), (0.0, 0.0, 0.0))
+    # 1000 N/m · 0.02 m at an arm of 0.1 m
+    felt = turning(scene.model, 10.0, 0.02) - turning(scene.model, 10.0)
+    assert felt == pytest.approx(2.0, rel=1e-9)
+
+
+def test_force_limit_of_a_joint_is_each_motors_if_it_has_several(tmp_path: Path) -> None:
+    motors = "<motor name='a' joint='elbow'/><motor name='b' joint='elbow' gear='2'/>"
+    text = mjcf(f"<actuator>{motors}</actuator>", body=ARM_UNDER_LIMIT)
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.changes[-1].endswith("→ on each of its actuators")
+    ranges = scene.model.actuator_forcerange[:2].tolist()
+    assert ranges == [[-0.3, 0.2], [-0.15, 0.1]]
+
+
+def test_force_limit_is_moved_on_the_way_to_the_grip_alone(tmp_path: Path) -> None:
     limit = "actuatorfrcrange='-1 1'"
-    outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{{}}</body>"
-    message = refusal_of(tmp_path, mjcf(body=outer.format(HINGE_TOOL.format(joint=""))))
-    assert message.startswith("joint 'base' of body 'stand' limits actuator forces")
-    unnamed = HINGE_TOOL.format(joint=limit).replace('name="elbow"', "")
-    assert refusal_of(tmp_path, mjcf(body=unnamed)).startswith("joint '0' of body 'arm'")
+    outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{ARM_UNDER_LIMIT}"
+    path = scene_file(tmp_path, mjcf(body=outer + "</body>"))
+    assert load_scene(path).changes[-1].startswith("force limit of joint 'base' and 1 more:")
+    with pytest.raises(hb.SceneError, match=r"joint 'base' and 1 more limits .*--as-is"):
+        load_scene(path, as_is=True)
     elsewhere = f"<body pos='1 0 0'><joint {limit}/><geom size='.01'/></body>"
-    load_scene(scene_file(tmp_path, mjcf(world=elsewhere)))
+    scene = load_scene(scene_file(tmp_path, mjcf(world=elsewhere)))
+    assert scene.model.jnt_actfrclimited.tolist() == [0, 1]
+    assert not any("force limit" in change for change in scene.changes)
 
 
 TABLE = "<geom name='table' type='plane' size='1 1 1'/>"

@@ -182,8 +182,8 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     """Refuses a compiled model that cannot be coupled; returns warnings.
 
     Raises:
-        SceneError: Masses or inertias are not finite, the grip cannot move, a joint would cap the
-            coupling's force, or a default of the scene changed a coupling actuator.
+        SceneError: Masses or inertias are not finite, the grip cannot move, or a default of the
+            scene changed a coupling actuator.
     """
     for body_id in range(model.nbody):
         mass, inertia = model.body_mass[body_id], model.body_inertia[body_id]
@@ -192,22 +192,12 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
                 f"{_body_name(model, body_id)} has mass {mass:g} kg and inertia "
                 f"{inertia.tolist()} kg m²; all must be finite"
             )
-    chain = _ancestors(model, int(model.site(grip).bodyid[0]))
+    chain = ancestors(model, int(model.site(grip).bodyid[0]))
     if not any(model.body_dofnum[body_id] for body_id in chain):
         raise SceneError(
             f"grip '{grip}' sits on {_body_name(model, chain[0])}, which cannot move; put it on a "
             "body with a free joint or at the end of joints"
         )
-    for body_id in chain:
-        first = model.body_jntadr[body_id]
-        for joint_id in range(first, first + model.body_jntnum[body_id]):
-            if model.jnt_actfrclimited[joint_id]:
-                name = model.joint(joint_id).name or str(joint_id)
-                raise SceneError(
-                    f"joint '{name}' of {_body_name(model, body_id)} limits actuator forces "
-                    "(actuatorfrcrange), which would cap the coupling; remove it and limit the "
-                    "actuator's own forcerange"
-                )
     for name in COUPLING_ACTUATORS:
         _check_coupling_actuator(model, name)
     warnings = []
@@ -219,7 +209,8 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     return warnings
 
 
-def _ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
+def ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
+    """Returns the bodies from a body to the world, both included."""
     chain = [body_id]
     while chain[-1] != 0:
         chain.append(int(model.body_parentid[chain[-1]]))

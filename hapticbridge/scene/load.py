@@ -15,7 +15,7 @@ from hapticbridge.errors import SceneError, choices
 from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
 from hapticbridge.scene.compile import clause, compiled, seat_handle
 from hapticbridge.scene.grip import add_grip
-from hapticbridge.scene.handle import attach_handle, set_options
+from hapticbridge.scene.handle import attach_handle, limit_motors_alone, set_options
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
@@ -224,6 +224,7 @@ def compile_scene(
         data, values = mujoco.MjData(model), dict(source.parameters)
         scene = Scene(path, grip, model, data, source.sources, values, changes, spec)
         scene.reset()
+        scene.changes += limit_motors_alone(model, scene.data, grip, as_is=as_is)
     if checks_start:
         check_start(model, scene.data, grip)
     if warns:
