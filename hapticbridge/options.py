@@ -45,10 +45,10 @@ from hapticbridge.realtime import wants_real_time
 from hapticbridge.rendering import (
     Method,
     default_method,
-    loaded_handle,
     method_named,
     require_hazard_consent,
     resolve_contact_stiffness,
+    start_handle,
     static_load,
 )
 from hapticbridge.scene import Scene
@@ -387,23 +387,8 @@ class RunSetup:
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
-        is_absolute, guard = self.workspace.absolute, self.guard
-        handle_origin: tuple[float, ...] = IDENTITY_POSE
-        if self.method.has_law:
-            load = static_load(self.scene)
-            force, torque = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
-            guard = replace(
-                guard,
-                hold_force=guard.hold_force + force,
-                hold_torque=guard.hold_torque + torque,
-                idle_force=guard.idle_force + force,
-                idle_torque=guard.idle_torque + torque,
-            )
-        else:
-            load = np.zeros(6)
-        if not is_absolute:
-            handle_origin = loaded_handle(self.scene.grip_pose(), load, self.law)
-        return RunParameters(
+        is_absolute = self.workspace.absolute
+        unloaded = RunParameters(
             grip=self.scene.grip,
             period=self.period,
             substeps=self.substeps,
@@ -415,7 +400,7 @@ class RunSetup:
             torque_limit=self.limits.torque,
             ramp_ticks=self.limits.ramp_ticks(self.info, self.period),
             device_origin=IDENTITY_POSE if is_absolute else pose,
-            handle_origin=handle_origin,
+            handle_origin=IDENTITY_POSE if is_absolute else self.scene.grip_pose(),
             device_start=pose,
             scheme=self.method.scheme,
             is_rigid=self.method.is_rigid,
@@ -423,5 +408,22 @@ class RunSetup:
             contact_stiffness=self.contact_stiffness,
             device_damping=damping,
             device_rotational_damping=rotational_damping,
-            guarding=guard,
+            guarding=self.guard,
         )
+        return self._loaded(unloaded) if self.method.has_law else unloaded
+
+    def _loaded(self, parameters: RunParameters) -> RunParameters:
+        """Returns parameters with which the coupling holds the tool at rest at the start."""
+        load, guard = static_load(self.scene, parameters), parameters.guarding
+        force, torque = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
+        guard = replace(
+            guard,
+            hold_force=guard.hold_force + force,
+            hold_torque=guard.hold_torque + torque,
+            idle_force=guard.idle_force + force,
+            idle_torque=guard.idle_torque + torque,
+        )
+        handle = parameters.handle_origin
+        if not self.workspace.absolute:
+            handle = start_handle(self.scene, parameters, load)
+        return replace(parameters, handle_origin=handle, guarding=guard)

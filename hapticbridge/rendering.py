@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import Any
@@ -15,10 +16,13 @@ from numpy.typing import NDArray
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.kernel.codes import WELD_NAME, Scheme, added_id, coupling_ids
+from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import HANDLE, WELD_NAME, Scheme, added_id, coupling_ids
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.kernel.rigid_contact import finish_contacts
+from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered
 from hapticbridge.scene.contacts import warn_of_contacts
@@ -480,43 +484,126 @@ SETTLED = 1e-3
 """Largest relative change of the coupling's wrench over the last steps of a tool that has
 settled; no unit."""
 
+LIGHT = 0.1
+"""Wrench in N and N m below which changes are measured against it. A tool that rests on a table
+has no load to compare with."""
 
-def static_load(scene: Scene) -> NDArray[np.float64]:
+TRIAL_STEPS = 50
+"""Steps in which a load must prove better than none. A longer trial would judge the motion of a
+tool that hangs on its grip, not its start."""
+
+
+class Rehearsal:
+    """The start of a run on a copy of the scene's data, with the handle held still.
+
+    Contacts and limits are those of the run: rigid ones that are violated at the start hold the
+    tool, but do not push it out.
+
+    Args:
+        scene: The prepared scene, at its start; its model is set back at the end of ``steps``.
+        parameters: Parameters of the run.
+    """
+
+    def __init__(self, scene: Scene, parameters: RunParameters) -> None:
+        self.model, self.data = scene.model, mujoco.MjData(scene.model)
+        mujoco.mj_copyData(self.data, scene.model, scene.data)
+        self._parameters = replace(parameters, scheme=Scheme.IMPLICIT, substeps=1)
+        first = self.model.actuator_outadr[coupling_ids(self.model)[0]]
+        self._outputs = slice(first, first + 6)
+        self._handle = self.model.body_mocapid[self.model.body(HANDLE).id]
+
+    def steps(self, handle: tuple[float, ...], count: int) -> Iterator[NDArray[np.float64]]:
+        """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
+
+        Args:
+            handle: Pose of the handle.
+            count: Number of steps.
+        """
+        data = self.data
+        data.mocap_pos[self._handle], data.mocap_quat[self._handle] = handle[:3], handle[3:]
+        bound = BoundKernel(self.model, data, self._parameters)
+        record, step = bound.state[0], bound.step
+        finish = direct(finish_contacts, record)
+        try:
+            for _ in range(count):
+                step(self.model, data)
+                finish(record)
+                yield data.actuator_force[self._outputs].copy()
+        finally:
+            bound.release()
+
+
+def static_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
     """Returns the wrench that holds the tool of a prepared scene at rest, (6,) in N and N m.
 
     World frame, about the grip. The tool settles on the coupling with the handle at its grip; its
     motion is stopped whenever its kinetic energy has passed a peak (dynamic relaxation with kinetic
-    damping), on the scene's own contacts: MuJoCo alone would push at the margin of rigid ones. The
-    scene itself is not changed. Zero if the tool rests without a hand, or does not settle because
-    the scene moves it.
+    damping). The scene itself is not changed. Zero if the tool rests without a hand, or does not
+    settle because the scene moves it.
+
+    Args:
+        scene: The prepared scene, at its start.
+        parameters: Parameters of the run.
     """
-    model, load = scene.model_with_own_contact(), np.zeros(6)
-    data = mujoco.MjData(model)
-    mujoco.mj_copyData(data, model, scene.data)
-    mujoco.mj_forward(model, data)
-    grip = model.site(scene.grip).id
-    dofs = tree_of_tool(model, int(model.site_bodyid[grip])).dofs
-    if np.abs(data.qacc[dofs]).max(initial=0.0) < AT_REST:
-        return load
-    first = model.actuator_outadr[coupling_ids(model)[0]]
-    momentum, last, earlier = np.zeros(model.nv), 0.0, load
-    for step in range(SETTLING_STEPS):
-        mujoco.mj_step(model, data)
-        velocity = np.where(dofs, data.qvel, 0.0)
-        mujoco.mj_mulM(model, data, momentum, velocity)
-        kinetic = 0.5 * float(velocity @ momentum)
-        if kinetic < last:
-            data.qvel[dofs], kinetic = 0.0, 0.0
-        last = kinetic
-        if step % 100 == 99:
-            earlier, load = load, data.actuator_force[first : first + 6].copy()
-            if np.linalg.norm(load - earlier) <= SETTLED * np.linalg.norm(load):
-                handle = scene.grip_pose()[3:]  # the actuators push along the handle's axes
-                force, torque = np.zeros(3), np.zeros(3)
-                mujoco.mju_rotVecQuat(force, load[:3], np.array(handle))
-                mujoco.mju_rotVecQuat(torque, load[3:], np.array(handle))
-                return np.concatenate([force, torque])
+    rehearsal, grip = Rehearsal(scene, parameters), scene.grip_pose()
+    model, data = rehearsal.model, rehearsal.data
+    dofs = tree_of_tool(model, int(model.site_bodyid[model.site(scene.grip).id])).dofs
+    momentum, last, load = np.zeros(model.nv), 0.0, np.zeros(6)
+    with closing(rehearsal.steps(grip, SETTLING_STEPS)) as steps:
+        for count, wrench in enumerate(steps):
+            velocity = np.where(dofs, data.qvel, 0.0)
+            if np.abs(velocity).max(initial=0.0) < AT_REST * model.opt.timestep:
+                return _turned(grip, wrench)
+            mujoco.mj_mulM(model, data, momentum, velocity)
+            kinetic = 0.5 * float(velocity @ momentum)
+            if kinetic < last:
+                data.qvel[dofs], kinetic = 0.0, 0.0
+            last = kinetic
+            if count % 100 == 99:
+                change, load = np.linalg.norm(wrench - load), wrench
+                if change <= SETTLED * max(float(np.linalg.norm(load)), LIGHT):
+                    return _turned(grip, wrench)
     return np.zeros(6)
+
+
+def _turned(pose: tuple[float, ...], wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns a wrench in the axes of a pose, in those of the world."""
+    result, orientation = np.zeros((2, 3)), np.array(pose[3:])
+    for half, part in zip(result, wrench.reshape(2, 3), strict=True):
+        mujoco.mju_rotVecQuat(half, part, orientation)
+    return result.ravel()
+
+
+def start_handle(
+    scene: Scene, parameters: RunParameters, load: NDArray[np.float64]
+) -> tuple[float, ...]:
+    """Returns the handle pose (7,) at which the coupling carries the tool from the start on.
+
+    The coupling carries a load as far as its force level goes. A tool that can move far while its
+    grip is held, such as a robot that falls beside its foot, needs another wrench at its start than
+    when it has come to rest. The handle then starts at the grip: of both poses the one is taken
+    from which the coupling's energy strays less at first.
+
+    Args:
+        scene: The prepared scene, at its start.
+        parameters: Parameters of the run.
+        load: Result of ``static_load``.
+    """
+    coupling, grip = parameters.coupling, scene.grip_pose()
+    levels = np.array([parameters.force_limit, parameters.torque_limit * parameters.scale])
+    sizes = np.linalg.norm(load.reshape(2, 3), axis=1) * parameters.force_scale
+    shares = np.minimum(levels / np.maximum(sizes, levels), 1.0)
+    carried = load * np.repeat(shares, 3)
+    poses = loaded_handle(grip, carried, coupling), grip
+    if poses[0] == grip:
+        return grip
+    stiffness = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
+    has_spring, strays = stiffness > 0.0, []
+    for pose in poses:
+        wrenches = np.array(list(Rehearsal(scene, parameters).steps(pose, TRIAL_STEPS)))
+        change = (wrenches - wrenches[0])[:, has_spring]
+        strays.append(float((change**2 / stiffness[has_spring]).sum(axis=1).max()))
+    return poses[int(np.argmin(strays))]
 
 
 def loaded_handle(

@@ -265,7 +265,8 @@ class Session:
         bound = BoundKernel(scene.model, scene.data, self.parameters)
         resources.callback(bound.release)
         self.kernel.bind(bound, setup)
-        refuse_stretched_start(bound.state, sample, setup.limits)
+        if setup.workspace.absolute:
+            refuse_stretched_start(bound.state, sample, setup.limits)
         if self.stream.is_read:
             self.stream.start(self._description(), attachments(scene))
             self.event("start")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,6 +16,7 @@ from outside_scenes import hand_file, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.rendering import loaded_handle, static_load
 
 Array = NDArray[np.float64]
 Stops = list[tuple[float, tuple[float, float, float]]]
@@ -191,3 +193,97 @@ def test_command_runs_scene(tmp_path: Path, call: Called, monkeypatch: pytest.Mo
     report, recording = hb.audit("lauf 1.mcap"), hb.read_recording("lauf 1.mcap")
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert recording.attachments["scene/Schublade 1.xml"] == outside.DRAWER.encode()
+
+
+# Starts that are not at rest
+
+BEYOND_ITS_LIMIT = """<mujoco>
+  <worldbody>
+    <body pos="0 0 1">
+      <joint axis="0 1 0" range="-70 -30" armature="0.01" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.3"/>
+      <site name="grip" pos="0.3 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""A lever that starts 30 degrees beyond a limit, with MuJoCo's default options."""
+
+
+def started(folder: Path, text: str, **options: Any) -> hb.Bridge:
+    scene = hb.load_scene(scene_file(folder, text), as_is=options.pop("as_is", False))
+    return hb.Bridge(
+        scene, "simulated", clock=hb.SimulatedClock(), recording=folder / "run.mcap", **options
+    )
+
+
+def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: Path) -> None:
+    with started(tmp_path, BEYOND_ITS_LIMIT) as bridge:
+        offset = np.subtract(bridge.session.parameters.handle_origin, bridge.scene.grip_pose())
+        bridge.run(duration=0.5)
+    # the limit holds the lever's weight, and does not push
+    assert np.linalg.norm(offset[:3]) * K < 0.1
+    assert hb.audit(tmp_path / "run.mcap").verdict == "passive"
+    with (
+        started(tmp_path, BEYOND_ITS_LIMIT, contact="scene") as bridge,
+        pytest.raises(hb.SafetyTrip, match="energy|stretch"),
+    ):
+        bridge.run(duration=0.5)
+
+
+FLOPPY = """<mujoco>
+  <worldbody>
+    <body name="trunk" pos="0 0 1">
+      <freejoint/>
+      <geom size="0.1" mass="2"/>
+      <body pos="0.1 0 0">
+        <joint axis="0 1 0" damping="0.01"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.1"/>
+        <site name="grip" pos="0.3 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""A trunk that falls while the end of its leg is held."""
+
+
+def test_handle_starts_at_grip_of_a_robot_that_falls_beside_it(tmp_path: Path) -> None:
+    with started(tmp_path, FLOPPY) as bridge:
+        parameters = bridge.session.parameters
+        assert parameters.handle_origin == bridge.scene.grip_pose()
+        load = static_load(bridge.scene, parameters)
+        # when all has come to rest, the leg hangs from the grip and the trunk from the leg
+        assert np.linalg.norm(load[:3]) == pytest.approx(2.1 * 9.81, rel=0.02)
+        bridge.run(duration=0.05)
+        # that load would throw the light end of the leg
+        loaded = loaded_handle(bridge.scene.grip_pose(), load, parameters.coupling)
+        assert loaded[2] - bridge.scene.grip_pose()[2] > 5e-3
+        assert np.linalg.norm(bridge.latest_records(1)["wrench_on_tool"][0, :3]) < 10.0
+
+
+SERVO_ARM = """<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body>
+      <joint name="elbow" axis="0 1 0" damping="0.5"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1"/>
+      <site name="grip" pos="0.3 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><position name="elbow" joint="elbow" kp="200"/></actuator>
+  <keyframe><key name="home" qpos="1.5"{}/></keyframe>
+</mujoco>"""
+
+
+def test_servo_holds_the_pose_of_a_keyframe_without_controls(tmp_path: Path) -> None:
+    with started(tmp_path, SERVO_ARM.format("")) as bridge:
+        bridge.run(duration=0.5)
+        assert bridge.scene.changes[-1] == "ctrl of 1 servo in keyframe 'home': 0 → its pose"
+        assert bridge.scene.data.qpos[0] == pytest.approx(1.5, abs=0.02)
+    assert hb.audit(tmp_path / "run.mcap").verdict == "passive"
+    # controls of the file, and the file as it is, stay
+    for text, as_is in ((SERVO_ARM.format(' ctrl="0.1"'), False), (SERVO_ARM.format(""), True)):
+        with (
+            started(tmp_path, text, as_is=as_is) as bridge,
+            pytest.raises(hb.SafetyTrip, match="energy|stretch"),
+        ):
+            bridge.run(duration=0.5)

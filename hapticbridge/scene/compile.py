@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 
 import mujoco
+import numpy as np
 
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene.source import SourceFile
@@ -72,6 +73,51 @@ def seat_handle(model: mujoco.MjModel, grip: str) -> None:
         mujoco.mj_kinematics(model, data)
         model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
         model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
+
+
+def hold_servos(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Aims the position servos at their pose in keyframe ``home`` if this has no controls.
+
+    MuJoCo reads missing controls as zeros, so that the servos would fling the scene out of the pose
+    that the keyframe describes.
+
+    Returns:
+        The change, as ``name: old → new``; nothing if no servo was to leave its pose.
+    """
+    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
+    if key < 0 or np.any(model.key_ctrl[key]) or np.any(model.key_act[key]):
+        return ()
+    data, moved = mujoco.MjData(model), []
+    mujoco.mj_resetDataKeyframe(model, data, key)
+    mujoco.mj_fwdPosition(model, data)
+    for actuator in range(model.nactuator):
+        control, output = model.actuator_ctrladr[actuator], model.actuator_outadr[actuator]
+        if _is_servo(model, actuator):
+            target = data.actuator_length[output]
+            if model.actuator_ctrllimited[control]:
+                target = np.clip(target, *model.actuator_ctrlrange[control])
+            if abs(target) > SERVO_ERROR:
+                model.key_ctrl[key, control] = target
+                moved.append(model.actuator(actuator).name or str(actuator))
+    count = f"{len(moved)} servo{'s' if len(moved) > 1 else ''}"
+    return (f"ctrl of {count} in keyframe '{START_KEYFRAME}': 0 → its pose",) if moved else ()
+
+
+def _is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Returns True for a position servo, whose force is k (u − l) at rest."""
+    gain = float(model.actuator_gainprm[actuator, 0])
+    return bool(
+        gain > 0.0
+        and model.actuator_biasprm[actuator, 1] == -gain
+        and model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+        and model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_SITE
+    )
+
+
+SERVO_ERROR = 1e-6
+"""Smallest distance in m or rad between a servo's pose and zero that is worth a change."""
 
 
 def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjModel:

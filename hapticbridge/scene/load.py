@@ -13,7 +13,7 @@ import mujoco
 
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
-from hapticbridge.scene.compile import clause, compiled, seat_handle
+from hapticbridge.scene.compile import clause, compiled, hold_servos, seat_handle
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import attach_handle, limit_motors_alone, set_options
 from hapticbridge.scene.parameters import apply_parameters
@@ -221,6 +221,8 @@ def compile_scene(
         model = compiled(spec, source.sources)
         concerns = [*source.concerns, *about_grip, *check_model(model, grip)]
         seat_handle(model, grip)
+        if not as_is:
+            changes += hold_servos(model)
         data, values = mujoco.MjData(model), dict(source.parameters)
         scene = Scene(path, grip, model, data, source.sources, values, changes, spec)
         scene.reset()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -147,14 +146,6 @@ class Scene:
         for name, value in self._own_contact.items():
             setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
         use_exact_points(model, is_used=False)
-
-    def model_with_own_contact(self) -> mujoco.MjModel:
-        """Returns the model if its contacts are the scene's own, else a copy that has these."""
-        if not self._own_contact:
-            return self.model
-        model = copy.copy(self.model)
-        self._restore_contact(model)
-        return model
 
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
