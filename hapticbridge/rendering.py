@@ -24,7 +24,7 @@ from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.rigid_contact import finish_contacts
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.scene import Scene
-from hapticbridge.scene.checks import check_metered
+from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
 from hapticbridge.scene.handle import measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
@@ -469,6 +469,8 @@ def prepare(
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
     effective = measured_weld(scene.model, scene.grip) if method.is_weld else None
     scene.reset()
+    if not method.is_rigid:
+        refuse_overlap(scene.model, scene.data, scene.grip)
     return effective
 
 

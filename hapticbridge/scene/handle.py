@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME, coupling_ids
-from hapticbridge.scene.checks import ancestors
+from hapticbridge.scene.checks import (
+    NOTABLE_OVERLAP,
+    Overlap,
+    ancestors,
+    is_nested,
+    overlaps,
+)
 from hapticbridge.scene.compile import go_to_start
 
 # Weld between grip and handle (MuJoCo's equality constraint)
@@ -327,3 +333,49 @@ def limit_motors_alone(
             model.actuator_forcerange[actuator] = low, high
     each = "each of its actuators" if shared else "its actuator"
     return (f"force limit of joint '{name}'{more}: on all actuators together → on {each}",)
+
+
+def exclude_nested(spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str) -> tuple[str, ...]:
+    """Excludes contacts between parts of a robot that begin inside each other, for good.
+
+    A link whose hull encloses part of the link that carries it is inside it in every pose. A
+    contact between them would only jam the joint.
+
+    Args:
+        spec: The scene with its handle; changed in place.
+        model: The model that it compiles to.
+        grip: Name of the site on the tool.
+
+    Returns:
+        The change, as ``name: old → new``; nothing if no exclusion was added, and the model is
+        that of the specification.
+    """
+    data = mujoco.MjData(model)
+    go_to_start(model, data, grip)
+    pairs: dict[tuple[int, int], Overlap] = {}
+    for overlap in overlaps(model, data, NOTABLE_OVERLAP):
+        if is_nested(model, *overlap.bodies):
+            pairs.setdefault(overlap.bodies, overlap)
+    bodies = list(spec.bodies)
+    if len(bodies) != model.nbody or not pairs:
+        return ()  # MuJoCo fused bodies, so that their numbers differ
+    for first, second in pairs:
+        for body_id in (first, second):
+            bodies[body_id].name = bodies[body_id].name or f"{PREFIX}body_{body_id}"
+        spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
+    return (f"contact where {_listed(list(pairs.values()))} at the start: on → off",)
+
+
+def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[str, ...]:
+    """Returns a sentence on what overlaps at the start, as a change ``name: old → new``."""
+    if found := overlaps(model, data, NOTABLE_OVERLAP):
+        return (
+            f"start where {_listed(found)}: pushed out at once → held, and eased out with energy "
+            "that the scene has dissipated",
+        )
+    return ()
+
+
+def _listed(found: list[Overlap]) -> str:
+    count = len(found) - 1
+    return str(found[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")
