@@ -14,6 +14,7 @@ from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, sce
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.inputs import input_writes
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
@@ -297,12 +298,19 @@ def resting(height: float) -> str:
     return mjcf(body=body, world=TABLE)
 
 
-def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) -> None:
-    message = refusal_of(tmp_path, resting(0.0098))
+def strict_refusal(folder: Path, text: str) -> str:
+    """Returns the refusal under ``as_is`` of a scene that loads without it."""
+    path = scene_file(folder, text)
+    load_scene(path)
+    return refusal(path, as_is=True)
+
+
+def test_tool_inside_something_is_refused_as_is_with_pair_and_depth(tmp_path: Path) -> None:
+    message = strict_refusal(tmp_path, resting(0.0098))
     assert "overlap by 0.2 mm" in message
     assert "geom 'table' and geom 'ball'" in message
     unnamed = resting(0.005).replace('name="ball"', "").replace("name='table'", "")
-    message = refusal_of(tmp_path, unnamed)
+    message = strict_refusal(tmp_path, unnamed)
     assert "overlap by 5 mm" in message
     assert "geom 0 of the world and geom 1 of body 'tool'" in message
 
@@ -315,25 +323,88 @@ def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) ->
 def test_start_is_refused_exactly_beyond_tenth_of_millimetre(tmp_path: Path, depth: float) -> None:
     path = scene_file(tmp_path, resting(0.01 - depth))
     if depth > 1.0001e-4:
-        assert "starts in penetration" in refusal(path)
+        assert "starts in penetration" in refusal(path, as_is=True)
     elif depth < 0.9999e-4:
-        load_scene(path)
+        load_scene(path, as_is=True)
 
 
 def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:
     deep = "<keyframe><key name='{}' qpos='0 0 0.005 1 0 0 0'/></keyframe>"
     text = resting(1.0).replace("</mujoco>", deep + "</mujoco>")
-    load_scene(scene_file(tmp_path, text.format("other")))
-    assert "overlap by 5 mm" in refusal_of(tmp_path, text.format("home"))
+    load_scene(scene_file(tmp_path, text.format("other")), as_is=True)
+    assert "overlap by 5 mm" in strict_refusal(tmp_path, text.format("home"))
 
 
-def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not(tmp_path: Path) -> None:
+def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not_as_is(
+    tmp_path: Path,
+) -> None:
     sunk = "<body pos='1 0 .005'><freejoint/><geom size='.01'/></body>"
-    load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)))
+    load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)), as_is=True)
     cloth = """<flexcomp name='cloth' type='grid' count='4 4 1' spacing='.05 .05 .05' mass='1'
       radius='.001'><edge equality='true'/></flexcomp>"""
-    message = refusal_of(tmp_path, mjcf(world=cloth))
+    message = strict_refusal(tmp_path, mjcf(world=cloth))
     assert "geom 'ball' and flex 'cloth'" in message
+
+
+def still_run(path: Path, **options: str) -> tuple[hb.Scene, np.ndarray, str]:
+    """Holds the device still for 1 s; returns scene, heights of the tool and verdict."""
+    scene = load_scene(path)
+    device = SimulatedDevice(path=Motion([0.0, 2.0], np.zeros((2, 3))))
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), **options) as bridge:
+        summary = bridge.run(duration=1.0)
+        ticks = bridge.latest_records(1000)
+    return scene, ticks["tool_position"][:, 2].copy(), summary.environment
+
+
+def test_tool_that_starts_inside_a_table_stays_there_in_a_still_hand(tmp_path: Path) -> None:
+    text = resting(0.005)
+    plain = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(plain)
+    speeds = []
+    while data.time < 0.2:
+        mujoco.mj_step(plain, data)
+        speeds.append(data.qvel[2])
+    assert max(speeds) > 0.05  # MuJoCo's own contact throws the ball out
+    scene, heights, environment = still_run(scene_file(tmp_path, text))
+    assert environment == "strict"
+    assert heights.max() < 0.0055  # nothing was dissipated that could pay for coming out
+    assert np.abs(np.diff(heights)).max() < 1e-5  # 10 mm/s
+    assert scene.changes[-1].startswith("start where geom 'table' and geom 'ball' overlap by 5 mm:")
+    with pytest.raises(hb.SceneError, match=r"in penetration.*--contact rigid"):
+        still_run(scene_file(tmp_path, text), contact="scene")
+
+
+NEST = """<body name='base'><geom name='shell' size='.05'/>
+<body name='mid' pos='0 0 .04'><joint name='first' axis='0 1 0'/><geom size='.001' mass='.1'
+contype='0' conaffinity='0'/><body {outer} pos='0 0 .01'><joint axis='1 0 0' {joint}/><geom name='tip' size='.02' mass='.1'/>
+<site name='grip'/></body></body></body>"""
+
+
+@pytest.mark.parametrize("outer", ["name='outer'", ""])
+def test_links_inside_each_other_are_excluded_and_neighbours_of_the_tree_are_not(
+    tmp_path: Path, outer: str
+) -> None:
+    text = mjcf(
+        body=NEST.format(outer=outer, joint=""), world=TABLE.replace("/>", " pos='0 0 -1'/>")
+    )
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.data.ncon == 0
+    assert mujoco.MjModel.from_xml_string(text).nexclude == 0
+    assert scene.model.nexclude == 1
+    assert scene.changes[-1].startswith(
+        "contact where geom 'shell' and geom 'tip' overlap by 20 mm"
+    )
+    assert refusal(scene.path, as_is=True).startswith(
+        "the tool starts in penetration: geom 'shell'"
+    )
+    # it still meets what is not part of the robot
+    ball = "<body pos='0 0 .06'><freejoint/><geom name='ball' size='.02'/></body>"
+    scene = load_scene(scene_file(tmp_path, text.replace("</worldbody>", ball + "</worldbody>")))
+    assert scene.data.ncon >= 1
+    # a shallow overlap is held, because a gripper that closes must not pass through itself
+    shallow = load_scene(scene_file(tmp_path, text.replace("pos='0 0 .01'", "pos='0 0 .0295'")))
+    assert shallow.model.nexclude == 0
+    assert shallow.data.ncon == 1
 
 
 @pytest.mark.parametrize(

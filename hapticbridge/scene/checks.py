@@ -314,9 +314,7 @@ def is_nested(model: mujoco.MjModel, first: int, second: int) -> bool:
     """
     if min(first, second) <= 0 or model.body_rootid[first] != model.body_rootid[second]:
         return False
-    groups = [
-        model.body_weldid[ancestors(model, body)[:-1]].tolist() for body in (first, second)
-    ]
+    groups = [model.body_weldid[ancestors(model, body)[:-1]].tolist() for body in (first, second)]
     return groups[0][0] in groups[1] or groups[1][0] in groups[0]
 
 

@@ -239,7 +239,7 @@ def compile_scene(
         if not as_is:
             changes += hold_servos(model)
         data, values = mujoco.MjData(model), dict(source.parameters)
-        scene = Scene(path, grip, model, data, source.sources, values, changes, spec)
+        scene = Scene(path, grip, model, data, source.sources, values, changes, as_is, _spec=spec)
         scene.reset()
         scene.changes += limit_motors_alone(model, scene.data, grip, as_is=as_is)
     if checks_start:
