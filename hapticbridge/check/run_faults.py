@@ -19,6 +19,7 @@ from hapticbridge.check.model_faults import constraint_faults, geometry_faults, 
 from hapticbridge.check.observe import Observation, Setting
 from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
+from hapticbridge.rendering import RIGID
 from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
@@ -151,7 +152,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     if seen.environment == "active":
         used = "more than the coupling's slack covers"
     sentence = f"contacts or joints created energy in the motion: {used}"
-    if not seen.meetings:
+    if not seen.meetings or case.contact == RIGID:
         return _created_without_contact(case, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
     one, other = (case.places.geom(geom) for geom in pair)

@@ -13,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.kernel.colliders import use_exact_points
-from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN
+from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
@@ -34,6 +34,13 @@ def has_rigid_contact(model: mujoco.MjModel) -> bool:
     for name in _MARGINS:
         margins += getattr(model, name).ravel().tolist()
     return min(margins) >= MARGIN and all(getattr(model.opt, k) == v for k, v in options.items())
+
+
+def _widen_bodies(model: mujoco.MjModel, more: float) -> None:
+    """Lets MuJoCo compare bodies from the distance of their geoms' contacts, and more, in m."""
+    model.body_margin[:] = 0.0
+    reach = model.geom_margin + model.geom_gap + more
+    np.maximum.at(model.body_margin, model.geom_bodyid, reach)
 
 
 @dataclass(slots=True)
@@ -120,6 +127,7 @@ class Scene:
         self.model.geom_gap += more
         self.model.pair_gap += more
         self.model.flex_gap += more
+        self._set_margins()
 
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
@@ -130,6 +138,7 @@ class Scene:
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
+            self._set_margins()
             return
         if not is_rigid:
             self._restore_contact(model)
@@ -141,14 +150,19 @@ class Scene:
         for name, value in _CONTACT_OPTIONS.items():
             setattr(model.opt, name, value)
         model.opt.o_margin = max(own["o_margin"], MARGIN)
-        for name in _MARGINS:
-            margins = getattr(model, name)
-            margins[:] = np.maximum(margins, MARGIN)
+        self._set_margins()
         use_exact_points(model)
+
+    def _set_margins(self) -> None:
+        """Sets the margins of rigid contacts at rest; in a run they follow the speed."""
+        for name in _MARGINS if self._own_contact else ():
+            getattr(self.model, name)[:] = np.maximum(self._own_contact[name], MARGIN)
+        _widen_bodies(self.model, LARGEST_MARGIN if self._own_contact else 0.0)
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
         for name, value in self._own_contact.items():
             setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+        _widen_bodies(model, 0.0)
         use_exact_points(model, is_used=False)
 
     def set_gains(
