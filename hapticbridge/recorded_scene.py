@@ -23,7 +23,13 @@ from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import check_prepared, prepare
-from hapticbridge.run_description import SOURCE_PREFIX, method_of, model_digest, requested_of
+from hapticbridge.run_description import (
+    CARRIED,
+    SOURCE_PREFIX,
+    method_of,
+    model_digest,
+    requested_of,
+)
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.scene.source import refuse_outside
 
@@ -203,8 +209,10 @@ def recorded_values(meta: Mapping[str, str]) -> dict[str, float]:
         raise RecordingError(f"metadata 'scene_parameters' are not numbers: {error}") from None
 
 
-def load_unpacked(main: Path, grip: str, values: Mapping[str, float]) -> Scene:
-    """Loads an unpacked scene with these values of its parameters.
+def load_unpacked(
+    main: Path, grip: str, values: Mapping[str, float], meta: Mapping[str, str]
+) -> Scene:
+    """Loads an unpacked scene with these values of its parameters, its tool carried as recorded.
 
     Raises:
         SceneError: A value is out of range, or the scene cannot be loaded.
@@ -214,7 +222,10 @@ def load_unpacked(main: Path, grip: str, values: Mapping[str, float]) -> Scene:
     changed = {name: value for name, value in values.items() if defaults.get(name) != value}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-        return load_scene(main, grip, as_is=False, **changed)
+        scene = load_scene(main, grip, as_is=False, **changed)
+    if meta.get("tool_weight") == CARRIED:
+        scene.carry_tool("as recorded")
+    return scene
 
 
 def compile_recorded(
@@ -239,8 +250,9 @@ def compile_recorded(
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
             main = unpack_scene(recording, Path(folder))
-            scene = load_unpacked(main, parameters.grip, recorded_values(recording.meta))
-            requested, method = requested_of(recording.meta), method_of(recording.meta)
+            meta = recording.meta
+            scene = load_unpacked(main, parameters.grip, recorded_values(meta), meta)
+            requested, method = requested_of(meta), method_of(meta)
             steps = parameters.period, parameters.substeps
             prepare(scene, requested, *steps, method, warns=False)
             check_prepared(scene.model, parameters, method)

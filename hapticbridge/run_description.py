@@ -180,6 +180,9 @@ def processor() -> str:
 
 SOURCE_PREFIX = "scene/"
 
+CARRIED = "carried"
+"""Value of ``tool_weight`` in the metadata if the scene compensates the tool's weight."""
+
 _MID_RUN = "mid-run"
 """Value of metadata ``began`` in recordings of earlier versions that begin during a run."""
 
@@ -238,6 +241,7 @@ def describe_run(
         "device": device.to_json(),
         "scene": scene.name,
         "scene_file": scene.path.name,
+        "tool_weight": CARRIED if scene.is_carried else "felt",
         "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
         "scene_sha256": model_digest(scene.model),

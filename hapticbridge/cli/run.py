@@ -30,6 +30,7 @@ from hapticbridge.guard import (
     Limits,
     refuse_simulated_time,
 )
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
@@ -52,8 +53,6 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}, "
         f"{method.contact} contacts"
     )
-    if setup.scene.changes:
-        err.print(f"  options changed in the scene: {escape(', '.join(setup.scene.changes))}")
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
@@ -117,8 +116,16 @@ def _without_motor(setup: RunSetup) -> Iterator[str]:
 
 
 def announce_measured(bridge: Bridge) -> None:
-    """Prints the device conditions of a method without a coupling law, known once it is open."""
+    """Prints what is known once the bridge is open.
+
+    These are the changes of the scene, the tool's weight, and the device conditions of a method
+    without a coupling law.
+    """
     setup, parameters = bridge.setup, bridge.session.parameters
+    for change in setup.scene.changes:
+        err.print(f"  changed in the scene: {escape(change)}")
+    for sentence in _weight_in_hand(setup, parameters):
+        err.print(f"  {sentence}")
     if setup.method.has_law:
         return
     if parameters.effective is not None:
@@ -130,6 +137,22 @@ def announce_measured(bridge: Bridge) -> None:
     for sentence in bridge.conditions():
         head = "  " if sentence in met else "[yellow]warning:[/yellow] "
         err.print(head + escape(sentence))
+
+
+HEAVY = 0.25
+"""Share of the force limit above which a sentence tells the tool's load; no unit."""
+
+
+def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]:
+    """Yields a sentence on the load of the tool at rest, if it is a heavy one."""
+    load = parameters.guarding.idle_force - setup.guard.idle_force
+    in_hand = setup.workspace.scales[1] * load
+    if setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf:
+        sag = format_si(load / parameters.coupling.stiffness, "m")
+        yield (
+            f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
+            "the handle; --no-tool-weight carries it"
+        )
 
 
 _WELD = "the weld in its stiffest directions at the start"
@@ -241,8 +264,9 @@ class Run:
     """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
     body's frame. If the scene has none of that name, the most plausible ones are listed."""
     as_is: bool = False
-    """Refuse a scene with options that exclude the coupling (solver PGS, noslip_iterations, sleep);
-    by default they are changed, and a line lists them."""
+    """Refuse a scene that must be changed to be felt: options that exclude the coupling (solver
+    PGS, noslip_iterations, sleep), force limits of joints, a tool inside something or too heavy.
+    By default it is changed, with a line for each change."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
@@ -318,6 +342,8 @@ class Run:
     """Button of the device, from 0: while it is held the device moves without handle and force."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
+    tool_weight: bool = True
+    """Feel the tool's weight, unless the device cannot hold it. --no-tool-weight carries it."""
     mark: int | None = None
     """Button of the device, from 0: each press writes an event 'mark' into the recording.
     'hapticbridge export --from S --to S' cuts a recording."""
@@ -439,6 +465,7 @@ class Run:
             clutch=self.clutch,
             dead_man=self.dead_man,
             mark=self.mark,
+            tool_weight=self.tool_weight,
             live=not self.as_json and (err.is_terminal or not self.fast),
             realtime=self.realtime or None,
         )

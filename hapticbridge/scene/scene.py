@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
@@ -65,7 +65,9 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
-        changes: Options of the file that were changed, each as ``name: old → new``.
+        changes: What differs from the file, each as ``name: old → new``.
+        as_is: True if the scene must not be changed to be felt.
+        is_carried: True if the weight of the tool is compensated (``carry_tool``).
     """
 
     path: Path
@@ -75,6 +77,8 @@ class Scene:
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
     changes: tuple[str, ...] = ()
+    as_is: bool = False
+    is_carried: bool = False
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -188,6 +192,32 @@ class Scene:
             self.model.actuator_biasprm[actuator_id, 1] = -stiffness
             self.model.actuator_biasprm[actuator_id, 2] = -damping
 
+    def carry_tool(self, reason: str) -> None:
+        """Compensates the weight of all that moves with the grip (MuJoCo's ``gravcomp``).
+
+        ``model`` and ``data`` are replaced, and the change is noted with its reason. Inertia,
+        contacts and motors stay. The compensation's work is metered at the external port.
+
+        Raises:
+            SceneError: The scene was not made by ``load_scene``.
+        """
+        if self._spec is None:
+            raise SceneError("only the weight of a tool in a scene from load_scene can be carried")
+        # MuJoCo compensates only if a body asked for it in compilation; the handle has no mass
+        self._spec.body(HANDLE).gravcomp = 1.0
+        self._recompile(self._spec)
+        model = self.model
+        body_id = model.site_bodyid[model.site(self.grip).id]
+        model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
+        self.is_carried = True
+        self.changes += (f"weight of the tool: felt → carried ({reason})",)
+        self.reset()
+
+    def _recompile(self, spec: mujoco.MjSpec) -> None:
+        model = compiled(spec, self.sources)
+        carry_over(self.model, model)
+        self.model, self.data = model, mujoco.MjData(model)
+
     def set_weld(self, coupling: Coupling | None) -> None:
         """Welds the grip to the handle with K and B as ``solref``; None removes the weld.
 
@@ -207,8 +237,6 @@ class Scene:
             spec = self._spec.copy()
             if coupling is not None:
                 add_weld(spec, self.grip)
-            model = compiled(spec, self.sources)
-            carry_over(self.model, model)
-            self.model, self.data = model, mujoco.MjData(model)
+            self._recompile(spec)
         if coupling is not None:
             set_weld_gains(self.model, coupling)

@@ -176,7 +176,9 @@ class RecordedRun:
         Raises:
             SceneError: A parameter is out of range, or the scene cannot be loaded.
         """
-        return load_unpacked(self.scene_file, self.parameters.grip, settings.scene)
+        return load_unpacked(
+            self.scene_file, self.parameters.grip, settings.scene, self.recording.meta
+        )
 
     def is_scene_as_recorded(self) -> bool:
         """Returns True if the attached sources compile to the recorded model.
