@@ -17,6 +17,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
+from hapticbridge.check.own_motion import own_substeps
 from hapticbridge.cli.terminal import err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -31,7 +32,7 @@ from hapticbridge.guard import (
 )
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
-from hapticbridge.scene import Scene, load_scene, settings_from
+from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
@@ -68,8 +69,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         err.print(f"  {method.name}: {escape(method.about)}")
     elif method.name != usual.name:
         err.print(
-            f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and {substeps} "
-            "are requested"
+            f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and this run "
+            f"{substeps}"
         )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
@@ -268,8 +269,10 @@ class Run:
     """Accept a method that may kick on a real device; the first three never need it."""
     rate: float = 1000.0
     """Ticks per second."""
-    substeps: int = 1
-    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent."""
+    substeps: int | None = None
+    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent. By default one,
+    or as many as keep the file's own time step if it is shorter and the scene alone would move
+    noticeably differently."""
     realtime: bool = False
     """Request real-time priority and locked memory for the loop, and print what the system refuses
     (see 'hapticbridge doctor'). Always done with a real device."""
@@ -345,12 +348,33 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        scene = load_scene(self.scene, self.grip, as_is=self.as_is, **settings_from(self.settings))
+        source = read_scene(self.scene, **settings_from(self.settings))
+        scene = compile_scene(source, self.grip, as_is=self.as_is)
+        chosen = (
+            self
+            if self.substeps is not None
+            else replace(self, substeps=self._own_substeps(source))
+        )
         with ExitStack() as stack:
             callbacks = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, clock, stack, window, callbacks)
+            return chosen._feel(scene, device, clock, stack, window, callbacks)
+
+    def _own_substeps(self, source: SceneSource) -> int:
+        """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
+        if self.method is not None:
+            return 1
+        period = period_of(self.rate)
+        count, moved = own_substeps(source, self.grip, period)
+        if count > 1:
+            notify(
+                f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
+                "scene alone would move noticeably differently (--substeps 1 takes one)"
+            )
+        elif moved is not None and moved.jnd > 1.0:
+            notify(f"{moved}; {moved.remedy(period)}")
+        return count
 
     def _feel(
         self,
@@ -391,7 +415,7 @@ class Run:
     def _options(self, info: DeviceInfo) -> BridgeOptions:
         return BridgeOptions(
             rate=self.rate,
-            substeps=self.substeps,
+            substeps=1 if self.substeps is None else self.substeps,
             method=self.method,
             contact=self.contact,
             contact_stiffness=self.contact_stiffness,

@@ -22,7 +22,8 @@ environment has dissipated,
 
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
 remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
-moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
+moved mocap body pays for its own push: its work, of the external port, is subtracted from C. One
+that recedes by δ takes δ/h from ŵ: what rests on it follows, and its energy goes into that port.
 All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before it closes:
 margins follow the speed (``follow_speed``).
 Limits of joints are rows like a contact's without friction and share the tank. Limits of tendons
@@ -49,7 +50,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import LIMIT_JOINT, Part, State
-from hapticbridge.kernel.ledger import mocap_contact_work
+from hapticbridge.kernel.ledger import mocap_contact_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
@@ -185,6 +186,9 @@ def _aim(s: State) -> None:
             slide += (friction[j - 1] * velocities[row + j]) ** 2
         distance = floats(contact + mj.contact_distance, 1)[0]
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
+        if s.energy.mocap_has_moved:
+            opened = max(opened_by_mocap(s, contact), 0.0)
+            wanted -= max(opened - max(distance, 0.0), 0.0) / h
         stop = max(wanted - velocities[row], 0.0)
         wanted -= max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
