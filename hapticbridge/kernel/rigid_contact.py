@@ -34,7 +34,7 @@ nothing. Equality constraints of a flex stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
-an impedance d, R is (1 − d)/d of the row's inverse inertia, and under ``integrator="discrete"``
+an impedance d and under ``integrator="discrete"``, R is (1 − d)/(2 d) of the row's inverse inertia,
 
     solref = (−ε d², −d/h),  position = −(2ŵ − v)/(ε h d)    →    J v⁺ = ŵ − h R λ
     solreffriction = (0, −d/(ε h))                           →    ŵ_t = 0 to ε
@@ -60,7 +60,7 @@ from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
-m sinks in by h² F SOFTNESS/(m DEPENETRATION), 0.15 µm at 3 N on 0.1 kg and 1 ms. A smaller value
+m sinks in by h² F SOFTNESS/(2 m DEPENETRATION), 0.08 µm at 3 N on 0.1 kg and 1 ms. A smaller value
 is more rigid and slower to solve."""
 
 DEPENETRATION = 0.2
