@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -515,7 +515,7 @@ class Rehearsal:
         self._outputs = slice(first, first + 6)
         self._handle = self.model.body_mocapid[self.model.body(HANDLE).id]
 
-    def steps(self, handle: tuple[float, ...], count: int) -> Iterator[NDArray[np.float64]]:
+    def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
         """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
 
         Args:

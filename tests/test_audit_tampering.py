@@ -176,10 +176,10 @@ def test_the_scene_is_compiled_from_what_is_attached(tap: Recording, folder: Pat
         assert report.verdict == ("invalid" if words else "passive")
     sheet = {SCENE.replace(".xml", ".toml"): b""}
     assert verdict_of(tap, folder, attachments=sheet).verdict == "invalid"
-    other = {
+    heavier = {
         "scene_parameters": json.dumps(json.loads(tap.meta["scene_parameters"]) | {"mass": 0.12})
     }
-    assert "scene_sha256" in verdict_of(tap, folder, meta=other).reason
+    assert "scene_sha256" in verdict_of(tap, folder, meta=heavier).reason
 
 
 def test_another_processor_may_compile_another_model_which_is_then_not_judged(

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import zstandard
 from audit_cases import recorded, rewritten, tapped
+from cli_cases import Called
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.replay import compare_resimulation
@@ -221,15 +222,15 @@ def test_a_child_has_the_time_that_it_is_allowed() -> None:
 
 
 def test_a_crash_of_a_scene_is_exit_code_2_and_a_row(
-    honest: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., object]
+    honest: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Called
 ) -> None:
     path = rewritten(honest, tmp_path / "a.mcap")
     crash = lambda *_, **__: os.kill(os.getpid(), signal.SIGSEGV)  # noqa: E731
     monkeypatch.setattr(sys.modules[compare_resimulation.__module__], "Resimulator", crash)
-    code, _, err = call("audit", path)  # type: ignore[misc]
+    code, _, err = call("audit", path)
     assert code == 2
     assert "crashed MuJoCo (SIGSEGV)" in err
-    code, out, _ = call("audit", path, honest.path)  # type: ignore[misc]
+    code, out, _ = call("audit", path, honest.path)
     assert code == 2
     assert "2 unreadable" in out
 
