@@ -36,6 +36,8 @@ def lazy_exports(
                     places |= {alias.name: (module, alias.name) for alias in aliases}
                 case ast.ImportFrom(names=aliases):
                     present += [alias.name for alias in aliases if alias.asname]
+                case ast.FunctionDef(name=name):
+                    present.append(name)
                 case ast.Assign(targets=[ast.Name(id=name)], value=ast.Name(id=other)):
                     places[name] = places[other]
     names = sorted({*places, *present})

@@ -22,7 +22,13 @@ from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
-from hapticbridge.errors import DeviceError, HapticBridgeError, RecordingError, choices
+from hapticbridge.errors import (
+    DeviceError,
+    HapticBridgeError,
+    RecordingError,
+    SceneError,
+    choices,
+)
 from hapticbridge.guard import (
     CONTROLLERS,
     UNLIMITED,
@@ -45,6 +51,7 @@ from hapticbridge.realtime import wants_real_time
 from hapticbridge.rendering import (
     Method,
     default_method,
+    holding_force,
     method_named,
     require_hazard_consent,
     resolve_contact_stiffness,
@@ -127,6 +134,8 @@ class BridgeOptions:
         clutch: Number of the device's button, from 0, that lets it move without the handle.
         dead_man: Number of the button, from 0, that must be held for any force.
         mark: Number of the button, from 0, that writes an event ``mark`` at each press.
+        tool_weight: True lets the hand feel the tool's weight, unless the device cannot hold it
+            (``RunSetup.holding``). False carries it (``Scene.carry_tool``).
         realtime: True requests real time from the system while the loop runs. A refused request is
             reported once, with the command that grants it. None requests it for a real device.
         pipelined: True computes ahead, after the wrench was sent, what needs no new sample
@@ -151,6 +160,7 @@ class BridgeOptions:
     clutch: int | None = None
     dead_man: int | None = None
     mark: int | None = None
+    tool_weight: bool = True
     realtime: bool | None = None
     pipelined: bool | None = None
     live: bool = False
@@ -199,6 +209,7 @@ class OptionChanges(TypedDict, total=False):
     clutch: int | None
     dead_man: int | None
     mark: int | None
+    tool_weight: bool
     realtime: bool | None
     pipelined: bool | None
     live: bool
@@ -247,6 +258,7 @@ class RunSetup:
         guard: Guard parameters.
         contact_stiffness: K_c in N/m for a massless tool, else 0.
         mark: Bit of the mark button; 0 without one.
+        tool_weight: False to carry the tool's weight.
         is_realtime: True if real time is requested from the system.
         is_pipelined: True if a tick computes ahead for the next one.
     """
@@ -262,6 +274,7 @@ class RunSetup:
     guard: GuardParameters = UNGUARDED
     contact_stiffness: float = 0.0
     mark: int = 0
+    tool_weight: bool = True
     is_realtime: bool = False
     is_pipelined: bool = False
 
@@ -340,6 +353,7 @@ class RunSetup:
                 method, requested, options.contact_stiffness
             ),
             mark=button_mask(options.mark, "mark"),
+            tool_weight=options.tool_weight,
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
         )
@@ -373,6 +387,39 @@ class RunSetup:
             substeps=self.substeps,
             limits=self.limits,
         )
+
+    def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
+        """Returns the parameters of a run that starts now and whose device can hold the tool.
+
+        If a still hand would need more than the device's force limit because of the tool's weight,
+        the weight is carried, which replaces the scene's model.
+
+        Args:
+            start: As for ``parameters``.
+            effective: As for ``parameters``.
+
+        Raises:
+            SceneError: The scene must not be changed (``Scene.as_is``).
+            HapticBridgeError: A value is out of range.
+        """
+        parameters, scene, most = self.parameters(start, effective), self.scene, self.limits.force
+        is_held = not self.method.has_law or self.info.is_prescribed or scene.is_carried
+        if is_held or (force := self._sent(holding_force(scene, parameters))) <= most:
+            return parameters
+        weightless = self._sent(holding_force(scene, parameters, has_weight=False))
+        if weightless > max(most, force / 2):
+            return parameters  # motors or springs push, more than the weight
+        reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        if scene.as_is:
+            raise SceneError(
+                f"the tool is too heavy ({reason}): let its weight be carried (--no-tool-weight, "
+                "or without --as-is)"
+            )
+        scene.carry_tool(reason)
+        return self.parameters(start, effective)
+
+    def _sent(self, force: float) -> float:
+        return self.workspace.scales[1] * force
 
     def parameters(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now.

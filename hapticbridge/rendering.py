@@ -23,8 +23,9 @@ from hapticbridge.kernel.lossless import REACH, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.kernel.rigid_contact import finish_contacts
 from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
-from hapticbridge.scene.checks import check_metered
+from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
 from hapticbridge.scene.handle import measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
@@ -469,6 +470,8 @@ def prepare(
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
     effective = measured_weld(scene.model, scene.grip) if method.is_weld else None
     scene.reset()
+    if not method.is_rigid:
+        refuse_overlap(scene.model, scene.data, scene.grip)
     return effective
 
 
@@ -604,6 +607,32 @@ def start_handle(
         change = (wrenches - wrenches[0])[:, has_spring]
         strays.append(float((change**2 / stiffness[has_spring]).sum(axis=1).max()))
     return poses[int(np.argmin(strays))]
+
+
+HOLDING_STEPS = 1000
+"""Steps in which a device must hold a tool with a still hand. A longer trial would also find tools
+that tip over slowly, and delay every start."""
+
+
+def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool = True) -> float:
+    """Returns the largest force in N with which a still handle holds the tool at first.
+
+    The coupling is not limited, and the tool moves freely on it. The scene is not changed.
+
+    Args:
+        scene: The prepared scene, at its start.
+        parameters: Parameters of the run; a handle with absolute poses is taken at the grip.
+        has_weight: If false, gravity is left out.
+    """
+    handle, gravity = parameters.handle_origin, scene.model.opt.gravity.copy()
+    if handle == IDENTITY_POSE or not has_weight:
+        handle = scene.grip_pose()
+    try:
+        scene.model.opt.gravity *= has_weight
+        steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
+        return max(float(np.linalg.norm(wrench[:3])) for wrench in steps)
+    finally:
+        scene.model.opt.gravity = gravity
 
 
 def loaded_handle(

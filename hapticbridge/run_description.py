@@ -176,6 +176,9 @@ def processor() -> str:
 MODEL_ATTACHMENT = "model.mjb"
 SOURCE_PREFIX = "scene/"
 
+CARRIED = "carried"
+"""Value of ``tool_weight`` in the metadata if the scene compensates the tool's weight."""
+
 _MID_RUN = "mid-run"
 """Value of metadata ``began`` in recordings of earlier versions that begin during a run."""
 
@@ -235,6 +238,7 @@ def describe_run(
         "device": device.to_json(),
         "scene": scene.name,
         "scene_file": scene.path.name,
+        "tool_weight": CARRIED if scene.is_carried else "felt",
         "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
         "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),

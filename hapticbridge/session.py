@@ -245,6 +245,8 @@ class Session:
         setup, scene, clock = self.setup, self.setup.scene, self.clock
         scene.claim()
         resources.callback(scene.release)
+        if not setup.tool_weight and not scene.is_carried:
+            scene.carry_tool("--no-tool-weight")
         effective = prepare(scene, setup.coupling, setup.period, setup.substeps, setup.method)
         self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
         if self._snapshot is not None:
@@ -260,7 +262,7 @@ class Session:
             self._grants = resources.enter_context(memory_at_rest())
         sample[:] = self.device.start(setup.period)
         refuse_implausible_pose(self.device.info, sample)
-        self.parameters = setup.parameters(sample, effective)
+        self.parameters = setup.holding(sample, effective)
         start = start_state(scene.model, scene.data).tobytes()
         bound = BoundKernel(scene.model, scene.data, self.parameters)
         resources.callback(bound.release)

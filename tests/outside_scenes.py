@@ -156,10 +156,10 @@ HINGE_TOOL = """<body name="arm"><joint name="elbow" {joint}/>
 <geom name="arm" size="0.01" mass="0.1"/><site name="grip" pos="0.1 0 0"/></body>"""
 
 
-def refusal(path: str | Path, grip: str = "grip") -> str:
+def refusal(path: str | Path, grip: str = "grip", *, as_is: bool = False) -> str:
     """Loads what must be refused; returns the message, which is one line."""
     with pytest.raises(hb.SceneError) as caught:
-        load_scene(path, grip)
+        load_scene(path, grip, as_is=as_is)
     message = str(caught.value)
     assert "\n" not in message
     assert "Error" not in message.split("'", maxsplit=1)[0]

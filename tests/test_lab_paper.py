@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.lab.paper import device_damping, impact, integrators, transmission_line
+from hapticbridge.lab.paper import STEPS, device_damping, impact, integrators, transmission_line
 from hapticbridge.lab.paper.section import PAGE, Check, Relation
-from hapticbridge.lab.paper.walk import STEPS
 from hapticbridge.theory.sampled_loop import stability_limit
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper"

@@ -182,7 +182,6 @@ SMALL = 80
 
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
-    "hapticbridge.audit.ask",  # the public call, without the imports of what it calls
     "hapticbridge.recording.repair",  # the public call of the command
     "hapticbridge.device.discovery",  # devices that are plugged in, for every driver
 }

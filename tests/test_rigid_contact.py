@@ -293,6 +293,50 @@ def test_a_lifted_tool_is_released_within_10_ms() -> None:
     assert opened[0] <= 10
 
 
+def blow(
+    start: float, velocity: tuple[float, float, float], mass: float = 0.1, force: float = 0.0
+) -> Array:
+    """Returns the penetration in m per tick of a ball in a blow; negative is a gap.
+
+    ``start`` is the ball's height in m above the floor; along x it meets a capsule at height 0. The
+    hand presses with up to 0.3 of ``force`` in N.
+    """
+    loaded = scene(BALL, mass=mass, mu=0.4)
+    loaded.data.qpos[2] = start
+    loaded.data.qvel[:3] = velocity
+    speed = loaded.data.qvel.copy()
+    run = prepared(loaded)
+    loaded.data.qvel[:] = speed
+    depths: list[float] = []
+
+    def note(_: int, data: mujoco.MjData) -> None:
+        depths.append(-min((c.dist for c in data.contact), default=1.0))
+
+    go_on(run, pressed(60, force), after_tick=note)
+    return np.array(depths)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 4.0])
+def test_a_fast_blow_is_met_before_it_sinks_in(speed: float) -> None:
+    assert blow(0.011, (0.0, 0.0, -speed)).max() < 2e-6
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+def test_a_fast_blow_on_a_free_body_is_met_before_it_sinks_in(speed: float) -> None:
+    assert blow(0.0, (speed, 0.0, 0.0)).max() < 0.01 * speed * T  # what the softness leaves
+
+
+def test_a_blow_beyond_the_largest_margin_is_seen_late() -> None:
+    assert blow(0.023, (0.0, 0.0, -8.0), mass=1.0).max() > 2e-4
+
+
+def test_an_oblique_blow_neither_sinks_in_where_it_sticks_nor_floats_where_it_slides() -> None:
+    sticking = blow(0.003, (0.1, 0.0, -0.3))
+    assert -2e-5 < sticking.max() < 2e-6
+    sliding = blow(0.0, (1.0, 0.0, 0.0), mass=30.0, force=30.0)[:25]  # then it meets the capsule
+    assert np.abs(sliding[-10:]).max() < 1e-5
+
+
 @pytest.mark.parametrize("mu", [0.1, 0.4])
 def test_friction_breaks_away_at_coulombs_limit_and_slides_at_it(mu: float) -> None:
     samples = pressed(6000, 3.0)
@@ -317,7 +361,7 @@ def test_below_the_limit_friction_creeps_by_less_than_10_nm_a_second() -> None:
 
 
 def drumming(count: int) -> np.ndarray:
-    """Returns samples of a hand that drums on the floor at 20 Hz, too fast for an empty tank."""
+    """Returns samples of a hand that drums on the floor at 20 Hz."""
     time = T * np.arange(1, count + 1)
     places, turns = np.zeros((count, 3)), np.zeros((count, 3))
     places[:, 0] = 0.004 * np.sin(2 * np.pi * 1.3 * time)
@@ -330,11 +374,14 @@ def drumming(count: int) -> np.ndarray:
 def test_compiled_ticks_equal_those_through_mujocos_bindings(method: str) -> None:
     samples = drumming(600)
 
-    def block() -> Scene:
-        return scene(BLOCK, mass=0.03, mu=0.1)
+    def sunken_block() -> Run:
+        block = scene(BLOCK, mass=0.03, mu=0.1)
+        block.data.qpos[2] = -3e-4
+        run = prepared(block, method)
+        run.binding.state["contact"]["cap"] = 1e-6  # too little for the way out
+        return run
 
-    one = go_on(prepared(block(), method), samples)
-    other = through(prepared(block(), method), samples)
+    one, other = go_on(sunken_block(), samples), through(sunken_block(), samples)
     assert one.ticks.tobytes() == other.ticks.tobytes()
     assert int(one.binding.state["contact"]["repetitions"][0]) > 0
     assert strict(one)
@@ -376,12 +423,18 @@ def test_a_recorded_contact_is_read_back_and_repeated(contact: str, tmp_path: Pa
 
 def test_contact_of_the_scene_restores_what_rigid_contact_changed() -> None:
     loaded = scene(PEG, cone="pyramidal")
-    fields = ("geom_margin", "pair_margin", "flex_margin")
+    fields = ("geom_margin", "pair_margin", "flex_margin", "body_margin")
     before = [getattr(loaded.model, name).copy() for name in fields]
     own = loaded.model.opt.cone, loaded.model.opt.impratio, loaded.model.opt.o_margin
     prepared(loaded)
     assert loaded.model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert (loaded.model.geom_margin > 0).all()
+    resting = loaded.model.geom_margin.copy()
+    run = go_on(prepared(loaded), drumming(300))
+    assert loaded.model.geom_margin.max() > resting.max()
+    assert (loaded.model.body_margin >= loaded.model.geom_margin.max()).any()
+    run.binding.release()
+    assert (loaded.model.geom_margin == resting).all()
     prepared(loaded, contact="scene")
     after = [getattr(loaded.model, name) for name in fields]
     assert all((a == b).all() for a, b in zip(before, after, strict=True))

@@ -14,6 +14,7 @@ from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, sce
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.inputs import input_writes
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
@@ -234,15 +235,59 @@ def test_mass_that_becomes_infinite_in_compilation_is_refused_with_its_body(tmp_
     assert message.startswith("part.xml, line 2: mass of <geom> is 'nan'")
 
 
-def test_force_limit_of_joint_is_refused_on_tool_and_accepted_elsewhere(tmp_path: Path) -> None:
+ARM_UNDER_LIMIT = HINGE_TOOL.format(joint="actuatorfrcrange='-0.3 0.2'")
+
+
+def turning(model: mujoco.MjModel, control: float, pull: float = 0.0) -> float:
+    """Returns the torque in N m on the elbow under a motor's control and a coupling's pull."""
+    data = mujoco.MjData(model)
+    data.ctrl[0] = control
+    if pull:
+        data.mocap_pos[-1, 1] += pull
+    mujoco.mj_forward(model, data)
+    return float(data.qfrc_actuator[0])
+
+
+@pytest.mark.parametrize("gear", [1.0, -4.0])
+@pytest.mark.parametrize("own", ["", "forcerange='-0.04 0.1'"])
+def test_force_limit_of_a_joint_bites_its_motor_and_not_the_coupling(
+    tmp_path: Path, gear: float, own: str
+) -> None:
+    motor = f"<actuator><motor name='m' joint='elbow' gear='{gear}' {own}/></actuator>"
+    text = mjcf("<option gravity='0 0 0'/>", motor, body=ARM_UNDER_LIMIT)
+    scene, plain = load_scene(scene_file(tmp_path, text)), mujoco.MjModel.from_xml_string(text)
+    assert scene.changes[-1].startswith("force limit of joint 'elbow': on all actuators")
+    assert scene.changes[-1].endswith("→ on its actuator")
+    for control in (-10.0, -0.05, 0.01, 0.04, 10.0):
+        # MuJoCo's own limit of the scene without a coupling
+        assert turning(scene.model, control) == pytest.approx(turning(plain, control), abs=1e-15)
+    assert max(turning(scene.model, 10.0), turning(scene.model, -10.0)) <= 0.2
+    scene.set_gains((0.0, 1000.0, 0.0), (0.0, 0.0, 0.0))
+    # 1000 N/m · 0.02 m at an arm of 0.1 m
+    felt = turning(scene.model, 10.0, 0.02) - turning(scene.model, 10.0)
+    assert felt == pytest.approx(2.0, rel=1e-9)
+
+
+def test_force_limit_of_a_joint_is_each_motors_if_it_has_several(tmp_path: Path) -> None:
+    motors = "<motor name='a' joint='elbow'/><motor name='b' joint='elbow' gear='2'/>"
+    text = mjcf(f"<actuator>{motors}</actuator>", body=ARM_UNDER_LIMIT)
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.changes[-1].endswith("→ on each of its actuators")
+    ranges = scene.model.actuator_forcerange[:2].tolist()
+    assert ranges == [[-0.3, 0.2], [-0.15, 0.1]]
+
+
+def test_force_limit_is_moved_on_the_way_to_the_grip_alone(tmp_path: Path) -> None:
     limit = "actuatorfrcrange='-1 1'"
-    outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{{}}</body>"
-    message = refusal_of(tmp_path, mjcf(body=outer.format(HINGE_TOOL.format(joint=""))))
-    assert message.startswith("joint 'base' of body 'stand' limits actuator forces")
-    unnamed = HINGE_TOOL.format(joint=limit).replace('name="elbow"', "")
-    assert refusal_of(tmp_path, mjcf(body=unnamed)).startswith("joint '0' of body 'arm'")
+    outer = f"<body name='stand'><joint name='base' {limit}/><geom size='.01'/>{ARM_UNDER_LIMIT}"
+    path = scene_file(tmp_path, mjcf(body=outer + "</body>"))
+    assert load_scene(path).changes[-1].startswith("force limit of joint 'base' and 1 more:")
+    with pytest.raises(hb.SceneError, match=r"joint 'base' and 1 more limits .*--as-is"):
+        load_scene(path, as_is=True)
     elsewhere = f"<body pos='1 0 0'><joint {limit}/><geom size='.01'/></body>"
-    load_scene(scene_file(tmp_path, mjcf(world=elsewhere)))
+    scene = load_scene(scene_file(tmp_path, mjcf(world=elsewhere)))
+    assert scene.model.jnt_actfrclimited.tolist() == [0, 1]
+    assert not any("force limit" in change for change in scene.changes)
 
 
 TABLE = "<geom name='table' type='plane' size='1 1 1'/>"
@@ -253,12 +298,19 @@ def resting(height: float) -> str:
     return mjcf(body=body, world=TABLE)
 
 
-def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) -> None:
-    message = refusal_of(tmp_path, resting(0.0098))
+def strict_refusal(folder: Path, text: str) -> str:
+    """Returns the refusal under ``as_is`` of a scene that loads without it."""
+    path = scene_file(folder, text)
+    load_scene(path)
+    return refusal(path, as_is=True)
+
+
+def test_tool_inside_something_is_refused_as_is_with_pair_and_depth(tmp_path: Path) -> None:
+    message = strict_refusal(tmp_path, resting(0.0098))
     assert "overlap by 0.2 mm" in message
     assert "geom 'table' and geom 'ball'" in message
     unnamed = resting(0.005).replace('name="ball"', "").replace("name='table'", "")
-    message = refusal_of(tmp_path, unnamed)
+    message = strict_refusal(tmp_path, unnamed)
     assert "overlap by 5 mm" in message
     assert "geom 0 of the world and geom 1 of body 'tool'" in message
 
@@ -271,25 +323,88 @@ def test_tool_inside_something_is_refused_with_pair_and_depth(tmp_path: Path) ->
 def test_start_is_refused_exactly_beyond_tenth_of_millimetre(tmp_path: Path, depth: float) -> None:
     path = scene_file(tmp_path, resting(0.01 - depth))
     if depth > 1.0001e-4:
-        assert "starts in penetration" in refusal(path)
+        assert "starts in penetration" in refusal(path, as_is=True)
     elif depth < 0.9999e-4:
-        load_scene(path)
+        load_scene(path, as_is=True)
 
 
 def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:
     deep = "<keyframe><key name='{}' qpos='0 0 0.005 1 0 0 0'/></keyframe>"
     text = resting(1.0).replace("</mujoco>", deep + "</mujoco>")
-    load_scene(scene_file(tmp_path, text.format("other")))
-    assert "overlap by 5 mm" in refusal_of(tmp_path, text.format("home"))
+    load_scene(scene_file(tmp_path, text.format("other")), as_is=True)
+    assert "overlap by 5 mm" in strict_refusal(tmp_path, text.format("home"))
 
 
-def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not(tmp_path: Path) -> None:
+def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not_as_is(
+    tmp_path: Path,
+) -> None:
     sunk = "<body pos='1 0 .005'><freejoint/><geom size='.01'/></body>"
-    load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)))
+    load_scene(scene_file(tmp_path, resting(0.02).replace(TABLE, TABLE + sunk)), as_is=True)
     cloth = """<flexcomp name='cloth' type='grid' count='4 4 1' spacing='.05 .05 .05' mass='1'
       radius='.001'><edge equality='true'/></flexcomp>"""
-    message = refusal_of(tmp_path, mjcf(world=cloth))
+    message = strict_refusal(tmp_path, mjcf(world=cloth))
     assert "geom 'ball' and flex 'cloth'" in message
+
+
+def still_run(path: Path, **options: str) -> tuple[hb.Scene, np.ndarray, str]:
+    """Holds the device still for 1 s; returns scene, heights of the tool and verdict."""
+    scene = load_scene(path)
+    device = SimulatedDevice(path=Motion([0.0, 2.0], np.zeros((2, 3))))
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), **options) as bridge:
+        summary = bridge.run(duration=1.0)
+        ticks = bridge.latest_records(1000)
+    return scene, ticks["tool_position"][:, 2].copy(), summary.environment
+
+
+def test_tool_that_starts_inside_a_table_stays_there_in_a_still_hand(tmp_path: Path) -> None:
+    text = resting(0.005)
+    plain = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(plain)
+    speeds = []
+    while data.time < 0.2:
+        mujoco.mj_step(plain, data)
+        speeds.append(data.qvel[2])
+    assert max(speeds) > 0.05  # MuJoCo's own contact throws the ball out
+    scene, heights, environment = still_run(scene_file(tmp_path, text))
+    assert environment == "strict"
+    assert heights.max() < 0.0055  # nothing was dissipated that could pay for coming out
+    assert np.abs(np.diff(heights)).max() < 1e-5  # 10 mm/s
+    assert scene.changes[-1].startswith("start where geom 'table' and geom 'ball' overlap by 5 mm:")
+    with pytest.raises(hb.SceneError, match=r"in penetration.*--contact rigid"):
+        still_run(scene_file(tmp_path, text), contact="scene")
+
+
+NEST = """<body name='base'><geom name='shell' size='.05'/>
+<body name='mid' pos='0 0 .04'><joint name='first' axis='0 1 0'/><geom size='.001' mass='.1'
+contype='0' conaffinity='0'/><body {outer} pos='0 0 .01'><joint axis='1 0 0' {joint}/><geom name='tip' size='.02' mass='.1'/>
+<site name='grip'/></body></body></body>"""
+
+
+@pytest.mark.parametrize("outer", ["name='outer'", ""])
+def test_links_inside_each_other_are_excluded_and_neighbours_of_the_tree_are_not(
+    tmp_path: Path, outer: str
+) -> None:
+    text = mjcf(
+        body=NEST.format(outer=outer, joint=""), world=TABLE.replace("/>", " pos='0 0 -1'/>")
+    )
+    scene = load_scene(scene_file(tmp_path, text))
+    assert scene.data.ncon == 0
+    assert mujoco.MjModel.from_xml_string(text).nexclude == 0
+    assert scene.model.nexclude == 1
+    assert scene.changes[-1].startswith(
+        "contact where geom 'shell' and geom 'tip' overlap by 20 mm"
+    )
+    assert refusal(scene.path, as_is=True).startswith(
+        "the tool starts in penetration: geom 'shell'"
+    )
+    # it still meets what is not part of the robot
+    ball = "<body pos='0 0 .06'><freejoint/><geom name='ball' size='.02'/></body>"
+    scene = load_scene(scene_file(tmp_path, text.replace("</worldbody>", ball + "</worldbody>")))
+    assert scene.data.ncon >= 1
+    # a shallow overlap is held, because a gripper that closes must not pass through itself
+    shallow = load_scene(scene_file(tmp_path, text.replace("pos='0 0 .01'", "pos='0 0 .0295'")))
+    assert shallow.model.nexclude == 0
+    assert shallow.data.ncon == 1
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,9 +214,8 @@ BEYOND_ITS_LIMIT = """<mujoco>
 
 def started(folder: Path, text: str, **options: Any) -> hb.Bridge:
     scene = hb.load_scene(scene_file(folder, text), as_is=options.pop("as_is", False))
-    return hb.Bridge(
-        scene, "simulated", clock=hb.SimulatedClock(), recording=folder / "run.mcap", **options
-    )
+    device, file = options.pop("device", "simulated"), folder / "run.mcap"
+    return hb.Bridge(scene, device, clock=hb.SimulatedClock(), recording=file, **options)
 
 
 def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: Path) -> None:
@@ -229,6 +230,67 @@ def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: P
         pytest.raises(hb.SafetyTrip, match=r"energy|stretch"),
     ):
         bridge.run(duration=0.5)
+
+
+WEIGHT = 9.81
+"""Weight in N per kg."""
+
+
+@pytest.mark.parametrize(("mass", "is_carried"), [(0.9, False), (1.1, True)])
+def test_tool_that_the_device_cannot_hold_is_carried(
+    tmp_path: Path, mass: float, *, is_carried: bool
+) -> None:
+    """The simulated device holds 10 N."""
+    text = outside.mjcf(body=outside.FREE_TOOL.replace('mass="0.1"', f'mass="{mass}"'))
+    with started(tmp_path, text) as bridge:
+        scene = bridge.scene
+        bridge.run(duration=1.0)
+        ticks = bridge.latest_records(1000)
+    said = [change for change in scene.changes if change.startswith("weight of the tool")]
+    in_hand = ticks["wrench_on_tool"][-1, 2]
+    if is_carried:
+        assert re.fullmatch(
+            r"weight of the tool: felt → carried \(it pulls with up to 1[01]\.\d N, and the device "
+            r"holds 10 N\)",
+            *said,
+        )
+        assert abs(in_hand) < 0.2  # it has inertia still, and the hand moves
+        model = mujoco.MjModel.from_xml_string(text)
+        assert scene.model.body_mass[1] == model.body_mass[1]
+    else:
+        assert not said
+        assert in_hand > 0.3 * WEIGHT * mass  # the hand sags and swings
+    report = hb.audit(tmp_path / "run.mcap")
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    run = hb.read_recording(tmp_path / "run.mcap")
+    assert json.loads(run.meta["scene_changes"])[-len(said) :] == (said or list(scene.changes))
+    assert run.meta["tool_weight"] == ("carried" if is_carried else "felt")
+
+
+def test_weight_is_carried_on_request_and_not_as_is(tmp_path: Path) -> None:
+    with started(tmp_path, outside.mjcf(), tool_weight=False) as bridge:
+        bridge.run(duration=0.1)
+        assert bridge.scene.changes[-1].endswith("(--no-tool-weight)")
+        assert abs(bridge.latest_records(1)["wrench_on_tool"][0, 2]) < 0.02
+    heavy = outside.mjcf(body=outside.FREE_TOOL.replace('mass="0.1"', 'mass="1.1"'))
+    with (
+        pytest.raises(
+            hb.SceneError, match=r"1[01]\.\d N, .* holds 10 N\): let its weight be carried"
+        ),
+        started(tmp_path, heavy, as_is=True),
+    ):
+        pass
+
+
+def test_force_of_a_motor_is_not_taken_for_weight(tmp_path: Path) -> None:
+    arm = outside.HINGE_TOOL.format(joint="axis='0 0 1'")
+    text = outside.mjcf(
+        "<actuator><motor name='m' joint='elbow'/></actuator>",
+        "<keyframe><key name='home' ctrl='1.5'/></keyframe>",
+        body=arm,
+    )
+    with started(tmp_path, text) as bridge:
+        assert not bridge.scene.is_carried  # 15 N at an arm of 0.1 m, with or without gravity
 
 
 FLOPPY = """<mujoco>
@@ -248,7 +310,7 @@ FLOPPY = """<mujoco>
 
 
 def test_handle_starts_at_grip_of_a_robot_that_falls_beside_it(tmp_path: Path) -> None:
-    with started(tmp_path, FLOPPY) as bridge:
+    with started(tmp_path, FLOPPY, device="simulated:force_limit=1000") as bridge:
         parameters = bridge.session.parameters
         assert parameters.handle_origin == bridge.scene.grip_pose()
         load = static_load(bridge.scene, parameters)

@@ -194,6 +194,8 @@ def open_case(
             observation = observe(scene, samples, Setting(coupling, period), progress)
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
+    finally:
+        scene.set_contact(is_rigid=False)  # the file's own settings are what the rules examine
     return SceneUnderCheck(
         source=source,
         scene=scene,

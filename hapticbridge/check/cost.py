@@ -233,7 +233,7 @@ def _time_ticks(
     before = direct(before_step, state, samples[:1], row, 0, period)
     after = direct(after_step, state, row, 0)
     hand_over = direct(publish, row, ring.rows, ring.cursors, 0, 0, 0, 0, 0)
-    step, model, data = mujoco.mj_step, scene.model, scene.data
+    step, model, data = binding.step, scene.model, scene.data
     records, cursors = ring.rows, ring.cursors
     times = np.zeros(samples.size)
     contacts, rows = np.zeros((2, samples.size), np.int64)
@@ -258,13 +258,14 @@ def _time_stages(
     """Returns the time in s of every stage of every step by MuJoCo's timers, and the contacts."""
     binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     state, row, model, data = binding.state, binding.row, scene.model, scene.data
+    step = binding.step
     spent = np.zeros((samples.size, int(_TIMER.mjNTIMER)))
     contacts = np.zeros(samples.size, np.int64)
     durations = data.timer.duration
     for k in range(samples.size):
         before_step(state, samples[k : k + 1], row, 0, setting.period)
         earlier = durations.copy()  # energies are refreshed after the step, by stages with timers
-        mujoco.mj_step(model, data)
+        step(model, data)
         spent[k] = durations - earlier
         after_step(state, row, 0)
         contacts[k] = int(row["contacts"][0])

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -17,11 +18,12 @@ from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import default_method, prepare
+from hapticbridge.rendering import RIGID, default_method, prepare
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
 
@@ -196,11 +198,13 @@ class Setting:
         coupling: Requested K and B.
         period: T in s.
         substeps: MuJoCo steps per tick.
+        contact: ``rigid``, the default of a run, or ``scene``, MuJoCo's own.
     """
 
     coupling: Coupling
     period: float = 1e-3
     substeps: int = 1
+    contact: Literal["rigid", "scene"] = "rigid"
 
     @property
     def needed_damping(self) -> float:
@@ -250,13 +254,13 @@ def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
 
 
 def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
-    """Resets a scene for the default method with its own contacts, and returns the parameters.
+    """Resets a scene for the default method, and returns the parameters.
 
     Raises:
         SceneError: A value is out of range.
     """
     coupling, period, substeps = setting.coupling, setting.period, setting.substeps
-    method = default_method(substeps).with_contact("scene")  # these are what is examined
+    method = default_method(substeps).with_contact(setting.contact)
     prepare(scene, coupling, period, substeps, method, warns=False)
     # an error inside the C function would end the process; the first step in Python raises instead
     mujoco.mj_step(scene.model, scene.data)
@@ -367,7 +371,7 @@ def observe(
     binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     model, data, state, row = scene.model, scene.data, binding.state, binding.row
     before = direct(before_step, state, samples[:1], row, 0, period)
-    after = direct(after_step, state, row, 0)
+    after, step = direct(after_step, state, row, 0), binding.step
     meetings: dict[tuple[int, int], Meeting] = {}
     types = np.zeros((samples.size, len(_TYPE.__members__)), np.int64)
     postures, every = [], max(samples.size // POSTURES, 1)
@@ -375,14 +379,14 @@ def observe(
     for k in range(samples.size):
         if before(state, samples[k : k + 1], row, 0, period) != OK:
             raise not_finite(scene, k, samples.size)
-        mujoco.mj_step(model, data)
+        step(model, data)
         if after(state, row, 0) != OK:
             raise not_finite(scene, k, samples.size)
         if data.nefc:
             counted = np.bincount(data.efc_type)
             types[k, : counted.size] = counted
         if data.ncon:
-            _note_contacts(data, model.opt.timestep, meetings)
+            _note_contacts(data, model.opt.timestep, meetings, setting.contact == RIGID)
         iterations = data.solver_niter[: max(data.nisland, 1)]
         full += bool(data.nefc) and bool(iterations.max(initial=0) >= model.opt.iterations)
         force[k] = float(np.linalg.norm(row["wrench_on_tool"][0, :3]))
@@ -415,7 +419,10 @@ def quiet() -> Iterator[None]:
 
 
 def _note_contacts(
-    data: mujoco.MjData, step: float, meetings: dict[tuple[int, int], Meeting]
+    data: mujoco.MjData,
+    step: float,
+    meetings: dict[tuple[int, int], Meeting],
+    is_rigid: bool,
 ) -> None:
     """Adds the contacts of one step.
 
@@ -427,7 +434,8 @@ def _note_contacts(
     with depth −r, velocity v, MuJoCo's k and b of the row, its impedance d at that depth, and the
     contact's true inertia 1/A. Its stiffness is therefore f/r = k d/(R (1 + h b + h² k d)). With a
     pyramidal cone, 2 (dim − 1) rows share the normal force; together they are as stiff as one row
-    with that many times the inertia.
+    with that many times the inertia. A rigid contact of mass m has m β/(h² SOFTNESS)
+    (``kernel.rigid_contact``), and exists before it touches.
     """
     contacts, rows = data.contact, data.efc_type
     addresses, dims, depths = contacts.efc_address.tolist(), contacts.dim, (-contacts.dist).tolist()
@@ -437,12 +445,14 @@ def _note_contacts(
         if min(one, other) < 0 or adr < 0:  # a flex, or outside the active distance
             continue
         pair = min(one, other), max(one, other)
+        count = 2 * (int(dims[k]) - 1) if rows[adr] == _PYRAMIDAL else 1
+        normal = float(data.efc_force[adr : adr + count].sum())
+        if is_rigid and depths[k] < 0.0 and normal == 0.0:
+            continue
         meeting = meetings.setdefault(pair, Meeting())
         if pair not in seen:
             seen.add(pair)
             meeting.ticks += 1
-        count = 2 * (int(dims[k]) - 1) if rows[adr] == _PYRAMIDAL else 1
-        normal = float(data.efc_force[adr : adr + count].sum())
         meeting.deepest = max(meeting.deepest, depths[k])
         meeting.force = max(meeting.force, normal)
         if normal >= MIN_FORCE:
@@ -451,6 +461,8 @@ def _note_contacts(
             regular = float(data.efc_R[adr]) * (1.0 + step * damper + step**2 * spring)
             stiffness = count * spring / regular
             inertia = count * (1.0 - impedance) / (impedance * regular)
+            if is_rigid:
+                stiffness = inertia * DEPENETRATION / (SOFTNESS * step**2)
             meeting.inertia = min(meeting.inertia, inertia)
             meeting.softest = min(meeting.softest, stiffness)
             meeting.stiffest = max(meeting.stiffest, stiffness)

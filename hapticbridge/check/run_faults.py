@@ -16,8 +16,10 @@ from hapticbridge.check.contact_faults import (
 )
 from hapticbridge.check.fault import Fault, number
 from hapticbridge.check.model_faults import constraint_faults, geometry_faults, mass_faults
-from hapticbridge.check.observe import Observation
+from hapticbridge.check.observe import Observation, Setting
+from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
+from hapticbridge.rendering import RIGID
 from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
@@ -77,6 +79,17 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             attribute = "wind" if concern.startswith("wind") else "surfacevel"
             place = places.with_attribute(attribute) or places.option(attribute)
             yield Fault("unmetered work", place, concern, f"remove {attribute}")
+
+
+def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields a fault if the scene alone moves noticeably differently than its file says."""
+    if case.refused:
+        return  # the file's own scene does not compile
+    found = own_motion(case.source, case.scene.grip, Setting(case.coupling, case.period))
+    if found is not None and found.jnd > 1.0:
+        yield Fault(
+            "own motion", case.places.option("timestep"), str(found), found.remedy(case.period)
+        )
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -139,7 +152,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     if seen.environment == "active":
         used = "more than the coupling's slack covers"
     sentence = f"contacts or joints created energy in the motion: {used}"
-    if not seen.meetings:
+    if not seen.meetings or case.contact == RIGID:
         return _created_without_contact(case, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
     one, other = (case.places.geom(geom) for geom in pair)
@@ -169,6 +182,7 @@ def _created_without_contact(case: SceneUnderCheck, sentence: str) -> Fault:
 
 RULES = (
     option_faults,
+    own_motion_faults,
     keyframe_faults,
     mass_faults,
     geometry_faults,

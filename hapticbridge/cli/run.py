@@ -17,6 +17,7 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
+from hapticbridge.check.own_motion import own_substeps
 from hapticbridge.cli.terminal import err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -29,9 +30,10 @@ from hapticbridge.guard import (
     Limits,
     refuse_simulated_time,
 )
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
-from hapticbridge.scene import Scene, load_scene, settings_from
+from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
@@ -51,8 +53,6 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}, "
         f"{method.contact} contacts"
     )
-    if setup.scene.changes:
-        err.print(f"  options changed in the scene: {escape(', '.join(setup.scene.changes))}")
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
@@ -68,8 +68,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         err.print(f"  {method.name}: {escape(method.about)}")
     elif method.name != usual.name:
         err.print(
-            f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and {substeps} "
-            "are requested"
+            f"  {method.name}, because {usual.name} takes one MuJoCo step a tick, and this run "
+            f"{substeps}"
         )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
@@ -116,8 +116,16 @@ def _without_motor(setup: RunSetup) -> Iterator[str]:
 
 
 def announce_measured(bridge: Bridge) -> None:
-    """Prints the device conditions of a method without a coupling law, known once it is open."""
+    """Prints what is known once the bridge is open.
+
+    These are the changes of the scene, the tool's weight, and the device conditions of a method
+    without a coupling law.
+    """
     setup, parameters = bridge.setup, bridge.session.parameters
+    for change in setup.scene.changes:
+        err.print(f"  changed in the scene: {escape(change)}")
+    for sentence in _weight_in_hand(setup, parameters):
+        err.print(f"  {sentence}")
     if setup.method.has_law:
         return
     if parameters.effective is not None:
@@ -129,6 +137,22 @@ def announce_measured(bridge: Bridge) -> None:
     for sentence in bridge.conditions():
         head = "  " if sentence in met else "[yellow]warning:[/yellow] "
         err.print(head + escape(sentence))
+
+
+HEAVY = 0.25
+"""Share of the force limit above which a sentence tells the tool's load; no unit."""
+
+
+def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]:
+    """Yields a sentence on the load of the tool at rest, if it is a heavy one."""
+    load = parameters.guarding.idle_force - setup.guard.idle_force
+    in_hand = setup.workspace.scales[1] * load
+    if setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf:
+        sag = format_si(load / parameters.coupling.stiffness, "m")
+        yield (
+            f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
+            "the handle; --no-tool-weight carries it"
+        )
 
 
 _WELD = "the weld in its stiffest directions at the start"
@@ -240,8 +264,9 @@ class Run:
     """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
     body's frame. If the scene has none of that name, the most plausible ones are listed."""
     as_is: bool = False
-    """Refuse a scene with options that exclude the coupling (solver PGS, noslip_iterations, sleep);
-    by default they are changed, and a line lists them."""
+    """Refuse a scene that must be changed to be felt: options that exclude the coupling (solver
+    PGS, noslip_iterations, sleep), force limits of joints, a tool inside something or too heavy.
+    By default it is changed, with a line for each change."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), or a device from the list of 'hapticbridge devices'."""
@@ -268,8 +293,10 @@ class Run:
     """Accept a method that may kick on a real device; the first three never need it."""
     rate: float = 1000.0
     """Ticks per second."""
-    substeps: int = 1
-    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent."""
+    substeps: int | None = None
+    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent. By default one,
+    or as many as keep the file's own time step if it is shorter and the scene alone would move
+    noticeably differently."""
     realtime: bool = False
     """Request real-time priority and locked memory for the loop, and print what the system refuses
     (see 'hapticbridge doctor'). Always done with a real device."""
@@ -315,6 +342,8 @@ class Run:
     """Button of the device, from 0: while it is held the device moves without handle and force."""
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
+    tool_weight: bool = True
+    """Feel the tool's weight, unless the device cannot hold it. --no-tool-weight carries it."""
     mark: int | None = None
     """Button of the device, from 0: each press writes an event 'mark' into the recording.
     'hapticbridge export --from S --to S' cuts a recording."""
@@ -345,12 +374,33 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        scene = load_scene(self.scene, self.grip, as_is=self.as_is, **settings_from(self.settings))
+        source = read_scene(self.scene, **settings_from(self.settings))
+        scene = compile_scene(source, self.grip, as_is=self.as_is)
+        chosen = (
+            self
+            if self.substeps is not None
+            else replace(self, substeps=self._own_substeps(source))
+        )
         with ExitStack() as stack:
             callbacks = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return self._feel(scene, device, clock, stack, window, callbacks)
+            return chosen._feel(scene, device, clock, stack, window, callbacks)
+
+    def _own_substeps(self, source: SceneSource) -> int:
+        """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
+        if self.method is not None:
+            return 1
+        period = period_of(self.rate)
+        count, moved = own_substeps(source, self.grip, period)
+        if count > 1:
+            notify(
+                f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
+                "scene alone would move noticeably differently (--substeps 1 takes one)"
+            )
+        elif moved is not None and moved.jnd > 1.0:
+            notify(f"{moved}; {moved.remedy(period)}")
+        return count
 
     def _feel(
         self,
@@ -391,7 +441,7 @@ class Run:
     def _options(self, info: DeviceInfo) -> BridgeOptions:
         return BridgeOptions(
             rate=self.rate,
-            substeps=self.substeps,
+            substeps=1 if self.substeps is None else self.substeps,
             method=self.method,
             contact=self.contact,
             contact_stiffness=self.contact_stiffness,
@@ -415,6 +465,7 @@ class Run:
             clutch=self.clutch,
             dead_man=self.dead_man,
             mark=self.mark,
+            tool_weight=self.tool_weight,
             live=not self.as_json and (err.is_terminal or not self.fast),
             realtime=self.realtime or None,
         )

@@ -32,7 +32,9 @@ from hapticbridge.kernel.mujoco_c import floats
 CONE = 0.02
 """Angle in rad by which a normal may lie outside a feature's normal cone. Faces that lie on each
 other within this angle keep all their points, so a point is known before the faces are parallel. A
-larger angle adds points that do not touch soon, each a row of the solver."""
+larger angle adds points that do not touch soon, each a row of the solver. Bodies with a margin m
+that follows their speed (``rigid_contact.follow_speed``) turn by up to m/r in a step, r being the
+radius of the smaller one, and count within that angle."""
 
 LATERAL = 1e-5
 """Length in m by which a vertex may lie beside a face and still rest on it. It bridges edges that
@@ -123,7 +125,7 @@ def _vertices(
     count: int,
     boxes: tuple[Numbers, Numbers, Numbers, Numbers],
     frame: tuple[Numbers, Numbers, float],
-    limits: tuple[float, float],
+    limits: tuple[float, float, float],
 ) -> int:
     """Adds the vertices of a box that are near another one.
 
@@ -133,12 +135,12 @@ def _vertices(
         boxes: Axes of the vertices' box in the other's frame by rows, its centre there in m, and
             the half-sizes of the other box and of the vertices' box in m.
         frame: Position and axes of the other box in the world, and the sign of the normal.
-        limits: Smallest and largest gap in m.
+        limits: Smallest and largest gap in m, and the angle of the normal cones in rad.
 
     Returns:
         The new number of points.
     """
-    (r, t, s, o), (place, turn, sign), (least, margin) = boxes, frame, limits
+    (r, t, s, o), (place, turn, sign), (least, margin, cone) = boxes, frame, limits
     for corner in range(8):
         c0 = 1.0 if corner & 1 else -1.0
         c1 = 1.0 if corner & 2 else -1.0
@@ -169,7 +171,7 @@ def _vertices(
                     n = _turned(turn, up * ex, up * ey, up * ez)
                     count = _add(points, count, gap, p, n)
                 continue
-        face, side, gap = _face(r, (c0, c1, c2), (px, py, pz), (fx, fy, fz), least)
+        face, side, gap = _face(r, (c0, c1, c2), (px, py, pz), (fx, fy, fz), (least, cone))
         if gap >= least and gap < margin:
             half = 0.5 * gap * side
             p = _placed(
@@ -201,7 +203,7 @@ def _inward(r: Numbers, corner: Any, n: Any) -> float:
 
 
 @compiled
-def _face(r: Numbers, corner: Any, p: Any, f: Any, least: float) -> tuple[int, float, float]:
+def _face(r: Numbers, corner: Any, p: Any, f: Any, limits: Any) -> tuple[int, float, float]:
     """Returns the face that a vertex is on: axis, side (±1), and gap in m, −inf without a face.
 
     It is the face of largest gap, that is of least depth, whose normal is in the vertex's cone.
@@ -211,8 +213,9 @@ def _face(r: Numbers, corner: Any, p: Any, f: Any, least: float) -> tuple[int, f
         corner: Signs of the vertex.
         p: The vertex.
         f: Its gaps to the nearer face along each axis, in m.
-        least: Smallest gap in m at which a far face counts.
+        limits: Smallest gap in m at which a far face counts, and the angle of the cone in rad.
     """
+    least, cone = limits
     gap, face, side = -np.inf, 0, 1.0
     for i in range(3):
         if i == 0:
@@ -225,11 +228,11 @@ def _face(r: Numbers, corner: Any, p: Any, f: Any, least: float) -> tuple[int, f
             continue
         up = 1.0 if q >= 0.0 else -1.0
         c0, c1, c2 = corner[0] * r[3 * i], corner[1] * r[3 * i + 1], corner[2] * r[3 * i + 2]
-        if near > gap and max(up * c0, up * c1, up * c2) <= CONE:
+        if near > gap and max(up * c0, up * c1, up * c2) <= cone:
             gap, face, side = near, i, up
         # the far face, by which a vertex leaves that is past the middle of a thin plate
         far = near - 2.0 * abs(q)
-        if far > gap and far >= least and min(up * c0, up * c1, up * c2) >= -CONE:
+        if far > gap and far >= least and min(up * c0, up * c1, up * c2) >= -cone:
             gap, face, side = far, i, -up
     return face, side, gap
 
@@ -283,7 +286,7 @@ def _edges(
     s: Numbers,
     normals: Numbers,
     frame: tuple[Numbers, Numbers],
-    limits: tuple[float, float],
+    limits: tuple[float, float, float],
 ) -> int:
     """Adds the crossings of edges of two boxes.
 
@@ -292,12 +295,12 @@ def _edges(
         s: Scratch memory of the pair.
         normals: Normals of the pairs of axes, from ``_separation``.
         frame: Position and axes of the first box in the world.
-        limits: Smallest and largest gap in m.
+        limits: Smallest and largest gap in m, and the angle of the normal cones in rad.
 
     Returns:
         The number of points.
     """
-    (place, turn), (least, margin) = frame, limits
+    (place, turn), (least, margin, cone) = frame, limits
     r, t, a, b = s[_R : _R + 9], s[_T : _T + 3], s[_A : _A + 3], s[_B : _B + 3]
     count = 0
     for pair in range(9):
@@ -306,8 +309,8 @@ def _edges(
         inverse, gap = normals[one + 4], normals[one + 5]
         k, m, o, q = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
         # with a component within the cone's tolerance, the edges on both sides count
-        wide = (abs(nk) <= CONE) | (abs(nm) <= CONE) << 1
-        wide |= (abs(no) <= CONE) << 2 | (abs(nq) <= CONE) << 3
+        wide = (abs(nk) <= cone) | (abs(nm) <= cone) << 1
+        wide |= (abs(no) <= cone) << 2 | (abs(nq) <= cone) << 3
         if gap == -np.inf or (wide == 0 and gap < least):
             continue
         for other in range(16):
@@ -370,7 +373,9 @@ def box_points(
     largest = _separation(s, normals)
     if largest >= margin:
         return 0
-    limits = (min(2.0 * largest, 0.0) - TIE, margin)
+    square = min(a[0] ** 2 + a[1] ** 2 + a[2] ** 2, b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
+    cone = max(CONE, margin / np.sqrt(square))
+    limits = (min(2.0 * largest, 0.0) - TIE, margin, cone)
     count = _edges(points, s, normals, (place1, turn1), limits)
     first = (s[_R : _R + 9], s[_T : _T + 3], a, b)
     second = (s[_BACK : _BACK + 9], s[_U : _U + 3], b, a)

@@ -2,11 +2,14 @@
 
 Each contact has a wanted normal velocity at the end of the step, in m/s,
 
-    ŵ = σ β p/h − μ|v_t|    in the penetration p > 0,        ŵ = −gap/h − μ|v_t|    in a gap
+    ŵ = w − max(0, μ|v_t| − μ² max(0, w − v_n)),
+    w = σ β p/h    in the penetration p > 0,        w = −gap/h    in a gap
 
 h is the time step in s, v the relative velocity at the start, μ|v_t| = sqrt(Σ (μ_j v_j)²) over the
-rows of friction and σ the share of the depenetration. The wanted velocities of the friction rows
-are 0. MuJoCo's convex problem, with the regularisation R of each row, then gives impulses h λ with
+rows of friction and σ the share of the depenetration. The convex cone lifts a contact by μ times
+its sliding, which is subtracted; the impulse that stops the normal velocity v_n slows the sliding
+first. The wanted velocities of the friction rows are 0. MuJoCo's convex problem, with the
+regularisation R of each row, then gives impulses h λ with
 
     C = h λᵀ J v⁺ = h λᵀ ŵ − h² λᵀ R λ   <=   Σ_{p>0} (σ β p/h)² / (4 R)
 
@@ -20,6 +23,8 @@ environment has dissipated,
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
 remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
 moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
+All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before it closes:
+margins follow the speed (``follow_speed``).
 Limits of joints and tendons are rows like a contact's without friction, and equality constraints
 rows with ŵ = −σ β p/h for an error p of either sign; all share the tank. What they hold stretched
 at the start is thus not pushed together for nothing. Equality constraints of a flex stay MuJoCo's.
@@ -48,6 +53,7 @@ from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part,
 from hapticbridge.kernel.ledger import mocap_work
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
@@ -63,10 +69,14 @@ IMPRATIO = 1000.0
 creeps less below the limit of friction: 3 nm/s at half of it where 100 creeps by 31 nm/s (3 N on
 0.1 kg)."""
 
-MARGIN = 3e-4
-"""Distance in m at which a contact takes part in the step before it closes. A tool at 0.3 m/s
-moves so far in 1 ms. Faster contacts are first seen in penetration, which the tank then pays for.
-A larger margin costs time for contacts without force."""
+MARGIN = 5e-5
+"""Margin of a geom at rest in m. Two geoms take part in the step from the sum of their margins on,
+before they touch. It covers the speed that a body gains within a step. A larger one costs time for
+contacts without force."""
+
+LARGEST_MARGIN = 5e-3
+"""Largest margin in m that a geom's speed adds, that of 5 m/s at 1 ms. A faster geom may be first
+seen in penetration, which the tank then pays for."""
 
 SPENDABLE = 0.9
 """Largest share of the tank that one tick spends, without unit. The rest covers the remainder of
@@ -85,15 +95,18 @@ _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 _LAST_ROWS = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
 
-_PARAMETERS = (
+_WRITTEN = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
-    *("tendon_solref_lim", "tendon_solimp_lim"),
+    *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
 )
-_ROW_ADDRESSES = (
-    *_PARAMETERS,
-    *(f"own_{name}" for name in _PARAMETERS),
-    "eq_type",
-    "row_positions",
+_OF_MODEL = (
+    *(*_WRITTEN, "geom_rbound", "pair_geom1", "pair_geom2", "eq_type"),
+    *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
+)
+_OF_DATA = ("geom_xpos", "subtree_com", "cdof")
+_OWNED = (
+    *(f"own_{name}" for name in _WRITTEN),
+    *("row_positions", "moving_geoms", "body_velocity"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -103,7 +116,9 @@ RIGID_DTYPE = np.dtype(
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
         ("row_capacity", "<i8"),
-        *((name, "<i8") for name in _ROW_ADDRESSES),
+        *((name, "<i8") for name in (*_OF_MODEL, *_OF_DATA, *_OWNED)),
+        ("moving_count", "<i8"),
+        ("pair_count", "<i8"),
         ("share", "<f8"),
         ("tank", "<f8"),
         ("cap", "<f8"),
@@ -115,7 +130,8 @@ RIGID_DTYPE = np.dtype(
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
 last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of limits and equality
 constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
-of copies, and of the rows' own positions."""
+of copies, and of the rows' own positions. Of margins: addresses and counts of the geoms that move,
+of pairs, and of the bodies' velocities."""
 
 
 def bind_contact(
@@ -131,20 +147,27 @@ def bind_contact(
             max(6 * model.neq, flex_rows) + model.nv + 2 * model.njnt + 3 * model.ntendon
         )
     owned: dict[str, NDArray[np.generic]] = {
-        f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
+        f"own_{name}": getattr(model, name).copy() for name in _WRITTEN
     }
-    owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     owned["row_positions"] = np.zeros(max(int(contact["row_capacity"]), 1))
+    meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    meets[model.pair_geom1] = meets[model.pair_geom2] = True
+    is_moving = model.body_weldid[model.geom_bodyid] > 0
+    owned["moving_geoms"] = np.flatnonzero(meets & is_moving).astype(np.int32)
+    owned["body_velocity"] = np.zeros((model.nbody, 6))
+    contact["moving_count"], contact["pair_count"] = owned["moving_geoms"].size, model.npair
+    for name in _OF_MODEL:
+        contact[name] = getattr(model, name).ctypes.data
+    for name in _OF_DATA:
+        contact[name] = getattr(data, name).ctypes.data
     for name, array in owned.items():
         contact[name] = array.ctypes.data
-    for name in _PARAMETERS:
-        contact[name] = getattr(model, name).ctypes.data
     return owned
 
 
-def restore_model(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
-    """Gives limits and equality constraints their own parameters, after a step broken off."""
-    for name in _PARAMETERS:
+def restore_contact(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
+    """Puts back what a run writes to the model, from the arrays of ``bind_contact``."""
+    for name in _WRITTEN:
         getattr(model, name)[...] = owned[f"own_{name}"]
 
 
@@ -170,7 +193,9 @@ def _aim(s: State) -> None:
         for j in range(1, ints(contact + mj.contact_dim, 1)[0]):
             slide += (friction[j - 1] * velocities[row + j]) ** 2
         distance = floats(contact + mj.contact_distance, 1)[0]
-        wanted = (-push if distance < 0.0 else -1.0) * distance / h - math.sqrt(slide)
+        wanted = (-push if distance < 0.0 else -1.0) * distance / h
+        stop = max(wanted - velocities[row], 0.0)
+        wanted -= max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         solref = floats(contact + mj.contact_solref, 2)
@@ -330,6 +355,56 @@ def finish_contacts(s: State) -> None:
         if row >= 0:
             positions[row] = floats(contact + mj.contact_distance, 1)[0]
             s.contact.active_contacts += force[row] > 0.0
+
+
+@compiled
+def follow_speed(s: State) -> None:
+    """Widens each geom's margin for the next collisions by the way that it goes in a step.
+
+    The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
+    bounding sphere, at most ``LARGEST_MARGIN``. Positions are those at the start of the last step.
+    """
+    contact, mj, h = s.contact, s.mj, s.run.timestep
+    _move_bodies(s)
+    velocities, centres = floats(contact.body_velocity, 6 * mj.nbody), contact.geom_xpos
+    bodies, roots = ints(mj.geom_bodyid, mj.ngeom), ints(contact.body_rootid, mj.nbody)
+    margins, at_rest = (
+        floats(contact.geom_margin, mj.ngeom),
+        floats(contact.own_geom_margin, mj.ngeom),
+    )
+    radii = floats(contact.geom_rbound, mj.ngeom)
+    for geom in ints(contact.moving_geoms, contact.moving_count):
+        body = bodies[geom]
+        centre = vector_of(floats(centres + 24 * geom, 3))
+        origin = vector_of(floats(contact.subtree_com + 24 * roots[body], 3))
+        turn = vector_of(velocities[6 * body : 6 * body + 3])
+        velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
+        velocity = add(velocity, cross(turn, subtract(centre, origin)))
+        way = h * (norm(velocity) + radii[geom] * norm(turn))
+        margins[geom] = at_rest[geom] + (way if way < LARGEST_MARGIN else LARGEST_MARGIN)
+    for pair in range(contact.pair_count):
+        way = 0.0
+        for geoms in (contact.pair_geom1, contact.pair_geom2):
+            geom = ints(geoms + 4 * pair, 1)[0]
+            way += margins[geom] - at_rest[geom]
+        at_rest_here = floats(contact.own_pair_margin + 8 * pair, 1)[0]
+        floats(contact.pair_margin + 8 * pair, 1)[0] = at_rest_here + way
+
+
+@compiled
+def _move_bodies(s: State) -> None:
+    """Computes the bodies' velocities from those of the joints, as MuJoCo's ``cvel``."""
+    contact, mj = s.contact, s.mj
+    parents = ints(contact.body_parentid, mj.nbody)
+    first, number = ints(contact.body_dofadr, mj.nbody), ints(contact.body_dofnum, mj.nbody)
+    axes, speeds = floats(contact.cdof, 6 * mj.nv), floats(mj.qvel, mj.nv)
+    velocities = floats(contact.body_velocity, 6 * mj.nbody)
+    for body in range(1, mj.nbody):
+        for i in range(6):
+            velocities[6 * body + i] = velocities[6 * parents[body] + i]
+        for dof in range(first[body], first[body] + number[body]):
+            for i in range(6):
+                velocities[6 * body + i] += axes[6 * dof + i] * speeds[dof]
 
 
 @compiled

@@ -96,7 +96,7 @@ from hapticbridge.kernel.passivity_controller import (
     observe_energy,
     within_energy_limit,
 )
-from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -394,6 +394,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
     spend_within_tank(s)
+    if s.contact.is_rigid:
+        follow_speed(s)
     is_last = substep + 1 == s.run.substeps
     if scheme != Scheme.MASSLESS:
         meter_ports(s)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -92,8 +93,13 @@ def _depends_on_velocity(model: mujoco.MjModel, actuator_id: int) -> bool:
 
 
 MAXIMUM_START_PENETRATION = 1e-4
-"""Largest penetration of the tool at the start, in m. A penetration releases contact energy that no
-port meters: 26 mJ within 15 ms were measured. A larger value allows a larger push at the start."""
+"""Largest penetration of the tool at the start, in m, for contacts of the scene. Their penetration
+releases energy that no port meters: 26 mJ within 15 ms were measured. A larger value allows a
+larger push at the start."""
+
+NOTABLE_OVERLAP = 1e-3
+"""Overlap in m at the start above which a scene is changed, or a sentence says that it begins so.
+MuJoCo's own contacts rest 0.1 mm deep, and soft ones deeper; rigid contacts hold these silently."""
 
 
 def check_options(spec: mujoco.MjSpec) -> list[str]:
@@ -182,8 +188,8 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     """Refuses a compiled model that cannot be coupled; returns warnings.
 
     Raises:
-        SceneError: Masses or inertias are not finite, the grip cannot move, a joint would cap the
-            coupling's force, or a default of the scene changed a coupling actuator.
+        SceneError: Masses or inertias are not finite, the grip cannot move, or a default of the
+            scene changed a coupling actuator.
     """
     for body_id in range(model.nbody):
         mass, inertia = model.body_mass[body_id], model.body_inertia[body_id]
@@ -192,22 +198,12 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
                 f"{_body_name(model, body_id)} has mass {mass:g} kg and inertia "
                 f"{inertia.tolist()} kg m²; all must be finite"
             )
-    chain = _ancestors(model, int(model.site(grip).bodyid[0]))
+    chain = ancestors(model, int(model.site(grip).bodyid[0]))
     if not any(model.body_dofnum[body_id] for body_id in chain):
         raise SceneError(
             f"grip '{grip}' sits on {_body_name(model, chain[0])}, which cannot move; put it on a "
             "body with a free joint or at the end of joints"
         )
-    for body_id in chain:
-        first = model.body_jntadr[body_id]
-        for joint_id in range(first, first + model.body_jntnum[body_id]):
-            if model.jnt_actfrclimited[joint_id]:
-                name = model.joint(joint_id).name or str(joint_id)
-                raise SceneError(
-                    f"joint '{name}' of {_body_name(model, body_id)} limits actuator forces "
-                    "(actuatorfrcrange), which would cap the coupling; remove it and limit the "
-                    "actuator's own forcerange"
-                )
     for name in COUPLING_ACTUATORS:
         _check_coupling_actuator(model, name)
     warnings = []
@@ -219,7 +215,8 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
     return warnings
 
 
-def _ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
+def ancestors(model: mujoco.MjModel, body_id: int) -> list[int]:
+    """Returns the bodies from a body to the world, both included."""
     chain = [body_id]
     while chain[-1] != 0:
         chain.append(int(model.body_parentid[chain[-1]]))
@@ -247,8 +244,8 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
         )
 
 
-def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
-    """Raises SceneError for a start that is not finite or in which the tool penetrates a body.
+def check_start(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Raises SceneError for a start that is not finite.
 
     ``data`` must be at the start, after ``mj_forward``.
     """
@@ -258,20 +255,67 @@ def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
                 f"the scene's start is not finite, or beyond {mujoco.mjMAXVAL:g}, in {name}; check "
                 "keyframe 'home' and qpos0"
             )
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """A contact in penetration.
+
+    Attributes:
+        depth: Depth in m, > 0.
+        words: Names of both sides.
+        bodies: Ids of both bodies; -1 for a flex.
+    """
+
+    depth: float
+    words: str
+    bodies: tuple[int, int]
+
+    def __str__(self) -> str:
+        return f"{self.words} overlap by {1e3 * self.depth:.3g} mm"
+
+
+def overlaps(model: mujoco.MjModel, data: mujoco.MjData, depth: float) -> list[Overlap]:
+    """Returns the pairs that overlap by more than a depth in m, the deepest first.
+
+    ``data`` must be after MuJoCo's position stage. Each pair of geoms or flexes is listed once.
+    """
+    found: dict[str, Overlap] = {}
+    for contact in sorted(data.contact, key=lambda contact: float(contact.dist)):
+        if contact.dist >= -depth:
+            break
+        sides = list(zip(contact.geom.tolist(), contact.flex.tolist(), strict=True))
+        words = " and ".join(_side_name(model, geom, flex) for geom, flex in sides)
+        first, second = (int(model.geom_bodyid[geom]) if geom >= 0 else -1 for geom, _ in sides)
+        found.setdefault(words, Overlap(-float(contact.dist), words, (first, second)))
+    return list(found.values())
+
+
+def refuse_overlap(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    """Refuses a start in which the tool penetrates a body, for contacts that would push it out.
+
+    Raises:
+        SceneError: Names the deepest pair.
+    """
     root = model.body_rootid[model.site(grip).bodyid[0]]
-    for contact in data.contact:
-        if contact.dist >= -MAXIMUM_START_PENETRATION:
-            continue
-        pair = [
-            (int(geom), int(flex)) for geom, flex in zip(contact.geom, contact.flex, strict=True)
-        ]
-        roots = [model.body_rootid[model.geom_bodyid[geom]] for geom, _ in pair if geom >= 0]
-        if root in roots:
-            names = " and ".join(_side_name(model, geom, flex) for geom, flex in pair)
+    for overlap in overlaps(model, data, MAXIMUM_START_PENETRATION):
+        if root in [model.body_rootid[body] for body in overlap.bodies if body >= 0]:
             raise SceneError(
-                f"the tool starts in penetration: {names} overlap by {-contact.dist * 1e3:.3g} mm; "
-                f"at most {MAXIMUM_START_PENETRATION * 1e3:g} mm are allowed; move the tool's start"
+                f"the tool starts in penetration: {overlap}; contacts of the scene allow at most "
+                f"{MAXIMUM_START_PENETRATION * 1e3:g} mm; move the tool's start, or let rigid "
+                "contacts hold it (--contact rigid, without --as-is)"
             )
+
+
+def is_nested(model: mujoco.MjModel, first: int, second: int) -> bool:
+    """Returns True if one of two bodies of a tree carries the other one, in any number of joints.
+
+    Bodies without joints between them count as one.
+    """
+    if min(first, second) <= 0 or model.body_rootid[first] != model.body_rootid[second]:
+        return False
+    groups = [model.body_weldid[ancestors(model, body)[:-1]].tolist() for body in (first, second)]
+    return groups[0][0] in groups[1] or groups[1][0] in groups[0]
 
 
 def _side_name(model: mujoco.MjModel, geom_id: int, flex_id: int) -> str:

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME, coupling_ids
+from hapticbridge.scene.checks import (
+    NOTABLE_OVERLAP,
+    Overlap,
+    ancestors,
+    is_nested,
+    overlaps,
+)
 from hapticbridge.scene.compile import go_to_start
 
 # Weld between grip and handle (MuJoCo's equality constraint)
@@ -268,3 +275,107 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
     # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return tuple(dict.fromkeys((*changes, *needed)))
+
+
+def limit_motors_alone(
+    model: mujoco.MjModel, data: mujoco.MjData, grip: str, *, as_is: bool = False
+) -> tuple[str, ...]:
+    """Moves force limits from the joints that carry the grip to the actuators of these joints.
+
+    MuJoCo's ``actuatorfrcrange`` limits the sum of all actuator forces on a joint, and the coupling
+    is made of actuators. An actuator that alone drives a joint with moment arm g pushes within
+    [a, b] on it if its own force is within [a, b]/g. Several actuators of one joint are limited
+    each by itself; gravity compensation is not limited.
+
+    Args:
+        model: The compiled scene; changed in place.
+        data: Its state at the start, after ``mj_forward``.
+        grip: Name of the site on the tool.
+        as_is: If true, a scene with such a joint is refused.
+
+    Returns:
+        The change, as ``name: old → new``; nothing if no such joint has a limit.
+
+    Raises:
+        SceneError: A change is needed that ``as_is`` forbids.
+    """
+    chain = np.isin(model.jnt_bodyid, ancestors(model, int(model.site(grip).bodyid[0])))
+    joints = np.flatnonzero(chain & (model.jnt_actfrclimited != 0)).tolist()
+    if not joints:
+        return ()
+    name = model.joint(joints[0]).name or str(joints[0])
+    more = f" and {len(joints) - 1} more" if len(joints) > 1 else ""
+    if as_is:
+        raise SceneError(
+            f"joint '{name}'{more} limits actuator forces (actuatorfrcrange), which would cap the "
+            "coupling; limit the actuator's own forcerange, or let it be done (without --as-is)"
+        )
+    moments = np.zeros((model.nout, model.nv))
+    mujoco.mju_sparse2dense(
+        moments,
+        data.actuator_moment,
+        data.moment_rownnz,
+        data.moment_rowadr,
+        data.moment_colind,
+    )
+    shared = 0
+    for joint in joints:
+        model.jnt_actfrclimited[joint] = 0
+        arms = moments[model.actuator_outadr, model.jnt_dofadr[joint]]
+        drivers = [i for i in np.flatnonzero(arms).tolist() if i not in coupling_ids(model)]
+        shared += len(drivers) > 1
+        for actuator in drivers:
+            low, high = sorted(model.jnt_actfrcrange[joint] / arms[actuator])
+            if model.actuator_forcelimited[actuator]:
+                low = max(low, model.actuator_forcerange[actuator, 0])
+                high = min(high, model.actuator_forcerange[actuator, 1])
+            model.actuator_forcelimited[actuator] = 1
+            model.actuator_forcerange[actuator] = low, high
+    each = "each of its actuators" if shared else "its actuator"
+    return (f"force limit of joint '{name}'{more}: on all actuators together → on {each}",)
+
+
+def exclude_nested(spec: mujoco.MjSpec, model: mujoco.MjModel, grip: str) -> tuple[str, ...]:
+    """Excludes contacts between parts of a robot that begin inside each other, for good.
+
+    A link whose hull encloses part of the link that carries it is inside it in every pose. A
+    contact between them would only jam the joint.
+
+    Args:
+        spec: The scene with its handle; changed in place.
+        model: The model that it compiles to.
+        grip: Name of the site on the tool.
+
+    Returns:
+        The change, as ``name: old → new``; nothing if no exclusion was added, and the model is
+        that of the specification.
+    """
+    data = mujoco.MjData(model)
+    go_to_start(model, data, grip)
+    pairs: dict[tuple[int, int], Overlap] = {}
+    for overlap in overlaps(model, data, NOTABLE_OVERLAP):
+        if is_nested(model, *overlap.bodies):
+            pairs.setdefault(overlap.bodies, overlap)
+    bodies = list(spec.bodies)
+    if len(bodies) != model.nbody or not pairs:
+        return ()  # MuJoCo fused bodies, so that their numbers differ
+    for first, second in pairs:
+        for body_id in (first, second):
+            bodies[body_id].name = bodies[body_id].name or f"{PREFIX}body_{body_id}"
+        spec.add_exclude(bodyname1=bodies[first].name, bodyname2=bodies[second].name)
+    return (f"contact where {_listed(list(pairs.values()))} at the start: on → off",)
+
+
+def announce_overlaps(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[str, ...]:
+    """Returns a sentence on what overlaps at the start, as a change ``name: old → new``."""
+    if found := overlaps(model, data, NOTABLE_OVERLAP):
+        return (
+            f"start where {_listed(found)}: pushed out at once → held, and eased out with energy "
+            "that the scene has dissipated",
+        )
+    return ()
+
+
+def _listed(found: list[Overlap]) -> str:
+    count = len(found) - 1
+    return str(found[0]) + (f" (and {count} more pair{'s' * (count > 1)})" if count else "")

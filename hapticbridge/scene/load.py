@@ -12,10 +12,22 @@ from pathlib import Path
 import mujoco
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.scene.checks import check_model, check_numbers, check_options, check_start
+from hapticbridge.scene.checks import (
+    check_model,
+    check_numbers,
+    check_options,
+    check_start,
+    refuse_overlap,
+)
 from hapticbridge.scene.compile import clause, compiled, hold_servos, seat_handle
 from hapticbridge.scene.grip import add_grip
-from hapticbridge.scene.handle import attach_handle, set_options
+from hapticbridge.scene.handle import (
+    announce_overlaps,
+    attach_handle,
+    exclude_nested,
+    limit_motors_alone,
+    set_options,
+)
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
@@ -114,8 +126,9 @@ def load_scene(
             written form.
         grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
             ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``).
-        as_is: If true, a scene with options that exclude the coupling is refused; else they are
-            changed, and ``Scene.changes`` lists them.
+        as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
+            coupling, force limits of joints, a tool inside something); else it is changed, and
+            ``Scene.changes`` lists the changes.
         **parameters: Values of the scene's parameters, such as ``clearance=0.1e-3``.
             ``scene.scene_parameters`` and ``hapticbridge scenes NAME`` list them. A specification
             has none.
@@ -201,9 +214,9 @@ def compile_scene(
     Args:
         source: Result of ``read_scene``, possibly with a changed specification; it is not modified.
         grip: Site, ``BODY`` or ``BODY@x,y,z``.
-        as_is: If true, a scene with options that exclude the coupling is refused.
+        as_is: If true, a scene that must be changed to be felt is refused.
         warns: If true, deviations of the run from the file are issued as warnings.
-        checks_start: If true, a start in penetration or that is not finite is refused.
+        checks_start: If true, a start that is not finite is refused.
         stacklevel: Stack level of the warnings.
 
     Raises:
@@ -219,15 +232,22 @@ def compile_scene(
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = compiled(spec, source.sources)
+        if not as_is and (excluded := exclude_nested(spec, model, grip)):
+            changes, model = changes + excluded, compiled(spec, source.sources)
         concerns = [*source.concerns, *about_grip, *check_model(model, grip)]
         seat_handle(model, grip)
         if not as_is:
             changes += hold_servos(model)
         data, values = mujoco.MjData(model), dict(source.parameters)
-        scene = Scene(path, grip, model, data, source.sources, values, changes, spec)
+        scene = Scene(path, grip, model, data, source.sources, values, changes, as_is, _spec=spec)
         scene.reset()
+        scene.changes += limit_motors_alone(model, scene.data, grip, as_is=as_is)
     if checks_start:
-        check_start(model, scene.data, grip)
+        check_start(model, scene.data)
+    if as_is:
+        refuse_overlap(model, scene.data, grip)
+    else:
+        scene.changes += announce_overlaps(model, scene.data)
     if warns:
         for concern in concerns:
             warnings.warn(f"scene '{path}': {concern}", UserWarning, stacklevel=stacklevel)

@@ -11,9 +11,9 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, WELD_NAME
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.kernel.colliders import use_exact_points
-from hapticbridge.kernel.rigid_contact import IMPRATIO, MARGIN
+from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
@@ -36,6 +36,13 @@ def has_rigid_contact(model: mujoco.MjModel) -> bool:
     return min(margins) >= MARGIN and all(getattr(model.opt, k) == v for k, v in options.items())
 
 
+def _widen_bodies(model: mujoco.MjModel, more: float) -> None:
+    """Lets MuJoCo compare bodies from the distance of their geoms' contacts, and more, in m."""
+    model.body_margin[:] = 0.0
+    reach = model.geom_margin + model.geom_gap + more
+    np.maximum.at(model.body_margin, model.geom_bodyid, reach)
+
+
 @dataclass(slots=True)
 class Scene:
     """A compiled scene with its handle, ready to be stepped.
@@ -47,7 +54,9 @@ class Scene:
         data: State of the model.
         sources: The original bytes of the file, its includes and its assets.
         parameters: Value of each of the scene's parameters, in the unit of its parameter file.
-        changes: Options of the file that were changed, each as ``name: old → new``.
+        changes: What differs from the file, each as ``name: old → new``.
+        as_is: True if the scene must not be changed to be felt.
+        is_carried: True if the weight of the tool is compensated (``carry_tool``).
     """
 
     path: Path
@@ -57,6 +66,8 @@ class Scene:
     sources: tuple[SourceFile, ...]
     parameters: dict[str, float] = field(default_factory=dict)
     changes: tuple[str, ...] = ()
+    as_is: bool = False
+    is_carried: bool = False
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -116,6 +127,7 @@ class Scene:
         self.model.geom_gap += more
         self.model.pair_gap += more
         self.model.flex_gap += more
+        self._set_margins()
 
     def set_contact(self, *, is_rigid: bool) -> None:
         """Sets the options that rigid contacts need (``kernel.rigid_contact``), or the scene's own.
@@ -126,6 +138,7 @@ class Scene:
         """
         model, own = self.model, self._own_contact
         if is_rigid == bool(own):
+            self._set_margins()
             return
         if not is_rigid:
             self._restore_contact(model)
@@ -137,14 +150,19 @@ class Scene:
         for name, value in _CONTACT_OPTIONS.items():
             setattr(model.opt, name, value)
         model.opt.o_margin = max(own["o_margin"], MARGIN)
-        for name in _MARGINS:
-            margins = getattr(model, name)
-            margins[:] = np.maximum(margins, MARGIN)
+        self._set_margins()
         use_exact_points(model)
+
+    def _set_margins(self) -> None:
+        """Sets the margins of rigid contacts at rest; in a run they follow the speed."""
+        for name in _MARGINS if self._own_contact else ():
+            getattr(self.model, name)[:] = np.maximum(self._own_contact[name], MARGIN)
+        _widen_bodies(self.model, LARGEST_MARGIN if self._own_contact else 0.0)
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
         for name, value in self._own_contact.items():
             setattr(model.opt if name in _CONTACT_OPTIONS else model, name, value)
+        _widen_bodies(model, 0.0)
         use_exact_points(model, is_used=False)
 
     def set_gains(
@@ -162,6 +180,32 @@ class Scene:
             self.model.actuator_gainprm[actuator_id, 0] = gain
             self.model.actuator_biasprm[actuator_id, 1] = -stiffness
             self.model.actuator_biasprm[actuator_id, 2] = -damping
+
+    def carry_tool(self, reason: str) -> None:
+        """Compensates the weight of all that moves with the grip (MuJoCo's ``gravcomp``).
+
+        ``model`` and ``data`` are replaced, and the change is noted with its reason. Inertia,
+        contacts and motors stay. The compensation's work is metered at the external port.
+
+        Raises:
+            SceneError: The scene was not made by ``load_scene``.
+        """
+        if self._spec is None:
+            raise SceneError("only the weight of a tool in a scene from load_scene can be carried")
+        # MuJoCo compensates only if a body asked for it in compilation; the handle has no mass
+        self._spec.body(HANDLE).gravcomp = 1.0
+        self._recompile(self._spec)
+        model = self.model
+        body_id = model.site_bodyid[model.site(self.grip).id]
+        model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
+        self.is_carried = True
+        self.changes += (f"weight of the tool: felt → carried ({reason})",)
+        self.reset()
+
+    def _recompile(self, spec: mujoco.MjSpec) -> None:
+        model = compiled(spec, self.sources)
+        carry_over(self.model, model)
+        self.model, self.data = model, mujoco.MjData(model)
 
     def set_weld(self, coupling: Coupling | None) -> None:
         """Welds the grip to the handle with K and B as ``solref``; None removes the weld.
@@ -182,8 +226,6 @@ class Scene:
             spec = self._spec.copy()
             if coupling is not None:
                 add_weld(spec, self.grip)
-            model = compiled(spec, self.sources)
-            carry_over(self.model, model)
-            self.model, self.data = model, mujoco.MjData(model)
+            self._recompile(spec)
         if coupling is not None:
             set_weld_gains(self.model, coupling)

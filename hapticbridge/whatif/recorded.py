@@ -30,6 +30,7 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.rendering import Method, prepare
 from hapticbridge.run_description import (
+    CARRIED,
     SOURCE_PREFIX,
     compiled_model,
     method_of,
@@ -219,7 +220,10 @@ class RecordedRun:
         values = {n: v for n, v in settings.scene.items() if defaults.get(n) != v}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-            return load_scene(self.scene_file, self.parameters.grip, as_is=False, **values)
+            scene = load_scene(self.scene_file, self.parameters.grip, as_is=False, **values)
+        if self.recording.meta.get("tool_weight") == CARRIED:
+            scene.carry_tool("as recorded")
+        return scene
 
     def is_scene_as_recorded(self) -> bool:
         """Returns True if the attached sources compile to the recorded model.

@@ -1,0 +1,82 @@
+"""Motion of a scene without a hand, against the one that its file describes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cli_cases import Called
+
+from hapticbridge.check.observe import Setting
+from hapticbridge.check.own_motion import NO_HAND, OwnMotion, own_motion, own_substeps
+from hapticbridge.scene import SceneSource, read_scene
+
+PERIOD = 1e-3
+SWING = """<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 0"/><worldbody>
+<body name="swing"><joint name="slide" type="slide" axis="1 0 0" stiffness="400" damping="0"/>
+<geom size=".02" mass="0.1"/><site name="grip"/></body></worldbody>
+<keyframe><key name="home" qpos="0.02"/></keyframe></mujoco>"""
+"""A mass on a spring of 10 Hz without damping."""
+FILTER = """<mujoco><option timestep="0.0001"/><worldbody>
+<body name="cart"><joint name="slide" type="slide" axis="1 0 0" damping="1"/>
+<geom size=".02" mass="0.1"/><site name="grip"/></body></worldbody>
+<actuator><general joint="slide" dyntype="filter" dynprm="0.0003"/></actuator>
+<keyframe><key name="home" ctrl="0.1"/></keyframe></mujoco>"""
+"""A motor behind a filter of 0.3 ms, which Euler's steps of more than 0.6 ms let diverge."""
+ARM = """<mujoco><option timestep="0.002"/><worldbody>
+<body pos="0 0 1"><joint name="shoulder" axis="0 1 0" damping="5"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
+<body pos=".3 0 0"><joint name="elbow" axis="0 1 0" damping="2"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="0.5"/><site name="grip" pos=".3 0 0"/>
+</body></body></worldbody><actuator><position joint="shoulder" kp="500"/>
+<position joint="elbow" kp="200"/></actuator></mujoco>"""
+
+
+def scene(folder: Path, text: str) -> SceneSource:
+    path = folder / "scene.xml"
+    path.write_text(text)
+    return read_scene(path)
+
+
+def moved(source: SceneSource, substeps: int = 1) -> OwnMotion:
+    found = own_motion(source, "grip", Setting(NO_HAND, PERIOD, substeps))
+    assert found is not None
+    return found
+
+
+def test_an_arm_with_position_servos_holds_its_pose(tmp_path: Path) -> None:
+    assert moved(scene(tmp_path, ARM)).jnd < 0.1
+
+
+def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> None:
+    # implicit steps of 10 ms let a swing of 63 rad/s decay as exp(-20 t); ours keeps it
+    found = moved(scene(tmp_path, SWING.format(step=0.01, integrator="implicitfast")))
+    assert found.jnd > 5.0
+    assert found.body == "swing"
+    assert "--rate 100" in found.remedy(PERIOD)
+    for step in (0.0002, 0.001):
+        assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
+
+
+def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
+    needs = scene(tmp_path, FILTER)
+    assert moved(needs).jnd > 1.0
+    substeps, found = own_substeps(needs, "grip", PERIOD)
+    assert substeps == 10
+    assert found is not None
+    assert found.jnd < 1.0
+    does_not = scene(tmp_path, SWING.format(step=0.0002, integrator="RK4"))
+    assert own_substeps(does_not, "grip", PERIOD)[0] == 1
+
+
+def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) -> None:
+    text = FILTER.replace('"0.0001"', '"0.002"')
+    assert own_motion(scene(tmp_path, text), "grip", Setting(NO_HAND, PERIOD)) is None
+
+
+def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
+    path = scene(tmp_path, FILTER).path
+    command = ("run", path, "--fast", "--duration", 0.2)
+    code, _, err = call(*command)
+    assert (code, "10 MuJoCo steps per tick" in err) == (0, True)
+    code, _, err = call(*command, "--substeps", 1)
+    assert (code, "stretch limit" in err) == (3, True)
