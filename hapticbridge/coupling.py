@@ -60,12 +60,11 @@ class Coupling:
                 translational = getattr(self, field.name.removeprefix("rotational_"))
                 object.__setattr__(self, field.name, SQUARED_LEVER * translational)
                 continue
+            name = field.name.replace("_", " ")
             is_number = isinstance(value, Real) and not isinstance(value, bool)
             if not is_number or not math.isfinite(value):
-                raise CouplingError(
-                    f"coupling {field.name} is {value!r}; it must be a finite number"
-                )
+                raise CouplingError(f"coupling {name} is {value!r}; it must be a finite number")
             if value < 0:
-                raise CouplingError(f"coupling {field.name} is {value:g}; it must be >= 0")
+                raise CouplingError(f"coupling {name} is {value:g}; it must be >= 0")
         if self.stiffness == 0:
             raise CouplingError("coupling stiffness is 0 N/m; it must be > 0")

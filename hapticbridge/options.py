@@ -90,7 +90,7 @@ class Workspace:
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        for name, value in zip(("scale", "force_scale"), self.scales, strict=True):
+        for name, value in zip(("scale", "force scale"), self.scales, strict=True):
             if not math.isfinite(value) or value <= 0:
                 raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
         object.__setattr__(self, "axes", rotation_numbers(self.axes))

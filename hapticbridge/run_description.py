@@ -47,6 +47,11 @@ def compiled_model(model: mujoco.MjModel) -> bytes:
     return buffer.tobytes()
 
 
+def model_digest(model: mujoco.MjModel) -> str:
+    """Returns the SHA-256 of a compiled model."""
+    return hashlib.sha256(compiled_model(model)).hexdigest()
+
+
 def start_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
     """Returns the full state on which MuJoCo's next step depends."""
     state = np.zeros(mujoco.mj_stateSize(model, _STATE))
@@ -63,7 +68,7 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     expected = 8 * mujoco.mj_stateSize(model, _STATE)
     if len(state) != expected:
         raise RecordingError(
-            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached model needs "
+            f"attachment '{STATE_ATTACHMENT}' has {len(state)} bytes; the attached scene needs "
             f"{expected}"
         )
     mujoco.mj_resetData(model, data)
@@ -173,7 +178,6 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-MODEL_ATTACHMENT = "model.mjb"
 SOURCE_PREFIX = "scene/"
 
 CARRIED = "carried"
@@ -188,18 +192,17 @@ _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
 
 
 def attachments(scene: Scene) -> list[Attachment]:
-    """Returns the scene's sources, compiled model and start state as attachments.
+    """Returns the scene's sources and start state as attachments.
 
-    Call it after the scene was prepared and reset, because gains and timestep are part of the
-    model.
+    Call it after the scene was prepared and reset. The compiled model is not attached: MuJoCo's
+    loader of models is unsafe on foreign bytes, and the sources compile to it
+    (``recorded_scene``).
     """
     kept = [
         Attachment(SOURCE_PREFIX + source.name, "application/octet-stream", source.data)
         for source in scene.sources
     ]
-    model = compiled_model(scene.model)
     state = start_state(scene.model, scene.data).astype("<f8").tobytes()
-    kept.append(Attachment(MODEL_ATTACHMENT, "application/octet-stream", model))
     kept.append(Attachment(STATE_ATTACHMENT, "application/octet-stream", state))
     return kept
 
@@ -241,7 +244,7 @@ def describe_run(
         "tool_weight": CARRIED if scene.is_carried else "felt",
         "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
-        "scene_sha256": hashlib.sha256(compiled_model(scene.model)).hexdigest(),
+        "scene_sha256": model_digest(scene.model),
         "versions": json.dumps(versions(), sort_keys=True),
         "host": json.dumps(
             {"system": platform.system(), "machine": platform.machine(), "processor": processor()}

@@ -248,6 +248,7 @@ class Summary:
             fresh=fresh_share(info, parameters.period, int(state["guard"]["fresh"][0]), due),
             due=due,
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
+            mean_jitter=float(timing["jitter"]) / max(outcome.ticks, 1),
             delay_energy=float(timing["most_uncovered"]),
             is_realtime=outcome.is_realtime,
             flags=int(state["watch"]["flags"][0]),

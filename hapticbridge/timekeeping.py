@@ -4,10 +4,11 @@ The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a 
 once. A run certifies its device only if it kept its time, which means two things.
 
 1. At the time between new samples that the run had on average, T/s with s the share of the
-   deadlines that it kept, or of the samples that were new if that is less, and at its mean time t_d
-   from sample to force, the condition still holds:
+   deadlines that it kept, or of the samples that were new if that is less, at the mean time j by
+   which a sample came later after its deadline than the one before, and at the mean time t_d from
+   sample to force, the condition still holds:
 
-       b >= N/s + 3 κ t_d/T,    κ = (K T/2)²/N
+       b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
 
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
    (``kernel.timing``, and again ``audit.timing``).
@@ -49,6 +50,8 @@ class RunTimes:
         ticks: Number of ticks.
         due: Number of deadlines, with the skipped ones.
         mean_delay: Mean time in s from a sample to its force.
+        mean_jitter: Mean time in s by which samples came later than the ones before, 0 for early
+            ones; each after its own deadline.
         delay_energy: Largest energy in J that delays may have given to the hand.
         is_realtime: True if real time was requested from the system.
         fresh: Share of the samples due that were new, 0 to 1.
@@ -60,6 +63,7 @@ class RunTimes:
     fresh: float
     due: int
     mean_delay: float
+    mean_jitter: float
     delay_energy: float
     is_realtime: bool
     flags: int = 0
@@ -95,6 +99,7 @@ class Timekeeping:
         share: Share of the deadlines that were kept, 0 to 1.
         fresh: Share of the samples due that were new, 0 to 1.
         mean_delay: Mean time in s from a sample to its force.
+        mean_jitter: Mean time in s by which samples came later than the ones before.
         delay_energy: Largest energy in J that delays may have given to the hand.
         conditions: Device conditions at these times.
         in_time: The same for ticks and forces in time.
@@ -110,6 +115,7 @@ class Timekeeping:
     share: float
     fresh: float
     mean_delay: float
+    mean_jitter: float
     delay_energy: float
     conditions: tuple[DampingCondition, ...]
     in_time: tuple[DampingCondition, ...]
@@ -126,7 +132,7 @@ class Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
-        late = tuple(_at_times(each, parameters, least, times.mean_delay) for each in conditions)
+        late = tuple(_at_times(each, parameters, least, times) for each in conditions)
         held = [each.holds for each in late if each.available is not None]
         is_borne = bool(held) and all(each.holds is not False for each in conditions)
         return cls(
@@ -134,6 +140,7 @@ class Timekeeping:
             share=share,
             fresh=times.fresh,
             mean_delay=times.mean_delay,
+            mean_jitter=times.mean_jitter,
             delay_energy=times.delay_energy,
             conditions=late,
             in_time=tuple(conditions),
@@ -167,11 +174,25 @@ class Timekeeping:
 
     @property
     def words(self) -> str:
-        """Effective rate and share of the deadlines: ``914 Hz, 91.4 % of the deadlines kept``."""
+        """Effective rate, share of the deadlines, and the mean lateness of samples and forces."""
         lost = (
             "" if self.fresh >= self.share else f", {100.0 * self.fresh:.3g} % of the samples new"
         )
-        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}"
+        late = f", {self._late}" if self._late else ""
+        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
+
+    @property
+    def remark(self) -> str:
+        """``words`` where the run was not simply in time; else empty."""
+        is_exact = min(self.share, self.fresh) == 1.0 and not self._late
+        return "" if is_exact else self.words
+
+    @property
+    def _late(self) -> str:
+        jitter, delay = format_si(self.mean_jitter, "s"), format_si(self.mean_delay, "s")
+        texts = [f"sample times vary by {jitter}"] if self.mean_jitter > 0.0 else []
+        texts += [f"forces follow {delay} after the sample"] if self.mean_delay > 0.0 else []
+        return ", ".join(texts)
 
     @property
     def clause(self) -> str:
@@ -204,8 +225,7 @@ class Timekeeping:
     def _not_kept(self) -> str:
         if self.is_kept is not False:
             return ""
-        late = f" and {format_si(self.mean_delay, 's')} from sample to force"
-        at_times = f"at {self.rate:.4g} Hz{late if self.mean_delay else ''} it needs"
+        at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it needs"
         pairs = zip(self.conditions, self.in_time, strict=True)
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
@@ -224,18 +244,20 @@ class Timekeeping:
 
 
 def _at_times(
-    condition: DampingCondition, parameters: RunParameters, share: float, delay: float
+    condition: DampingCondition, parameters: RunParameters, share: float, times: RunTimes
 ) -> DampingCondition:
-    """Returns a device condition at a run's share of deadlines kept and mean delay in s."""
+    """Returns a device condition at a run's share of deadlines kept and mean times."""
     coupling = parameters.effective or parameters.coupling
     stiffness = parameters.scale * parameters.force_scale * coupling.stiffness
     if condition.axis == "rotation":
         ratio = parameters.force_scale / parameters.scale
         stiffness = ratio * coupling.rotational_stiffness
-    needed = condition.needed / share
+    needed = condition.needed * (1.0 / share + times.mean_jitter / parameters.period)
     if stiffness > 0.0:
         half = 0.5 * stiffness * parameters.period
-        needed += DELAY_PRICE * half * half / condition.needed * delay / parameters.period
+        needed += (
+            DELAY_PRICE * half * half / condition.needed * times.mean_delay / parameters.period
+        )
     return DampingCondition(
         condition.axis, needed, condition.available, condition.remedy, condition.delay
     )

@@ -24,7 +24,7 @@ from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
-from hapticbridge.run_description import MODEL_ATTACHMENT
+from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
 
@@ -118,7 +118,8 @@ def rewritten(
 
 def without_model(recording: Recording) -> Recording:
     """Leaves out what a re-simulation needs."""
-    files = {name: data for name, data in recording.attachments.items() if name != MODEL_ATTACHMENT}
+    kept = recording.attachments.items()
+    files = {name: data for name, data in kept if not name.startswith(SOURCE_PREFIX)}
     return Recording(**{**vars(recording), "attachments": files})
 
 

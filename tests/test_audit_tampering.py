@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
@@ -20,9 +19,8 @@ from hapticbridge.export import export
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.format import Digest
 from hapticbridge.run_description import (
-    MODEL_ATTACHMENT,
+    SOURCE_PREFIX,
     STATE_ATTACHMENT,
-    compiled_model,
     processor,
     versions,
 )
@@ -131,7 +129,7 @@ def test_damaged_metadata_never_crash_the_audit(
 ) -> None:
     report = verdict_of(held, folder, meta={name: text})
     if name in ("versions", "host"):
-        assert report.verdict == "passive"
+        assert report.verdict == ("passive" if name == "host" else "unverified")
         assert name == "host" or report.resimulation.startswith("not re-simulated: ")
     else:
         assert report.verdict == "invalid"
@@ -158,23 +156,41 @@ def test_changed_scene_is_found_whatever_else_was_made_to_fit(tap: Recording, fo
     assert verdict_of(tap, folder, attachments=other).verdict == "invalid"
     short = {STATE_ATTACHMENT: tap.attachments[STATE_ATTACHMENT][:-8]}
     assert "bytes" in verdict_of(tap, folder, attachments=short).reason
-    cut = {MODEL_ATTACHMENT: tap.attachments[MODEL_ATTACHMENT][:-8]}
-    assert "scene_sha256" in verdict_of(tap, folder, attachments=cut).reason
 
 
-def test_a_model_that_is_signed_anew_must_still_fit_the_metadata(
+SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
+
+
+def test_the_scene_is_compiled_from_what_is_attached(tap: Recording, folder: Path) -> None:
+    """The audit trusts no compiled model: its sources must be the scene that ran."""
+    text = tap.attachments[SCENE]
+    for other, words in (
+        (b"hello", "does not fit the metadata"),
+        (b"<mujoco/>", "does not fit the metadata"),
+        (text.replace(b'name="grip"', b'name="grap"'), "grip"),
+        (text.replace(b"</worldbody>", b'<light pos="0 0 1"/></worldbody>'), "scene_sha256"),
+        (text.replace(b"impratio", b"impratio", 1) + b"<!-- no change of the model -->", ""),
+    ):
+        report = verdict_of(tap, folder, attachments={SCENE: other})
+        assert words in report.reason
+        assert report.verdict == ("invalid" if words else "passive")
+    sheet = {SCENE.replace(".xml", ".toml"): b""}
+    assert verdict_of(tap, folder, attachments=sheet).verdict == "invalid"
+    other = {
+        "scene_parameters": json.dumps(json.loads(tap.meta["scene_parameters"]) | {"mass": 0.12})
+    }
+    assert "scene_sha256" in verdict_of(tap, folder, meta=other).reason
+
+
+def test_another_processor_may_compile_another_model_which_is_then_not_judged(
     tap: Recording, folder: Path
 ) -> None:
-    def reason(content: bytes) -> str:
-        meta = {"scene_sha256": hashlib.sha256(content).hexdigest()}
-        return verdict_of(tap, folder, meta=meta, attachments={MODEL_ATTACHMENT: content}).reason
-
-    content = tap.attachments[MODEL_ATTACHMENT]
-    name = b"hapticbridge/coupling_force_x"
-    assert "has no 'hapticbridge/coupling_force_x'" in reason(content.replace(name, name.upper()))
-    model = mujoco.MjModel.from_binary_path("a.mjb", assets={"a.mjb": content})
-    model.opt.timestep *= 0.5
-    assert "timestep is 0.0005 s" in reason(compiled_model(model))
+    other = {"scene_sha256": "0" * 64}
+    assert verdict_of(tap, folder, meta=other).verdict == "invalid"
+    other["host"] = json.dumps(json.loads(tap.meta["host"]) | {"processor": processor() + "!"})
+    report = verdict_of(tap, folder, meta=other)
+    assert "another processor compiled it" in report.reason
+    assert (report.verdict, report.exit_code) == ("unverified", 1)
 
 
 def test_change_without_a_new_digest_is_found_by_the_digest(
@@ -249,7 +265,9 @@ def test_a_recording_of_an_earlier_version_is_refused_exported_and_repaired(
 def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder: Path) -> None:
     other = {"versions": json.dumps(versions() | {"mujoco": "3.0"})}
     report = verdict_of(tap, folder, meta=other)
-    assert report.verdict == "passive"
+    assert (report.verdict, report.exit_code) == ("unverified", 1)
+    assert json.loads(report.to_json())["verdict"] == "unverified"
+    assert audit(report.path, accepts_unverified=True).exit_code == 0
     assert report.resimulation == (
         f"not re-simulated: recorded with mujoco 3.0, here is {mujoco.__version__}"
     )
@@ -259,9 +277,11 @@ def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder:
     # below NumPy's tolerance, so only the re-simulation can tell; with it the same is invalid
     ticks = tap.ticks.copy()
     ticks["kinetic"][60] *= 1 + 1e-12
-    assert verdict_of(tap, folder, ticks=ticks, meta=other).verdict == "passive"
+    assert verdict_of(tap, folder, ticks=ticks, meta=other).verdict == "unverified"
     assert verdict_of(tap, folder, ticks=ticks).verdict == "invalid"
-    assert MODEL_ATTACHMENT in verdict_of(without_model(tap), folder).resimulation
+    bare = verdict_of(without_model(tap), folder)
+    assert (bare.verdict, bare.exit_code) == ("unverified", 1)
+    assert SOURCE_PREFIX in bare.resimulation
 
 
 def test_other_processor_may_round_differently_but_not_more(tap: Recording, folder: Path) -> None:

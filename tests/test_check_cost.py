@@ -66,7 +66,7 @@ def cost_of_wall(
         return measure_cost(scene, samples, Setting(COUPLING))
     if plant is not None:
         plant(clock)  # not before: MuJoCo's compiler calls some of it too
-    return measure_cost(scene, samples, Setting(COUPLING), clock=clock.pythons)
+    return measure_cost(scene, samples, Setting(COUPLING, contact="scene"), clock=clock.pythons)
 
 
 def changed(cost: Cost) -> dict[str, tuple[float, float]]:

@@ -231,13 +231,13 @@ def test_time_step_is_no_fault_where_the_rate_was_asked_for(tmp_path: Path) -> N
 
 def test_contact_that_created_energy_is_named_with_a_setting_that_does_not(tmp_path: Path) -> None:
     source = read_scene("peg_in_hole", clearance=1e-3)
-    (fault,) = find_faults(open_case(source))
-    assert fault.kind == "energy created"
+    assert find_faults(open_case(source)) == ()
+    fault = one_of("energy created", find_faults(open_case(source, contact="scene")))
     assert "% of the coupling's slack, which covers it" in fault.sentence
     change = fault.change.split(" there")[0]
     assert change == 'solref="0.0005 8"'
     mended = read_scene(peg_with(tmp_path, "0.0005 8"), clearance=1e-3)
-    assert find_faults(open_case(mended)) == ()
+    assert "energy created" not in kinds(find_faults(open_case(mended, contact="scene")))
 
 
 def test_motion_that_does_not_end_is_a_fault_and_no_error(tmp_path: Path) -> None:

@@ -37,9 +37,9 @@ def test_active_and_invalid_recordings_are_exit_code_1(
 def test_strict_is_passed_on(call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def judged(path: Path, *, strict: bool) -> Any:
+    def judged(path: Path, *, strict: bool, **options: bool) -> Any:
         seen.append(strict)
-        return audit(path, strict=strict)
+        return audit(path, strict=strict, **options)
 
     monkeypatch.setattr("hapticbridge.cli.audit.audit", judged)
     call("audit", run_file, "--strict")
@@ -115,7 +115,7 @@ def test_page_is_whole_fetches_nothing_and_runs_nothing(
     target = tmp_path / "page.html"
     picture_file = tmp_path / "picture.svg"
     code, out, _ = call("audit", hostile.path, "--report", target, "--plot", picture_file)
-    assert code == 0
+    assert code == 1  # no run has such a clock
     assert "<script>alert('x')</script>[/b] ${y}" in out  # printed, not taken as markup
     assert "\x1b" not in out
     text = target.read_text(encoding="utf-8")
@@ -127,7 +127,7 @@ def test_page_is_whole_fetches_nothing_and_runs_nothing(
     assert not page.fetched
     assert "url(http" not in text and "@import" not in text
     assert "alert('x')" in page.text
-    for told in ("passive", "2400 N/m", "unknown", "not re-simulated"):
+    for told in ("invalid", "2400 N/m", "unknown", "metadata 'clock'"):
         assert told in page.text
     picture = text[text.index("<svg") : text.index("</svg>") + 6]
     ET.fromstring(picture)
@@ -193,3 +193,25 @@ def test_cut_file_is_called_cut_and_repaired(call: Called, cut_file: Path, tmp_p
     code, _, err = call("repair", cut, mended)
     assert code == 2
     assert "mended.mcap" in err
+
+
+def test_a_run_that_was_not_simulated_again_is_unverified_everywhere(
+    call: Called, run_file: Path, tmp_path: Path
+) -> None:
+    recording, page = read_recording(run_file), tmp_path / "page.html"
+    other = {"versions": json.dumps(json.loads(recording.meta["versions"]) | {"mujoco": "3.0"})}
+    path = rewritten(recording, tmp_path / "old.mcap", meta=other)
+    code, out, _ = call("audit", path, "--report", page)
+    assert code == 1
+    assert "old.mcap: environment unverified (strict)" in out
+    assert "recorded with mujoco 3.0" in out
+    assert call("audit", path, "--accept-unverified")[0] == 0
+    text = page.read_text()
+    assert '<span class="word">unverified</span>' in text
+    assert "recorded with mujoco 3.0" in text
+    code, out, _ = call("audit", path, "--json")
+    assert (code, json.loads(out)[0]["verdict"]) == (1, "unverified")
+    code, out, _ = call("audit", tmp_path, run_file)
+    assert code == 1
+    assert "2 recordings: 1 passive, 1 unverified" in out
+    assert call("audit", tmp_path, run_file, "--accept-unverified")[0] == 0

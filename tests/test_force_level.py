@@ -111,6 +111,42 @@ def test_without_slip_the_coupling_that_holds_the_orientation_adds_its_torque() 
     assert turned_by(Circling(), hold_torque=10.0) > 6.0
 
 
+class Leaning(Circling):
+    """A hand that pushes along y, 1 N more each second, on a device without motors for rotation."""
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.place = self.speed = self.answer = 0.0
+        return super().start(period)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.time += self.period
+        force = self.time + self.answer - 20.0 * self.speed
+        self.speed += self.period * force / 0.3
+        self.place += self.period * self.speed
+        sample["position"][0, 1] = self.place
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.answer = float(wrench[1])
+
+
+@pytest.mark.parametrize("breakaway", [0.3, 0.5])
+@pytest.mark.parametrize("hold_torque", [0.005, 0.05])
+def test_a_nut_breaks_away_at_its_torque_and_the_hold_torque_over_the_lever(
+    breakaway: float, hold_torque: float
+) -> None:
+    """The wrench is gripped 0.1 m from its nut: 3.5 N as it comes, of which 0.5 N hold it."""
+    needed = (breakaway + hold_torque) / 0.1
+    scene = hb.load_scene("open_wrench", breakaway=breakaway)
+    limits = hb.Limits(force=20.0, torque=0.5, hold_torque=hold_torque)
+    with hb.Bridge(scene, Leaning(), clock=hb.SimulatedClock(), limits=limits) as bridge:
+        ticks = bridge.run(needed + 0.5).ticks
+        turned = bridge.latest_records(ticks)["tool_quaternion"][:, 3]
+    # the jaws have 1.3 degrees of play, and the nut creeps by 0.2
+    at = np.argmax(turned > math.sin(math.radians(0.8)))
+    assert 1e-3 * at == pytest.approx(needed, rel=0.05)
+
+
 HANGING = """
 <mujoco>
   <worldbody>

@@ -395,4 +395,4 @@ def test_a_hand_is_given_nothing_while_the_force_rises(tmp_path: Path, pose: Pos
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     # from the records alone too: the second computation knows how the force rises
-    assert audit(rewritten(without_model(recording), tmp_path / "b.mcap")).verdict == "passive"
+    assert audit(rewritten(without_model(recording), tmp_path / "b.mcap")).verdict == "unverified"

@@ -13,7 +13,7 @@ from swing_cases import GRIPS, VERY_FIRM, alarms, shakes, taps
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
-from hapticbridge.device import Motion, SimulatedDevice
+from hapticbridge.device import AXES, DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.scene import scene_names
@@ -123,3 +123,25 @@ def test_without_the_watch_nothing_is_said(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     assert not pressed(path, is_watched=False).timekeeping.fault
     assert "the force was" not in audit(path).reason
+
+
+ZIGZAG = Motion(np.arange(0.0, 2.0, 0.1), [(0.02 + 0.02 * (k % 2), 0.0, 0.0) for k in range(20)])
+"""A motion in the wall to and fro at 0.2 m/s, whose speed jumps."""
+
+
+@pytest.mark.parametrize("is_prescribed", [True, False])
+def test_motion_that_no_force_changes_is_an_alarm_only_if_its_device_claims_a_hand(
+    is_prescribed: bool,
+) -> None:
+    """Prescribed motion cannot swing through the force; a hand so strong does not exist."""
+    device = TrajectoryDevice(ZIGZAG)
+    device.info = (
+        replace(device.info, force_limit=10.0)
+        if is_prescribed
+        else DeviceInfo(name="hand", axes=AXES[:3], damping=2.0, force_limit=10.0, is_real=False)
+    )
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+        bridge.run(1.0)
+        flags = int(np.bitwise_or.reduce(bridge.latest_records(1000)["flags"]))
+    is_alarm = flags & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY) != 0
+    assert is_alarm != is_prescribed

@@ -20,7 +20,7 @@ ORDER = (
     ("scene", "inputs"),
     ("rendering", "device"),
     ("certificate", "identify", "realtime", "run_description", "theory_plots"),
-    ("guard", "summary", "timekeeping", "export"),
+    ("guard", "summary", "timekeeping", "export", "recorded_scene"),
     ("commands", "check"),
     ("audit", "compare", "options"),
     ("session", "film_process", "report"),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -14,7 +16,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.parameters import ENVIRONMENT
+from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters
 from hapticbridge.options import BridgeOptions, OptionChanges, RunSetup, Workspace
 from hapticbridge.scene import Scene, load_scene
 
@@ -48,6 +50,23 @@ def test_an_impossible_option_is_refused_when_it_is_made(
 ) -> None:
     with pytest.raises(HapticBridgeError, match=re.escape(message)):
         BridgeOptions(**values)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Coupling(1.0, 1.0, -1.0, 0.1), "coupling rotational stiffness is -1"),
+        (lambda: Coupling(1.0, 1.0, 1.0, math.nan), "coupling rotational damping is nan"),
+        (lambda: Workspace(force_scale=0.0), "force scale is 0.0"),
+        (lambda: GuardParameters(hold_force=0.0), "guard: hold force is 0.0"),
+        (lambda: GuardParameters(max_damping=-1.0), "guard: max damping is -1.0"),
+        (lambda: GuardParameters(fade_ticks=0), "guard: fade ticks is 0"),
+    ],
+)
+def test_a_refusal_names_a_quantity_in_words(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(HapticBridgeError, match=message) as refused:
+        make()
+    assert "_" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

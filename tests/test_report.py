@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -227,7 +228,9 @@ def test_another_device_has_another_cause(
 def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -> None:
     recording, report = made(report_runs.active_by_contact)
     assert "touched" in cause_of(recording, report).evidence
-    hazardous = recording.meta | {"method": "implicitfast"}
+    gains = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+    law = json.dumps([float(recording.meta[name]) for name in gains])
+    hazardous = recording.meta | {"method": "implicitfast", "requested": law}
     assert cause_of(recording, report, meta=hazardous).kind == "contact setting"
     foreign = replace(report, resimulation="not re-simulated: recorded with mujoco 3.0.0")
     cause = cause_of(recording, foreign)

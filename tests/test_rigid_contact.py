@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -65,6 +66,43 @@ BALL = (
     <body name="other" pos="0.03 0 0"><freejoint/>
       <geom type="capsule" size="0.01 0.02" euler="1.5708 0 0" mass="0.05"/></body>
   </worldbody>
+</mujoco>"""
+)
+CLUTTER = (
+    HEAD.replace("<option", '<option iterations="{n}" ls_iterations="{line}"')
+    + """
+    <body name="tool" pos="0 0 0.035"><freejoint/>
+      <geom type="box" size="0.02 0.02 0.01" mass="{mass}"/><site name="grip"/></body>
+    <geom type="box" size="0.3 0.3 0.01" pos="0 0 -0.01"/>
+    <body pos="-0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body pos="0 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+    <body pos="0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+)
+LIFT = (
+    HEAD
+    + """
+    <body name="tool" pos="0 0 0.0105"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="{mass}"/><site name="grip"/></body>
+    <body name="plate" mocap="true" pos="0 0 -0.01"><geom type="box" size="0.1 0.1 0.01"/></body>
+    <body pos="0.03 0 0.0101"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="0.05"/></body>
+  </worldbody>
+</mujoco>"""
+)
+WELDED = (
+    HEAD
+    + """
+    <body name="tool" pos="0 0 0.0305"><freejoint/>
+      <geom type="box" size="0.01 0.01 0.01" mass="{mass}"/><site name="grip"/></body>
+    <body name="plate" mocap="true"/>
+    <body name="hand"><freejoint/><geom type="box" size="0.03 0.03 0.02" mass="0.2"/></body>
+  </worldbody>
+  <equality><weld body1="hand" body2="plate"/></equality>
 </mujoco>"""
 )
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
@@ -194,6 +232,50 @@ def test_a_jammed_peg_is_strict_where_the_contact_of_the_scene_creates_energy(co
             results[contact] = through(prepared(peg, "implicit", stiff, contact), jamming(seed))
         assert strict(results["rigid"]), (seed, mass, mu)
         assert not strict(results["scene"]), (seed, mass, mu)
+
+
+@pytest.mark.parametrize(("iterations", "line_search"), [(100, 10), (3, 50), (3, 5)])
+def test_a_file_with_a_hasty_solver_is_solved_as_mujoco_does(
+    iterations: int, line_search: int
+) -> None:
+    xml = CLUTTER.replace("{n}", str(iterations)).replace("{line}", str(line_search))
+    results: dict[bool, list[bool]] = {False: [], True: []}
+    for is_hasty, seed in product(results, range(4)):
+        stiff = Coupling(6000.0, 0.5, 6.0, 5e-4)
+        run = prepared(scene(xml, mass=0.05, g=-9.81), coupling=stiff)
+        if is_hasty:
+            option = run.scene.model.opt
+            option.iterations, option.ls_iterations = iterations, line_search
+        samples = jamming(seed, 800)
+        samples["position"][:, 2] -= 0.02 * np.minimum(T * np.arange(800) / 0.1, 1.0)
+        results[is_hasty].append(strict(through(run, samples)))
+    assert all(results[False])
+    assert not all(results[True])
+
+
+@pytest.mark.parametrize("xml", [LIFT, WELDED])
+def test_a_moving_mocap_body_pays_for_its_push_and_gives_nothing_by_receding(xml: str) -> None:
+    results: dict[str, list[bool]] = {"rigid": [], "scene": []}
+    for contact, stroke in product(results, (0.0005, 0.002, 0.005)):
+        run = prepared(scene(xml, mass=0.05, g=-9.81), contact=contact)
+        plate = run.scene.model.body("plate").mocapid[0]
+        start = run.scene.data.mocap_pos[plate].copy()
+
+        def move(
+            k: int,
+            data: mujoco.MjData,
+            plate: int = plate,
+            start: Array = start,
+            by: float = stroke,
+        ) -> None:
+            sideways = by * (np.cos(k / 15) - 1.0)
+            data.mocap_pos[plate] = start + np.array([sideways, 0.0, by * np.sin(k / 15)])
+
+        samples = jamming(1, 800)
+        samples["position"][:, 2] -= 0.002 * np.minimum(T * np.arange(800) / 0.1, 1.0)
+        results[contact].append(strict(go_on(run, samples, on_tick=move)))
+    assert all(results["rigid"])
+    assert not results["scene"][-1]
 
 
 def test_the_tank_is_filled_by_what_was_dissipated_up_to_its_cap() -> None:

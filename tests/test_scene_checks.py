@@ -376,17 +376,15 @@ def test_tool_that_starts_inside_a_table_stays_there_in_a_still_hand(tmp_path: P
 
 NEST = """<body name='base'><geom name='shell' size='.05'/>
 <body name='mid' pos='0 0 .04'><joint name='first' axis='0 1 0'/><geom size='.001' mass='.1'
-contype='0' conaffinity='0'/><body {outer} pos='0 0 .01'><joint axis='1 0 0' {joint}/><geom name='tip' size='.02' mass='.1'/>
-<site name='grip'/></body></body></body>"""
+contype='0' conaffinity='0'/><body {outer} pos='0 0 .01'><joint axis='1 0 0'/>
+<geom name='tip' size='.02' mass='.1'/><site name='grip'/></body></body></body>"""
 
 
 @pytest.mark.parametrize("outer", ["name='outer'", ""])
 def test_links_inside_each_other_are_excluded_and_neighbours_of_the_tree_are_not(
     tmp_path: Path, outer: str
 ) -> None:
-    text = mjcf(
-        body=NEST.format(outer=outer, joint=""), world=TABLE.replace("/>", " pos='0 0 -1'/>")
-    )
+    text = mjcf(body=NEST.format(outer=outer), world=TABLE.replace("/>", " pos='0 0 -1'/>"))
     scene = load_scene(scene_file(tmp_path, text))
     assert scene.data.ncon == 0
     assert mujoco.MjModel.from_xml_string(text).nexclude == 0
@@ -405,6 +403,33 @@ def test_links_inside_each_other_are_excluded_and_neighbours_of_the_tree_are_not
     shallow = load_scene(scene_file(tmp_path, text.replace("pos='0 0 .01'", "pos='0 0 .0295'")))
     assert shallow.model.nexclude == 0
     assert shallow.data.ncon == 1
+
+
+ROPE = """<flexcomp name='rope' type='grid' dim='1' count='12 1 1' spacing='.02 .02 .02' mass='.1'
+  radius='.002' pos='0 0 -.03'><edge {}/><pin id='0 11'/></flexcomp>"""
+
+
+@pytest.mark.parametrize(
+    ("edge", "change"),
+    [
+        ("stiffness='500' damping='.1'", "springs → constraints of constant length"),
+        ("equality='true' damping='.1'", "damping 0.1 → 0"),
+        ("equality='true'", ""),
+    ],
+)
+def test_edges_of_a_flex_are_constraints_where_discrete_has_no_springs(
+    tmp_path: Path, edge: str, change: str
+) -> None:
+    path = scene_file(tmp_path, mjcf("<option integrator='discrete'/>", world=ROPE.format(edge)))
+    scene, heights, environment = still_run(path)
+    assert scene.changes == ((f"edges of flex 'rope': {change}",) if change else ())
+    assert (environment, heights.min() > -0.05) == ("strict", True)
+    lengths = np.linalg.norm(np.diff(scene.data.flexvert_xpos, axis=0), axis=1)
+    assert lengths == pytest.approx(0.02, rel=0.2)  # MuJoCo's constraints are soft
+    if change:
+        assert change in refusal(path, as_is=True)
+    else:
+        load_scene(path, as_is=True)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 import hapticbridge as hb
 from hapticbridge import scene as scenes
 from hapticbridge.cli import main
-from hapticbridge.run_description import compiled_model
+from hapticbridge.recorded_scene import compile_recorded, is_as_recorded
+from hapticbridge.run_description import compiled_model, parameters_of
 from hapticbridge.scene import load_scene, scene_path
 
 PARAMETERS = [
@@ -275,14 +276,9 @@ def test_values_are_recorded_and_run(tmp_path: Path, capsys: pytest.CaptureFixtu
     report = hb.audit(file)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     # the walls of the recorded model stand where the clearance puts them, and the peg felt them
-    (tmp_path / "model.mjb").write_bytes(recording.attachments["model.mjb"])
-    model = mujoco.MjModel.from_binary_path(str(tmp_path / "model.mjb"))
-    assert model.geom("hole_east").pos[0] == pytest.approx(0.0201, abs=1e-12)
-    # what was set can be set again from the recording's own sources
-    for name in ("peg_in_hole.xml", "peg_in_hole.toml"):
-        (tmp_path / name).write_bytes(recording.attachments[f"scene/{name}"])
-    again = load_scene(tmp_path / "peg_in_hole.xml", **used)
-    assert np.array_equal(again.model.geom_pos, model.geom_pos)
+    scene = compile_recorded(recording, parameters_of(recording.meta))
+    assert is_as_recorded(scene, recording)
+    assert scene.model.geom("hole_east").pos[0] == pytest.approx(0.0201, abs=1e-12)
     capsys.readouterr()
 
 

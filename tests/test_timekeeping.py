@@ -117,6 +117,8 @@ IN_TIME = {
     "one force half a period late": Case({}, {}, lambda tick: 0.5 * (tick == 200)),
     "force 5 % of a period after the sample": Case({}, {}, lambda _: 0.05),
     "5 % late in turn": Case({}, dict.fromkeys(range(0, 1000, 2), 0.05), at_once, STIFF),
+    "30 % late in turn": Case({}, dict.fromkeys(range(0, 1000, 2), 0.3), at_once),
+    "late by as much all the time": Case({}, dict.fromkeys(range(1000), 0.3), at_once, STIFF),
 }
 NOT_IN_TIME = {
     "82 % of the deadlines missed": Case(
@@ -125,6 +127,9 @@ NOT_IN_TIME = {
     "force 80 % of a period after the sample": Case({}, {}, lambda _: 0.8),
     "force late in a tenth of the run": Case({}, {}, lambda tick: 0.8 * (280 < tick < 360)),
     "force 5 % of a period late at the bound": Case({}, {}, lambda _: 0.05, STIFF),
+    "10 % late in turn at the bound": Case(
+        {}, dict.fromkeys(range(0, 1000, 2), 0.1), at_once, STIFF
+    ),
 }
 
 
@@ -148,6 +153,7 @@ def test_a_run_is_certified_only_for_the_time_that_it_kept(tmp_path: Path, name:
     # the second opinion agrees in every number
     assert again.delay_energy == pytest.approx(kept.delay_energy, rel=1e-6, abs=1e-15)
     assert again.mean_delay == pytest.approx(kept.mean_delay)
+    assert again.mean_jitter == pytest.approx(kept.mean_jitter)
     assert (again.share, again.rate) == pytest.approx((kept.share, kept.rate))
     # without the time that the run really had, all of them would be certified
     assert summary.fault is None
@@ -167,6 +173,26 @@ def test_a_missed_deadline_is_said_with_the_share_of_the_time(tmp_path: Path) ->
     assert facts["rate"] == pytest.approx(999.0)
     summary, _ = felt(tmp_path / "again.mcap", IN_TIME["simulated"])
     assert summary.timekeeping.clause == summary.timekeeping.hint == ""
+    assert summary.timekeeping.remark == ""
+
+
+def test_ticks_that_come_late_in_turn_are_said_and_count(tmp_path: Path) -> None:
+    summary, report = felt(tmp_path / "run.mcap", IN_TIME["5 % late in turn"])
+    kept = summary.timekeeping
+    # half of the intervals are 50 µs too long, the others too short
+    assert kept.mean_jitter == pytest.approx(25e-6, rel=1e-2)
+    assert kept.conditions[0].needed == pytest.approx(1.95 * 1.025, rel=1e-3)
+    words = "1000 Hz, 100 % of the deadlines kept, sample times vary by 25 µs"
+    assert kept.words == kept.remark == words
+    assert report.timekeeping is not None
+    assert report.timekeeping.remark == words
+    summary, _ = felt(tmp_path / "late.mcap", NOT_IN_TIME["10 % late in turn at the bound"])
+    assert (
+        "at 1000 Hz (sample times vary by 50 µs) it needs 2.05 N s/m" in summary.timekeeping.fault
+    )
+    summary, _ = felt(tmp_path / "force.mcap", IN_TIME["force 5 % of a period after the sample"])
+    assert summary.timekeeping.remark.endswith("kept, forces follow 50 µs after the sample")
+    assert summary.timekeeping.mean_jitter == 0.0
 
 
 def test_a_run_at_a_fifth_of_its_rate_names_what_it_needed(tmp_path: Path) -> None:

@@ -1,12 +1,12 @@
 """Verdict on a recording, from the recording alone; never imports the bridge.
 
-Read ``verdict`` first; its function decide() alone calls a run passive, active or invalid. The
-audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
-(``energy``), checks the wrench against the coupling law (``motion``) and the guard's limits
-(``wrench_limits``), the time that the run kept (``timing``), and simulates the scene again
-(``replay``). ``state`` is carried from block to block, ``events`` reads external actions during the
-run, ``report`` holds the result, ``batch`` audits folders. Heavy imports are deferred
-to the first call.
+Read ``verdict`` first; its function decide() alone names the verdict. The audit checks that the
+file is whole (``structure``), computes the energies again in plain NumPy (``energy``), checks the
+wrench against the coupling law (``motion``) and the guard's limits (``wrench_limits``), the time
+that the run kept (``timing``), that no part contradicts another (``agreement``), and simulates the
+scene again (``replay``). ``state`` is carried from block to block, ``events`` reads external
+actions during the run, ``report`` holds the result, ``batch`` audits folders. Heavy imports are
+deferred to the first call.
 """
 
 from __future__ import annotations
@@ -23,16 +23,23 @@ else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)
 
 
-def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
+def audit(
+    path: str | Path,
+    *,
+    strict: bool = False,
+    accepts_unverified: bool = False,
+    in_process: bool = False,
+) -> AuditReport:
     """Judges a recording from the file alone.
 
     The audit checks the structure (checksums, schema, contiguous ticks, finite numbers, digest),
     the wrench against coupling law and guard, energies recomputed from poses and wrenches, and the
-    device condition. If the versions match, a re-simulation must agree bit for bit. Without a
-    re-simulation, ``AuditReport.unchecked`` names the changes that would pass. A device port that
-    the device condition does not prove safe is judged by its energy. The verdict is ``active`` from
-    the tick at which the device has received more than its damping dissipates and scene and
-    coupling release.
+    device condition. The scene is compiled from the attached sources, and a re-simulation must
+    agree bit for bit. A run that cannot be simulated again here, for another version or processor,
+    is ``unverified`` instead of passive; ``AuditReport.unchecked`` names the changes that would
+    pass. A device port that the device condition does not prove safe is judged by its energy. The
+    verdict is ``active`` from the tick at which the device has received more than its damping
+    dissipates and scene and coupling release.
 
     The file is read four times, block by block: digest and events, structure, second computation,
     re-simulation. Memory grows only with the number of events.
@@ -40,10 +47,16 @@ def audit(path: str | Path, *, strict: bool = False) -> AuditReport:
     Args:
         path: The recording.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
+        accepts_unverified: True counts ``unverified`` as a success in ``AuditReport.exit_code``.
+        in_process: True compiles and simulates in this process, without the limits on memory and
+            time that a child process has. It is for recordings of a known origin.
 
     Raises:
         RecordingError: The file is not a recording.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     from hapticbridge.audit.verdict import verdict_on  # noqa: PLC0415 - takes seconds
 
-    return verdict_on(path, strict=strict)
+    return verdict_on(
+        path, strict=strict, accepts_unverified=accepts_unverified, in_process=in_process
+    )

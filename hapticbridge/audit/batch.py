@@ -17,6 +17,7 @@ import numpy as np
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
+from hapticbridge.recorded_scene import ForeignSceneError
 from hapticbridge.sweep.points import Value
 from hapticbridge.sweep.results import Interrupted, Table, check_format
 from hapticbridge.sweep.sweep import sweep
@@ -64,6 +65,8 @@ def audit_all(
     paths: Sequence[Path],
     *,
     strict: bool = False,
+    accepts_unverified: bool = False,
+    in_process: bool = False,
     jobs: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
@@ -81,6 +84,8 @@ def audit_all(
     Args:
         paths: Recordings; different files.
         strict: True accepts only (14) itself; see ``audit``.
+        accepts_unverified: True counts ``unverified`` as a success; see ``audit``.
+        in_process: True simulates without the limits of a child process; see ``audit``.
         jobs: Largest number of processes; 1 uses the present process. The default is the number of
             cores, and 1 for fewer than 8 recordings.
         executor: Executor to use instead of processes.
@@ -99,7 +104,12 @@ def audit_all(
         jobs = 1
     try:
         table = sweep(
-            partial(audit_point, strict=strict),
+            partial(
+                audit_point,
+                strict=strict,
+                accepts_unverified=accepts_unverified,
+                in_process=in_process,
+            ),
             [{"file": str(path.absolute() if scheduler else path)} for path in paths],
             chunk=1,
             executor=executor,
@@ -112,11 +122,22 @@ def audit_all(
     return _sorted(_with_failures(table))
 
 
-def audit_point(point: dict[str, str], *, strict: bool) -> dict[str, Value]:
+def audit_point(
+    point: dict[str, str],
+    *,
+    strict: bool,
+    accepts_unverified: bool = False,
+    in_process: bool = False,
+) -> dict[str, Value]:
     """Audits one recording; returns its row."""
     try:
-        report = audit(point["file"], strict=strict)
-    except RecordingError as error:
+        report = audit(
+            point["file"],
+            strict=strict,
+            accepts_unverified=accepts_unverified,
+            in_process=in_process,
+        )
+    except (RecordingError, ForeignSceneError) as error:
         return {
             "margin": math.nan,
             "verdict": UNREADABLE,

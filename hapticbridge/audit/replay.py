@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, cast
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.agreement import first_contradiction, scene_statements
+from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.structure import first_row
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import EventApplier
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.inputs import apply_writes
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, coupling_ids
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.recorded_scene import (
+    SIMULATION_TIME,
+    SLOWEST,
+    compile_recorded,
+    in_bounds,
+    is_as_recorded,
+    unlimited,
+)
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared
 from hapticbridge.run_description import (
-    MODEL_ATTACHMENT,
+    SOURCE_PREFIX,
     STARTS,
     STATE_ATTACHMENT,
     meta_start,
@@ -36,8 +43,14 @@ from hapticbridge.run_description import (
     start_of,
     versions,
 )
+from hapticbridge.scene import Scene
 
 # Attached scene
+
+
+class ForeignModelError(RecordingError):
+    """Another processor compiles the attached sources to another model."""
+
 
 FOREIGN_TOLERANCE = 1e-9
 """Allowed difference on another processor, relative to a field's largest value; other vector
@@ -45,49 +58,24 @@ instructions round differently. A larger tolerance would hide tampering, a small
 honest recordings."""
 
 
-def attached_model(recording: RecordingFile, parameters: RunParameters) -> mujoco.MjModel:
-    """Loads the attached model and checks it against the metadata.
+def attached_scene(
+    recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
+) -> Scene:
+    """Compiles the attached sources, which must give the recorded model in every bit.
 
     Raises:
-        RecordingError: It contradicts the metadata or cannot be loaded.
+        ForeignModelError: Another processor compiled another model.
+        RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
-    content = recording.attachments[MODEL_ATTACHMENT]
-    if hashlib.sha256(content).hexdigest() != recording.meta.get("scene_sha256"):
-        raise RecordingError("the attached model is not the one of scene_sha256")
-    try:
-        model = mujoco.MjModel.from_binary_path(
-            MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content}
-        )
-    except ValueError as error:
-        raise RecordingError(f"the attached model cannot be loaded: {error}") from None
-    actuators = coupling_ids(model)
-    ids = dict(zip(COUPLING_ACTUATORS, actuators, strict=True))
-    ids[parameters.grip] = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, parameters.grip)
-    if lacking := [name for name, id_ in ids.items() if id_ < 0]:
-        raise RecordingError(f"the attached model has no '{lacking[0]}'")
-    method = method_of(recording.meta)
-    step = parameters.period / parameters.substeps
-    forces, torques = method.gains(parameters.coupling, step)
-    for axis, actuator_id in enumerate(actuators):
-        factor, stiffness, damping = forces if axis < 3 else torques
-        bias = model.actuator_biasprm[actuator_id].tolist()
-        gain = float(model.actuator_gainprm[actuator_id, 0])
-        if (bias[1], bias[2], gain) != (-stiffness, -damping, factor):
-            raise RecordingError(
-                f"the attached model's coupling has K = {-bias[1]!r}, B = {gain!r} in "
-                f"{COUPLING_ACTUATORS[axis]}, "
-                f"the metadata say {stiffness!r}, {factor!r}"
-            )
-    try:
-        check_prepared(model, parameters, method)
-    except HapticBridgeError as error:
-        raise RecordingError(f"the attached model does not fit the metadata: {error}") from None
-    if model.opt.timestep != parameters.period / parameters.substeps:
-        raise RecordingError(
-            f"the attached model's timestep is {model.opt.timestep!r} s, the metadata's period "
-            f"{parameters.period!r} s with {parameters.substeps} substeps"
-        )
-    return model
+    scene = compile_recorded(recording, parameters, is_trusted=is_trusted)
+    if is_as_recorded(scene, recording):
+        return scene
+    found = "the attached sources do not compile to the recorded model (scene_sha256)"
+    if not is_same_processor(recording):
+        raise ForeignModelError(f"{found}: another processor compiled it")
+    raise RecordingError(
+        f"{found}: the recording was changed, or a program changed the model after loading"
+    )
 
 
 def check_start(recording: RecordingFile, state: NDArray[np.void]) -> None:
@@ -130,7 +118,8 @@ class Resimulator:
     The recording must have no ``obstacle``. Its events are applied when due.
 
     Attributes:
-        model: The attached scene.
+        scene: The attached scene, at its start.
+        model: Its model.
         data: Its state after the last simulated tick.
         binding: The kernel's state bound to both.
         done: Number of simulated ticks.
@@ -140,7 +129,9 @@ class Resimulator:
         RecordingError: The attachments contradict the metadata, so the file was changed.
     """
 
-    def __init__(self, recording: RecordingFile, parameters: RunParameters) -> None:
+    def __init__(
+        self, recording: RecordingFile, parameters: RunParameters, scene: Scene | None = None
+    ) -> None:
         events = recording.events
         self._changes = deque(event for event in events if event.get("event") in _CHANGES)
         self._resumed: list[Any] = [
@@ -148,7 +139,8 @@ class Resimulator:
         ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.model = model = attached_model(recording, parameters)
+        self.scene = scene or attached_scene(recording, parameters)
+        self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
         start = recording.attachments[STATE_ATTACHMENT]
@@ -253,8 +245,10 @@ def obstacle(recording: RecordingFile) -> str:
     for name in DECISIVE:
         if recorded.get(name) != present[name]:
             return f"recorded with {name} {recorded.get(name, 'unknown')}, here is {present[name]}"
-    missing = [n for n in (MODEL_ATTACHMENT, STATE_ATTACHMENT) if n not in recording.attachments]
-    return f"the file has no attachment '{missing[0]}'" if missing else ""
+    if STATE_ATTACHMENT not in recording.attachments:
+        return f"the file has no attachment '{STATE_ATTACHMENT}'"
+    has_sources = any(name.startswith(SOURCE_PREFIX) for name in recording.attachments)
+    return "" if has_sources else f"the file has no attachment '{SOURCE_PREFIX}…'"
 
 
 # Comparison
@@ -293,16 +287,42 @@ class ReplayOutcome:
         return self.tick is not None
 
 
-def compare_resimulation(recording: RecordingFile, parameters: RunParameters) -> ReplayOutcome:
+def compare_resimulation(
+    recording: RecordingFile, described: AuditedRun, *, is_trusted: bool = False
+) -> ReplayOutcome:
     """Simulates the recorded device motion again and compares every number except times.
 
+    It is done in a child process with limits (``recorded_scene.in_bounds``), unless the recording
+    is trusted.
+
     Raises:
+        ForeignSceneError: The child process crashed, or exceeded its limits.
         RecordingError: The attachments contradict the metadata, or an event is damaged; the file
             was changed.
     """
     if reason := obstacle(recording):
         return ReplayOutcome(f"{NOT_RUN}: {reason}")
-    run = Resimulator(recording, parameters)
+    if is_trusted:
+        return _compared(recording, described, unlimited)
+    what = f"the scene of '{recording.path}'"
+    found = in_bounds(lambda allow: asdict(_compared(recording, described, allow)), what)
+    return ReplayOutcome(**cast(dict[str, Any], found))
+
+
+def _compared(
+    recording: RecordingFile, described: AuditedRun, allow: Callable[[float], None]
+) -> ReplayOutcome:
+    try:
+        scene = attached_scene(recording, described.parameters, is_trusted=True)
+    except ForeignModelError as error:
+        return ReplayOutcome(f"{NOT_RUN}: {error}")
+    allow(SIMULATION_TIME + SLOWEST * recording.count * described.parameters.period)
+    run = Resimulator(recording, described.parameters, scene)
+    is_exact = is_same_processor(recording)
+    if fault := first_contradiction(
+        scene_statements(run.scene, recording, described, is_exact=is_exact)
+    ):
+        raise RecordingError(fault.reason)
     names = [name for name in recording.record.names or () if name not in CLOCK_FIELDS]
     off, largest = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     first: tuple[int, str, float] | None = None

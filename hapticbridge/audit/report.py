@@ -12,6 +12,8 @@ from hapticbridge.files import finite_or_null
 from hapticbridge.rendering import RunCoupling
 from hapticbridge.timekeeping import Timekeeping
 
+Verdict = Literal["passive", "unverified", "active", "invalid"]
+
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
@@ -19,7 +21,8 @@ class AuditReport:
 
     Attributes:
         path: The recording.
-        verdict: ``passive``, ``active`` or ``invalid``.
+        verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
+            passive, but the run was not simulated again.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
         certified: True if the recorded device bears the coupling and the run kept its time; None if
             its damping is unknown or its motion is prescribed.
@@ -39,8 +42,7 @@ class AuditReport:
         coupling_sentences: Sentences on them, and on changes by commands. They hold away from
             contact, or everywhere if the tool was never released.
         unchecked: Parts that only the re-simulation confirms; empty if there are none. Without a
-            re-simulation a recording whose wrench is such a part is invalid instead of passive. Any
-            other then names the changes that would pass: those of ``wrench_on_device`` and
+            re-simulation it names the changes that would pass: those of ``wrench_on_device`` and
             ``share`` that fit each other.
         timekeeping: Time that the run kept, and the device conditions at this time; None where the
             records could not be read.
@@ -49,10 +51,11 @@ class AuditReport:
             needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
         events: Number of events of each kind.
+        accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
     """
 
     path: Path
-    verdict: Literal["passive", "active", "invalid"]
+    verdict: Verdict
     environment: Literal["strict", "within slack", "active"] | None
     certified: bool | None
     reason: str
@@ -72,6 +75,7 @@ class AuditReport:
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
+    accepts_unverified: bool = False
 
     @property
     def words(self) -> str:
@@ -85,8 +89,9 @@ class AuditReport:
 
     @property
     def exit_code(self) -> int:
-        """0 if passive and either certified or of unknown device, else 1."""
-        return 0 if self.verdict == "passive" and self.certified is not False else 1
+        """0 if passive (or unverified, if accepted) and not known to lack damping, else 1."""
+        accepted = ("passive", "unverified")[: 1 + self.accepts_unverified]
+        return 0 if self.verdict in accepted and self.certified is not False else 1
 
     @property
     def margin(self) -> float:
@@ -111,5 +116,5 @@ def verdict_words(verdict: str, environment: str, port: str) -> str:
 
     An unknown environment or port is empty.
     """
-    beside = {"passive": environment, "active": port}.get(verdict)
+    beside = {"passive": environment, "unverified": environment, "active": port}.get(verdict)
     return f"{verdict} ({beside})" if beside else verdict

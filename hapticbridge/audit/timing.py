@@ -37,7 +37,11 @@ class TimingTally:
         ticks: Number of records so far.
         fresh: Number of records with a new sample so far.
         due: Number of deadlines so far.
+        overruns: Number of records after skipped deadlines so far.
+        skipped: Number of skipped deadlines so far.
         delays: Sum of the times from sample to force in s.
+        jitter: Sum of the times in s by which samples came later than the one before, each after
+            its own deadline.
         most_uncovered: Largest energy in J that delays may have given to the hand.
         lent: Energies in J that late samples cost and b has not burned yet, by kind of axis.
         uncovered: Energies A in J by kind of axis.
@@ -48,7 +52,10 @@ class TimingTally:
     ticks: int = 0
     fresh: int = 0
     due: int = 0
+    overruns: int = 0
+    skipped: int = 0
     delays: float = 0.0
+    jitter: float = 0.0
     most_uncovered: float = 0.0
     lent: Array = field(default_factory=_no_energy)
     uncovered: Array = field(default_factory=_no_energy)
@@ -60,9 +67,14 @@ class TimingTally:
         self.ticks += len(ticks)
         self.fresh += int(np.count_nonzero(~has_flag(ticks, TickFlag.STALE_SAMPLE)))
         self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
+        self.overruns += int(np.count_nonzero(has_flag(ticks, TickFlag.OVERRUN)))
         rows = np.concatenate([block.state.row, ticks])
+        steps = 1e-9 * np.diff(rows["deadline_ns"]) / parameters.period
+        self.skipped += int(np.sum(np.round(steps) - 1))
         delay = 1e-9 * (rows["write_ns"] - rows["read_ns"])
         self.delays += float(np.sum(delay[1:]))
+        lateness = 1e-9 * (rows["read_ns"] - rows["deadline_ns"])
+        self.jitter += float(np.sum(np.maximum(np.diff(lateness), 0.0)))
         if not parameters.has_law:
             return
         elapsed = np.maximum(1e-9 * np.diff(rows["read_ns"]), parameters.period)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.agreement import (
+    event_statements,
+    first_contradiction,
+    metadata_statements,
+)
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import AuditedRun, RunEvents
 from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation
-from hapticbridge.audit.report import AuditReport
+from hapticbridge.audit.report import AuditReport, Verdict
 from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import (
     TOLERANCE,
@@ -100,11 +105,6 @@ class PassivityTally:
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
 
-    def is_passive(self, *, strict: bool) -> bool:
-        """Returns True if neither port gave out too much; ``strict`` allows no slack."""
-        is_within_slack = self.active is None and not strict
-        return self.excess is None and (self.unstrict is None or is_within_slack)
-
     def add(self, ticks: NDArray[np.void], balance: EnergyBalance) -> None:
         """Adds at least one record with its balance."""
         created, start = balance.environment_energy, int(ticks["tick"][0])
@@ -141,7 +141,7 @@ def _first(
 class Decision:
     """Verdict and its reason; the fields are those of ``AuditReport``."""
 
-    verdict: Literal["passive", "active", "invalid"]
+    verdict: Verdict
     environment: Environment | None
     reason: str
     tick: int | None = None
@@ -151,18 +151,27 @@ class Decision:
 
 
 def decide(
-    fault: Fault | None, energies: PassivityTally | None, *, gap: Fault | None, strict: bool
+    fault: Fault | None, energies: PassivityTally | None, *, gap: str, strict: bool
 ) -> Decision:
-    """Decides between ``passive``, ``active`` and ``invalid``.
+    """Decides between ``passive``, ``unverified``, ``active`` and ``invalid``.
 
     Args:
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
-        gap: Missing check without which a recording is not called passive, or None.
+        gap: Reason why the run was not simulated again; then it is not called passive. Empty if it
+            was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
-    if fault is None and energies is not None and energies.is_passive(strict=strict):
-        fault = gap
+    found = _decide_on_records(fault, energies, strict=strict)
+    if found.verdict != "passive" or not gap:
+        return found
+    reason = f"the run was {gap}; in its records alone {found.reason}"
+    return replace(found, verdict="unverified", reason=reason)
+
+
+def _decide_on_records(
+    fault: Fault | None, energies: PassivityTally | None, *, strict: bool
+) -> Decision:
     if fault is not None or energies is None:
         fault = fault or Fault("the recording holds no tick")
         return Decision("invalid", None, fault.reason, fault.tick, fault.port, fault.joules)
@@ -199,11 +208,14 @@ def decide(
 
 
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
-def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
+def verdict_on(
+    path: str | Path, *, strict: bool, accepts_unverified: bool, in_process: bool
+) -> AuditReport:
     """Judges a recording; implements ``audit.audit``.
 
     Raises:
         RecordingError: The file is not a recording.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     recording = open_recording(path)
     facts: dict[str, Any] = {
@@ -212,6 +224,7 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
         "ticks": recording.count,
         "events": _event_counts(recording),
         "certified": None,
+        "accepts_unverified": accepts_unverified,
     }
     energies, outcome = None, ReplayOutcome("")
     try:
@@ -228,17 +241,18 @@ def verdict_on(path: str | Path, *, strict: bool) -> AuditReport:
             fault, facts["duration"] = _check_records(recording, run, energies, timing)
             facts["energies"] = energies.energies
             facts |= _time_facts(run, recording, timing, facts["certified"])
+            fault = fault or first_contradiction(
+                chain(metadata_statements(recording, run), event_statements(recording, timing))
+            )
         if fault is None:
-            outcome = compare_resimulation(recording, run.parameters)
+            outcome = compare_resimulation(recording, run, is_trusted=in_process)
             facts["resimulation"] = outcome.agreement
             fault = _replay_fault(outcome)
         if fault is None:
             requested_of(recording.meta)
     except RecordingError as error:
         fault = Fault(str(error))
-    # without a simulation again, some methods leave a wrench that no other computation covers
-    is_checked = outcome.has_run or not facts.get("unchecked")
-    gap = None if is_checked else Fault(outcome.agreement)
+    gap = "" if outcome.has_run else outcome.agreement
     found = asdict(decide(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
@@ -339,6 +353,7 @@ def _time_facts(
         fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
+        mean_jitter=timing.jitter / max(timing.ticks, 1),
         delay_energy=timing.most_uncovered,
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
         flags=recording.flags,

@@ -155,6 +155,7 @@ def open_case(
     scale: float = 1.0,
     workspace: float = LARGEST_WORKSPACE,
     motion: str | Path | None = None,
+    contact: Literal["rigid", "scene"] = "rigid",
     progress: Callable[[int, int], None] | None = None,
 ) -> SceneUnderCheck:
     """Compiles a scene and leads it through its motion.
@@ -168,6 +169,7 @@ def open_case(
         workspace: Edge in m of the cube that the device reaches, > 0.
         motion: CSV file or recording. None takes ``NAME.csv`` beside the scene, or else the default
             hand motion of ``hapticbridge run``.
+        contact: Contact of the run: ``rigid``, its default, or ``scene``, MuJoCo's own.
         progress: Called with the number of ticks done and the total.
 
     Raises:
@@ -191,7 +193,9 @@ def open_case(
     observation, fault = None, ""
     try:
         with quiet():
-            observation = observe(scene, samples, Setting(coupling, period), progress)
+            observation = observe(
+                scene, samples, Setting(coupling, period, contact=contact), progress
+            )
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
     finally:
@@ -212,6 +216,7 @@ def open_case(
         has_chosen_period=has_chosen_period,
         observation=observation,
         motion_fault=fault,
+        contact=contact,
     )
 
 

@@ -310,12 +310,16 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         mover = second if model.body_treeid[model.geom_bodyid[second]] >= 0 else first
         body = int(model.geom_bodyid[mover])
         out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
+        effect = "they are held there, and eased out with energy that the scene has dissipated"
+        if case.contact == "scene":
+            effect = (
+                f"more than {length(MAXIMUM_START_PENETRATION)} release energy that is not metered"
+            )
         yield Fault(
             "starts in contact",
             case.places.geom(mover),
             f"{pair_names(case, [(first, second)])} overlap by {length(-contact.dist)} at the "
-            f"start; more than {length(MAXIMUM_START_PENETRATION)} release energy that is not "
-            "metered",
+            f"start; {effect}",
             _moved_out(case, body, out),
         )
 

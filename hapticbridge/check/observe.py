@@ -434,7 +434,7 @@ def _note_contacts(
     with depth −r, velocity v, MuJoCo's k and b of the row, its impedance d at that depth, and the
     contact's true inertia 1/A. Its stiffness is therefore f/r = k d/(R (1 + h b + h² k d)). With a
     pyramidal cone, 2 (dim − 1) rows share the normal force; together they are as stiff as one row
-    with that many times the inertia. A rigid contact of mass m has m β/(h² SOFTNESS)
+    with that many times the inertia. A rigid contact of mass m has 2 m β/(h² SOFTNESS)
     (``kernel.rigid_contact``), and exists before it touches.
     """
     contacts, rows = data.contact, data.efc_type
@@ -462,7 +462,7 @@ def _note_contacts(
             stiffness = count * spring / regular
             inertia = count * (1.0 - impedance) / (impedance * regular)
             if is_rigid:
-                stiffness = inertia * DEPENETRATION / (SOFTNESS * step**2)
+                stiffness = 2.0 * inertia * DEPENETRATION / (SOFTNESS * step**2)
             meeting.inertia = min(meeting.inertia, inertia)
             meeting.softest = min(meeting.softest, stiffness)
             meeting.stiffest = max(meeting.stiffest, stiffness)

@@ -26,6 +26,8 @@ from hapticbridge.scene.contacts import suggested_solref
 
 # Faults of a scene's options that the bridge overrides
 
+_OWN_FAULT = "integrator:", "solver:", "start where"  # changes with a fault of their own
+
 _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 
 
@@ -46,6 +48,14 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
         )
+    for change in case.scene.changes:
+        if not change.startswith(_OWN_FAULT):
+            yield Fault(
+                "changed",
+                places.option("integrator"),
+                f"the scene runs with a change, {change}",
+                "nothing, or see if run --as-is should refuse it",
+            )
     concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
     for concern in concerns:
         if "integrator" not in concern:

@@ -36,6 +36,7 @@ from hapticbridge.whatif.page import changes, rows, sentences
 
 _VERDICT_COLOURS = {
     "passive": "green",
+    "unverified": "yellow",
     "active": "red",
     "invalid": "magenta",
     UNREADABLE: "magenta",
@@ -103,7 +104,7 @@ _USUAL_EVENTS = ("start", "stop", "input")
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """Judge recorded runs offline: passive, active or invalid, and why.
+    """Judge recorded runs offline: passive, unverified, active or invalid, and why.
 
     Several recordings, a folder (searched through and through) or a pattern give a table, sorted by
     the margin: the least share left, of the slack and of the device's damping; negative beyond the
@@ -121,6 +122,11 @@ class Audit:
     """Recordings (.mcap), folders of them, or patterns such as 'runs/**/a*.mcap'."""
     strict: bool = False
     """Accept only passivity itself, not the slack that the device's damping leaves."""
+    accept_unverified: bool = False
+    """Count 'unverified' as a success: passive in its records, but not simulated again here."""
+    in_process: bool = False
+    """Simulate in this process, for recordings of a known origin: without the child process whose
+    memory and time are limited."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the reports as a JSON list."""
     plot: Path | None = None
@@ -164,7 +170,12 @@ class Audit:
             return self._ask(files[0])
         first = "the first audit on a machine compiles for about 20 s"
         with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
-            report = audit(files[0], strict=self.strict)
+            report = audit(
+                files[0],
+                strict=self.strict,
+                accepts_unverified=self.accept_unverified,
+                in_process=self.in_process,
+            )
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json())]))
         else:
@@ -183,6 +194,8 @@ class Audit:
                 table = audit_all(
                     files,
                     strict=self.strict,
+                    accepts_unverified=self.accept_unverified,
+                    in_process=self.in_process,
                     jobs=self.jobs,
                     scheduler=self.scheduler,
                     progress=show,
@@ -244,7 +257,7 @@ def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
 
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
-    judged = "environment " if report.verdict == "passive" else ""
+    judged = "environment " if report.environment and not report.port else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
@@ -270,7 +283,7 @@ def _print_report(report: AuditReport) -> None:
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
-    rate = "" if kept is None or kept.share == 1.0 else f", {kept.words}"
+    rate = f", {kept.remark}" if kept is not None and kept.remark else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}")
     energies = [
         f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e

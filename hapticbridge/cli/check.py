@@ -178,7 +178,7 @@ def print_inventory(inventory: Inventory) -> None:
         if largest:
             lines[f"{kind} rows"] = f"at most {largest} in a step, median {median:g}"
     if inventory.stiffness is not None:
-        least, most = (f"{1e-3 * stiffness:.3g}" for stiffness in inventory.stiffness)
+        least, most = (f"{float(f'{1e-3 * each:.3g}'):,g}" for each in inventory.stiffness)
         lines["contact stiffness"] = (
             f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)}"
         )

@@ -24,7 +24,7 @@ COMMANDS = {
     "run": "Put a scene behind a haptic device and feel it.",
     "scenes": "List the scenes, or the parameters of one.",
     "check": "Find what is wrong with a scene, and what a tick of it costs.",
-    "audit": "Judge recorded runs offline: passive, active or invalid, and why.",
+    "audit": "Judge recorded runs offline: passive, unverified, active or invalid, and why.",
     "view": "Show a recorded run in a browser.",
     "render": "Draw a recorded run: a picture, or a film of it.",
     "compare": "Find the first tick and field where two runs differ.",
@@ -82,14 +82,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in 'hapticbridge --help | head'
         _discard_output()
         code = READER_GONE
-    except OSError as error:
-        if error.filename is None and error.errno not in _FULL:
-            raise
-        if error.filename is None:
-            _discard_output()
-        where = "cannot write" if error.filename is None else f"'{error.filename}'"
-        code = _say("error", f"{where}: {error.strerror}")
+    except (MemoryError, ImportError, OSError) as error:
+        code = _system_fault(error)
     return code
+
+
+def _system_fault(error: MemoryError | ImportError | OSError) -> int:
+    """Says what the system refused; raises what is no fault of the system's again."""
+    is_full = not isinstance(error, OSError) or error.errno in (None, errno.ENOMEM)
+    if is_full and _is_memory_limited():
+        words = " ".join(str(error).split())[:200] or "no memory"
+        return _say("error", f"not enough memory, which 'ulimit -v' limits ({words})")
+    if not isinstance(error, OSError) or (error.filename is None and error.errno not in _FULL):
+        raise error
+    if error.filename is None:
+        _discard_output()
+    where = "cannot write" if error.filename is None else f"'{error.filename}'"
+    return _say("error", f"{where}: {error.strerror}")
+
+
+def _is_memory_limited() -> bool:
+    if sys.platform == "win32":
+        return False
+    import resource  # noqa: PLC0415 - for an error alone
+
+    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
 
 
 def _execute(name: str, words: list[str]) -> int:

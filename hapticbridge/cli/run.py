@@ -167,10 +167,10 @@ def print_summary(summary: Summary, *, has_hand: bool = True) -> None:
     """
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    skipped = ""
-    if summary.skipped:
-        skipped = f" ({summary.skipped} deadlines skipped: {summary.timekeeping.words})"
+    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
     table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
+    if remark := summary.timekeeping.remark:
+        table.add_row("time kept", remark)
     hand, tool = (
         (summary.peak_force, summary.peak_torque),
         (summary.peak_tool_force, summary.peak_tool_torque),

@@ -146,7 +146,7 @@ def read_profile(path: Path) -> Profile:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DeviceError(f"cannot read profile '{path}': {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise DeviceError(f"profile '{path}' is not TOML: {error}") from None
     try:
         return _profile(raw, path)

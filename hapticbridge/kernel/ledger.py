@@ -219,8 +219,27 @@ def _contact_work(s: State, contact: int, force: NDArray[np.float64]) -> float:
     """Returns λ δr of one contact, its normal force times the change of distance by the move."""
     mj = s.mj
     row = ints(contact + mj.contact_row, 1)[0]
+    change = opened_by_mocap(s, contact) if row >= 0 else 0.0
+    if change == 0.0:
+        return 0.0
+    rows = 1
+    if ints(pointer_at(mj.efc_type), force.size)[row] == CONTACT_PYRAMIDAL:
+        rows = 2 * (ints(contact + mj.contact_dim, 1)[0] - 1)  # every edge carries the normal
+    normal = 0.0
+    for i in range(row, row + rows):
+        normal += force[i]
+    return normal * change
+
+
+@compiled
+def opened_by_mocap(s: State, contact: int) -> float:
+    """Returns the distance in m by which moved mocap bodies opened a contact since the last step.
+
+    ``contact`` is its address. The handle is none of them.
+    """
+    mj = s.mj
     geoms = ints(contact + mj.contact_geoms, 2)
-    if row < 0 or geoms[0] < 0 or geoms[1] < 0:
+    if geoms[0] < 0 or geoms[1] < 0:
         return 0.0
     point, frame = floats(contact + mj.contact_point, 3), floats(contact + mj.contact_frame, 3)
     body_of, mocap_of = ints(mj.geom_bodyid, mj.ngeom), ints(mj.body_mocap, mj.nbody)
@@ -235,15 +254,7 @@ def _contact_work(s: State, contact: int, force: NDArray[np.float64]) -> float:
         moved = add(vector_of(shift[d:]), cross(vector_of(shift[d + 3 :]), arm))
         # the normal points from the first geom to the second
         change += (2.0 * side - 1.0) * dot(vector_of(frame), moved)
-    if change == 0.0:
-        return 0.0
-    rows = 1
-    if ints(pointer_at(mj.efc_type), force.size)[row] == CONTACT_PYRAMIDAL:
-        rows = 2 * (ints(contact + mj.contact_dim, 1)[0] - 1)  # every edge carries the normal
-    normal = 0.0
-    for i in range(row, row + rows):
-        normal += force[i]
-    return normal * change
+    return float(change)
 
 
 # Work that enters the environment in one MuJoCo step through ports other than the coupling

@@ -126,11 +126,13 @@ class GuardParameters:
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
             if not _is_number(value) or not 0 <= value < math.inf:
-                raise HapticBridgeError(f"guard: {name} is {value!r}; it must be finite and >= 0")
+                raise HapticBridgeError(
+                    f"guard: {_words(name)} is {value!r}; it must be finite and >= 0"
+                )
         for name in (*_POSITIVE, *_TRIPS):
             value = getattr(self, name)
             if not _is_number(value) or not value > 0:
-                raise HapticBridgeError(f"guard: {name} is {value!r}; it must be > 0")
+                raise HapticBridgeError(f"guard: {_words(name)} is {value!r}; it must be > 0")
         smallest = {
             "stale_ticks": 0,
             "fade_ticks": 1,
@@ -142,7 +144,9 @@ class GuardParameters:
         for name, minimum in smallest.items():
             value = getattr(self, name)
             if not isinstance(value, int) or not minimum <= value < 2**MAX_BUTTONS:
-                raise HapticBridgeError(f"guard: {name} is {value!r}; it must be >= {minimum}")
+                raise HapticBridgeError(
+                    f"guard: {_words(name)} is {value!r}; it must be >= {minimum}"
+                )
 
     def to_json(self) -> str:
         """Returns the text for a recording's metadata; infinity becomes null."""
@@ -167,6 +171,10 @@ class GuardParameters:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
         return cls(**numbers)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _is_number(value: object) -> bool:
@@ -287,13 +295,15 @@ class RunParameters:
             )
         refuse_substeps(self.scheme, self.substeps)
         if self.ramp_ticks < 0:
-            raise HapticBridgeError(f"ramp_ticks is {self.ramp_ticks}; it must be >= 0")
+            raise HapticBridgeError(f"the ramp is {self.ramp_ticks} ticks; it must be >= 0")
         for name in ("device_origin", "handle_origin", "device_start"):
             pose = getattr(self, name)
             if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
-                raise HapticBridgeError(f"{name} is {pose!r}; it must be 7 finite numbers")
+                raise HapticBridgeError(f"{_words(name)} is {pose!r}; it must be 7 finite numbers")
             if abs(math.hypot(*pose[3:]) - 1) > 1e-9:
-                raise HapticBridgeError(f"{name} is {pose!r}; its quaternion must have norm 1")
+                raise HapticBridgeError(
+                    f"{_words(name)} is {pose!r}; its quaternion must have norm 1"
+                )
         rotation = np.asarray(self.axes, dtype=np.float64)
         if rotation.shape != (9,) or not (
             np.allclose(rotation.reshape(3, 3) @ rotation.reshape(3, 3).T, np.eye(3), atol=1e-12)

@@ -22,16 +22,19 @@ environment has dissipated,
 
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
 remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
-moved mocap body pays for its own push: its work, of the external port, is subtracted from C.
+moved mocap body pays for its own push: its work, of the external port, is subtracted from C. One
+that recedes by δ takes δ/h from ŵ: what rests on it follows, and its energy goes into that port.
 All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before it closes:
 margins follow the speed (``follow_speed``).
+
 Limits of joints and tendons are rows like a contact's without friction, and equality constraints
-rows with ŵ = −σ β p/h for an error p of either sign; all share the tank. What they hold stretched
-at the start is thus not pushed together for nothing. Equality constraints of a flex stay MuJoCo's.
+rows with ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign, of which a moved mocap body
+adds δp; all share the tank. What they hold stretched at the start is thus not pushed together for
+nothing. Equality constraints of a flex stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
-an impedance d, R is (1 − d)/d of the row's inverse inertia, and under ``integrator="discrete"``
+an impedance d and under ``integrator="discrete"``, R is (1 − d)/(2 d) of the row's inverse inertia,
 
     solref = (−ε d², −d/h),  position = −(2ŵ − v)/(ε h d)    →    J v⁺ = ŵ − h R λ
     solreffriction = (0, −d/(ε h))                           →    ŵ_t = 0 to ε
@@ -50,14 +53,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
-from hapticbridge.kernel.ledger import mocap_work
+from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
-m sinks in by h² F SOFTNESS/(m DEPENETRATION), 0.15 µm at 3 N on 0.1 kg and 1 ms. A smaller value
+m sinks in by h² F SOFTNESS/(2 m DEPENETRATION), 0.08 µm at 3 N on 0.1 kg and 1 ms. A smaller value
 is more rigid and slower to solve."""
 
 DEPENETRATION = 0.2
@@ -95,18 +98,20 @@ _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 _LAST_ROWS = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
 
-_WRITTEN = (
+_PARAMETERS = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
     *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
 )
+"""Arrays of the model that a run writes to, and puts back."""
+
 _OF_MODEL = (
-    *(*_WRITTEN, "geom_rbound", "pair_geom1", "pair_geom2", "eq_type"),
+    *("geom_rbound", "pair_geom1", "pair_geom2"),
     *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
 )
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof")
 _OWNED = (
-    *(f"own_{name}" for name in _WRITTEN),
-    *("row_positions", "moving_geoms", "body_velocity"),
+    *(f"own_{name}" for name in _PARAMETERS),
+    *("eq_type", "row_positions", "moving_geoms", "body_velocity"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -116,7 +121,7 @@ RIGID_DTYPE = np.dtype(
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
         ("row_capacity", "<i8"),
-        *((name, "<i8") for name in (*_OF_MODEL, *_OF_DATA, *_OWNED)),
+        *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
         ("pair_count", "<i8"),
         ("share", "<f8"),
@@ -147,8 +152,9 @@ def bind_contact(
             max(6 * model.neq, flex_rows) + model.nv + 2 * model.njnt + 3 * model.ntendon
         )
     owned: dict[str, NDArray[np.generic]] = {
-        f"own_{name}": getattr(model, name).copy() for name in _WRITTEN
+        f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
     }
+    owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     owned["row_positions"] = np.zeros(max(int(contact["row_capacity"]), 1))
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
@@ -156,7 +162,7 @@ def bind_contact(
     owned["moving_geoms"] = np.flatnonzero(meets & is_moving).astype(np.int32)
     owned["body_velocity"] = np.zeros((model.nbody, 6))
     contact["moving_count"], contact["pair_count"] = owned["moving_geoms"].size, model.npair
-    for name in _OF_MODEL:
+    for name in (*_PARAMETERS, *_OF_MODEL):
         contact[name] = getattr(model, name).ctypes.data
     for name in _OF_DATA:
         contact[name] = getattr(data, name).ctypes.data
@@ -165,9 +171,9 @@ def bind_contact(
     return owned
 
 
-def restore_contact(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
+def restore_model(model: mujoco.MjModel, owned: dict[str, NDArray[np.generic]]) -> None:
     """Puts back what a run writes to the model, from the arrays of ``bind_contact``."""
-    for name in _WRITTEN:
+    for name in _PARAMETERS:
         getattr(model, name)[...] = owned[f"own_{name}"]
 
 
@@ -194,6 +200,9 @@ def _aim(s: State) -> None:
             slide += (friction[j - 1] * velocities[row + j]) ** 2
         distance = floats(contact + mj.contact_distance, 1)[0]
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
+        if s.energy.mocap_has_moved:
+            opened = max(opened_by_mocap(s, contact), 0.0)
+            wanted -= max(opened - max(distance, 0.0), 0.0) / h
         stop = max(wanted - velocities[row], 0.0)
         wanted -= max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
@@ -241,6 +250,8 @@ def _aim_rows(s: State) -> None:
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
     own = floats(contact.row_positions, count)
+    before = floats(mj.equality_before, s.energy.equality_rows)
+    has_moved = s.energy.mocap_has_moved and ints(mj.ne, 1)[0] == s.energy.equality_rows
     if not contact.is_aimed:
         for row in range(count):
             own[row] = positions[row]
@@ -250,6 +261,8 @@ def _aim_rows(s: State) -> None:
             continue
         is_in_error = own[row] < 0.0 or kind == EQUALITY
         wanted = (-push if is_in_error else -1.0) * own[row] / h
+        if kind == EQUALITY and has_moved:
+            wanted -= (1.0 - contact.share) * (own[row] - before[row]) / h
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         place, impedances, _, _ = _parameters_of(s, kind)

@@ -66,7 +66,7 @@ from hapticbridge.kernel.passivity_controller import (
     bind_observer,
     observe_reset,
 )
-from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_contact
+from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_model
 from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
 from hapticbridge.kernel.tick import LOOP_DTYPE, between_halves, discard_wrench, pause
@@ -235,7 +235,7 @@ class BoundKernel:
         """Puts back what a step that was broken off left in the model, at the end of a run."""
         if self._restore_springs is not None:
             self._restore_springs(self._record)
-        restore_contact(self._model, self._owned)
+        restore_model(self._model, self._owned)
 
     def handle_reset(self) -> None:
         """Continues after the scene's data were set back to a start.
@@ -248,7 +248,7 @@ class BoundKernel:
         before = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         self._take_tool_pose()
         move_handle_home(s["pose"])
-        restore_contact(self._model, self._owned)
+        restore_model(self._model, self._owned)
         discard_wrench(s["loop"])
         direct(refresh_energies, s)(s)
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])

@@ -35,9 +35,12 @@ device 2 ms late, which is clean, −0.36 where E_s >= E/4 and −0.28 where E_s
 0.51, 0.44 where E_s >= E; max(p, c) >= 0.52. Faults reach p = −0.95, c = −0.99 and x = 0.99. Work
 alone cannot tell them apart: E_s of a firm hand is up to 200 E.
 
-Limits of the method: a motor that holds 9 N for 50 ms gives two fingers 0.3 J within its first
-hold, before anything can be seen, and 0.6 to 1.3 J until the force is lowered. Encoder steps of 0.2
-mm while a tool rattles in a hole hide the answer (max(p, c) = 0.09) and are taken for a delay.
+Limits of the method: a motor that holds 10 N for 50 ms gives two fingers on a device of 0.05 kg
+0.5 J within its first hold, before a lower force could reach it, and up to 0.9 J until the force is
+lowered. A bound that finds it after one hold (max(p, c) <= 0.4 where E_s >= 8 E) takes encoder
+steps of 0.2 mm for a delay; while a tool rattles in a hole, this one does so too (max(p, c) =
+0.09). A hand stronger than any force, as a robot's, whose speed jumps is taken for a late device. A
+device with prescribed motion is not watched (``guard.guard_parameters_for``).
 """
 
 from __future__ import annotations

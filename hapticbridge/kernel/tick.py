@@ -622,7 +622,7 @@ def finish_tick(
     code = close_tick(state, row, has_positions)
     if code != OK:
         return code
-    note_delay(state[0], read_ns, write_ns)
+    note_delay(state[0], deadline_ns, read_ns, write_ns)
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 

@@ -43,6 +43,8 @@ TIMING_DTYPE = np.dtype(
     [
         ("delay", "<f8"),  # t_d of the last tick in s
         ("delays", "<f8"),  # sum of all t_d in s
+        ("lateness", "<f8"),  # of the last sample after its deadline, in s
+        ("jitter", "<f8"),  # sum of all rises of the lateness in s
         ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
         ("uncovered", "<f8", 2),  # A
         ("last_square", "<f8", 2),  # d² of the last tick in m² and rad²
@@ -56,10 +58,13 @@ DELAY_PRICE = 3.0
 
 
 @compiled
-def note_delay(s: State, read_ns: int, write_ns: int) -> None:
-    """Notes the time from the tick's sample to its force."""
-    s.timing.delay = 1e-9 * (write_ns - read_ns)
-    s.timing.delays += s.timing.delay
+def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
+    """Notes the times from the tick's deadline to its sample, and from its sample to its force."""
+    t, lateness = s.timing, 1e-9 * (read_ns - deadline_ns)
+    t.delay = 1e-9 * (write_ns - read_ns)
+    t.delays += t.delay
+    t.jitter += max(lateness - t.lateness, 0.0)
+    t.lateness = lateness
 
 
 @compiled

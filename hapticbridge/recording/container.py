@@ -167,8 +167,14 @@ class Fields:
 MAGIC = MCAP0_MAGIC
 """First and last bytes of an MCAP file."""
 
-MAX_CHUNK_SIZE = 1 << 28
-"""Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory."""
+MAX_CHUNK_SIZE = 1 << 22
+"""Largest chunk in bytes that is decompressed; a damaged size must not exhaust memory. The recorder
+writes 128 kB."""
+
+MAX_RATIO, FREE_SIZE = 100, 1 << 25
+"""Bytes that all chunks may hold per byte of the file, without unit, and the bytes that they may
+hold beyond it. A recorded run compresses to a third, one at rest to a thirtieth; a small file that
+claims to hold much more would take a reader's time."""
 
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
@@ -254,11 +260,20 @@ class Container:
         """
         with ThreadPoolExecutor(2) as pool:
             ahead: deque[_Item | Future[Block]] = deque()
-            count = 0
+            count, room = 0, FREE_SIZE + MAX_RATIO * len(self._data)
             for opcode, body, stop in self._data_section():
                 start = body - _RECORD.size
                 if opcode == Opcode.CHUNK:
                     count += 1
+                    size = self._claimed_size(body, stop)
+                    size = 0 if size > MAX_CHUNK_SIZE else size  # refused by itself
+                    if size > room:
+                        self.problems.append(
+                            f"chunk {count} (at byte {start}) is not read: it claims {size} bytes, "
+                            f"and all chunks more than {MAX_RATIO} times the file"
+                        )
+                        continue
+                    room -= size
                     label = f"chunk {count} (at byte {start})"
                     ahead.append(pool.submit(self._unpack, label, body, stop))
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
@@ -271,6 +286,10 @@ class Container:
                     yield self._finished(ahead.popleft())
             while ahead:
                 yield self._finished(ahead.popleft())
+
+    def _claimed_size(self, body: int, stop: int) -> int:
+        head = self._data[body : min(body + _CHUNK.size, stop)]
+        return int(_CHUNK.unpack(head)[2]) if len(head) == _CHUNK.size else 0
 
     def _check_attachment(self, body: int, stop: int) -> None:
         crc = int.from_bytes(self._data[max(body, stop - 4) : stop], "little")

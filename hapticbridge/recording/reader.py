@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +31,8 @@ _HEAD_DTYPE = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-_RECORD_HEAD = 9
+_RECORD = struct.Struct("<BQ")
+_RECORD_HEAD = _RECORD.size
 _MESSAGE_HEAD = _HEAD_DTYPE.itemsize
 _CDR = int.from_bytes(layout.CDR_HEADER, "little")
 
@@ -48,6 +50,7 @@ class Contents:
         meta: The metadata; None before they are read.
         digest: Digest stored in the file.
         refusal: Reason why the records cannot be read; None if they can.
+        keeps_events: True to parse events.
     """
 
     problems: list[str]
@@ -58,6 +61,7 @@ class Contents:
     meta: dict[str, str] | None = None
     digest: str | None = None
     refusal: str | None = None
+    keeps_events: bool = True
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _topics: dict[int, str] = field(default_factory=dict)
 
@@ -97,27 +101,31 @@ class Contents:
 
     def add_block(self, block: Block) -> None:
         """Adds the records of a block."""
-        data, position = block.data, 0
-        while position < len(data):
+        data, position, end = block.data, 0, len(block.data)
+        topics, head = self._topics, _RECORD.unpack_from
+        while position < end:
             body = position + _RECORD_HEAD
-            stop = body + int.from_bytes(data[position + 1 : body], "little")
-            if stop > len(data) or body > len(data):
+            opcode, size = head(data, position) if body <= end else (0, 0)
+            stop = body + size
+            if stop > end:
                 self.problems.append(f"{block.label} ends inside a record")
                 return
-            fields = Fields(data, body, stop)
             try:
-                if data[position] == Opcode.MESSAGE:
-                    channel = fields.number(2)
-                    topic = self._topics.get(channel)
+                if opcode == Opcode.MESSAGE:
+                    channel = int.from_bytes(data[body : body + 2], "little")
+                    topic = topics.get(channel, "")
                     if topic == layout.TICK_TOPIC:
                         stop = self._add_ticks(data, position, channel)
-                    elif topic == layout.EVENT_TOPIC:
-                        fields.raw(20)
+                    elif topic == layout.EVENT_TOPIC and self.keeps_events:
                         self._add_event(data[position + _MESSAGE_HEAD : stop])
-                elif data[position] == Opcode.SCHEMA:
-                    self._add_schema(fields)
-                elif data[position] == Opcode.CHANNEL:
-                    self._add_channel(fields)
+                elif opcode == Opcode.SCHEMA:
+                    self._add_schema(Fields(data, body, stop))
+                elif opcode == Opcode.CHANNEL:
+                    self._add_channel(Fields(data, body, stop))
+                else:
+                    # a chunk holds no others; a reader must not walk through millions of them
+                    self.problems.append(f"{block.label} holds a record of kind {opcode}")
+                    return
             except DamageError as error:
                 self.problems.append(f"{block.label} holds a damaged record: {error}")
             position = stop
@@ -235,7 +243,7 @@ class RecordingFile:
         size = size or BLOCK
         runs: list[NDArray[np.void]] = []
         found = 0
-        for _ in _read_parts(self.path, runs.append):
+        for _ in _read_parts(self.path, runs.append, keeps_events=False):
             while sum(run.size for run in runs) >= size:
                 block, runs[:] = _split(runs, size, self.record)
                 found += size
@@ -341,7 +349,7 @@ def _read_through(
 
 
 def _read_parts(
-    path: Path, take: Callable[[NDArray[np.void]], None]
+    path: Path, take: Callable[[NDArray[np.void]], None], *, keeps_events: bool = True
 ) -> Iterator[tuple[Container, Contents]]:
     """Reads a file; yields its container and contents after every part."""
     with FileBytes(path) as data:
@@ -349,7 +357,7 @@ def _read_parts(
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
         container = Container(data)
-        contents = Contents(container.problems, take)
+        contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
         for item in container.records():
             if isinstance(item, Block):

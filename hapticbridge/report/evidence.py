@@ -22,16 +22,12 @@ from hapticbridge.files import printable
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.record import force_on_hand
+from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.recording.timeline import due_times
 from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import (
-    MODEL_ATTACHMENT,
-    method_of,
-    parameters_of,
-    requested_of,
-)
+from hapticbridge.run_description import method_of, parameters_of, requested_of
 from hapticbridge.summary import was_always_implicit
 
 if TYPE_CHECKING:
@@ -194,7 +190,7 @@ class Evidence:
         excess: Energy given to the device beyond its dissipation and what scene and coupling
             released, so far, (n,) in J; zeros if it cannot be computed
             (``EnergyBalance.excess_device_energy``).
-        model: The compiled scene; None if the file lacks it or this MuJoCo cannot load it.
+        model: The compiled scene; None if its sources cannot be compiled.
     """
 
     recording: Recording
@@ -285,15 +281,12 @@ class Evidence:
             created=energies[0],
             allowed=energies[1],
             excess=energies[2],
-            model=_model(recording),
+            model=_model(recording, run.parameters),
         )
 
 
-def _model(recording: Recording) -> mujoco.MjModel | None:
-    content = recording.attachments.get(MODEL_ATTACHMENT)
-    if content is None:
-        return None
+def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel | None:
     try:
-        return mujoco.MjModel.from_binary_path(MODEL_ATTACHMENT, assets={MODEL_ATTACHMENT: content})
-    except ValueError:
+        return compile_recorded(recording, parameters).model
+    except HapticBridgeError:
         return None

@@ -175,8 +175,8 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
     words = NOT_KEPT if kept is not None and kept.fault else borne[report.certified]
     facts.append(("device condition", words + (kept.clause if kept and report.certified else "")))
-    if kept is not None and (kept.share < 1.0 or kept.mean_delay > 0.0):
-        facts.append(("time kept", f"{kept.words}, {format_si(kept.mean_delay, 's')} to the force"))
+    if kept is not None and kept.remark:
+        facts.append(("time kept", kept.remark))
     if report.slack_share:
         facts.append(("slack used", f"{report.slack_share:.0%}"))
     return [*facts, ("simulated again", report.resimulation or "not reached")]

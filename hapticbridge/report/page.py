@@ -73,7 +73,7 @@ def write_page(path: Path, template: str, **variables: object) -> None:
     page = environment.get_template(template).render(variables)
     try:
         with atomic_write(path) as draft:
-            draft.write_text(page, encoding="utf-8")
+            draft.write_text(page, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise RecordingError(f"cannot write '{path}': {error.strerror}") from None
 

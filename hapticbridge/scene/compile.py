@@ -124,19 +124,50 @@ def compiled(spec: mujoco.MjSpec, sources: tuple[SourceFile, ...]) -> mujoco.MjM
     """Compiles a scene from the bytes of its files, independent of their folder.
 
     A compiled model names the files of its meshes and textures. With their paths it would differ
-    from folder to folder, and a recording would reveal the user's folders. Files outside the
-    scene's own folder, and files that only MuJoCo finds, are read from their place.
+    from folder to folder, and a recording would reveal the user's folders. Files that only MuJoCo
+    finds are read from their place.
     """
     main, *assets = sources
-    if not assets or "/" in main.name:
+    if not assets:
         return spec.compile()
+    inner = main.name.rpartition("/")[0]
     portable = spec.copy()
-    portable.modelfiledir = ""
+    portable.modelfiledir = inner
     portable.assets = {source.name: source.data for source in assets}
     try:
-        return portable.compile()
+        model = portable.compile()
+        folder = spec.modelfiledir.removesuffix("/").removesuffix(inner).removesuffix("/") + "/"
+        if _name_by_source(portable, model, folder, sources):
+            return portable.compile()
     except ValueError:
         return spec.compile()
+    return model
+
+
+def _name_by_source(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, folder: str, sources: tuple[SourceFile, ...]
+) -> bool:
+    """Names files of nested includes and attached models, which keep their absolute paths.
+
+    They get the path that they would have if the scene's folder were the root.
+
+    Returns:
+        True if there were any.
+    """
+    known = {source.name: source.data for source in sources}
+    named = {}
+    kinds = (spec.meshes, "mesh"), (spec.hfields, "hfield"), (spec.textures, "tex")
+    for elements, kind in kinds:
+        for element in elements:
+            start = int(getattr(model, f"{kind}_pathadr")[element.id])
+            path = model.paths[start:].split(b"\0", 1)[0].decode() if start >= 0 else ""
+            name = path.removeprefix(folder)
+            if name != path and name in known:
+                named[element] = name
+    for element, name in named.items():
+        element.file = f"/{name}"
+        spec.assets |= {f"/{name}": known[name]}
+    return bool(named)
 
 
 def _malformed(match: re.Match[str]) -> str:
@@ -160,9 +191,12 @@ _WORDING: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
 """Patterns of MuJoCo's error messages, and their wording after a colon."""
 
 
+_LONGEST = 1000  # of a message, which may quote a whole file
+
+
 def clause(error: Exception) -> str:
     """Returns MuJoCo's error message, worded to follow a colon."""
-    text = " ".join(str(error).split())
+    text = " ".join(str(error)[:_LONGEST].split())
     for pattern, wording in _WORDING:
         text = re.sub(pattern, wording, text)
     return text or type(error).__name__

@@ -260,6 +260,7 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
         needed.append(f"noslip_iterations: {option.noslip_iterations} → 0")
     if option.enableflags & enable.mjENBL_SLEEP:
         needed.append("flag sleep: enable → disable")
+    needed += _constrain_edges(spec, as_is=as_is)
     if needed and as_is:
         raise SceneError(
             f"the scene needs other options to be coupled ({', '.join(needed)}); set them, or let "
@@ -275,6 +276,30 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
     # a reset during a run would move the tool unnoticed; the guard trips on non-finite values
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return tuple(dict.fromkeys((*changes, *needed)))
+
+
+def _constrain_edges(spec: mujoco.MjSpec, *, as_is: bool) -> list[str]:
+    """Replaces springs and dampers on a flex's edges, which ``discrete`` lacks, by constraints.
+
+    Returns:
+        The changes, as ``name: old → new``, which are not made if ``as_is`` forbids them.
+    """
+    constrained = {each.name1 for each in spec.equalities if each.type == mujoco.mjtEq.mjEQ_FLEX}
+    changes = []
+    for flex in spec.flexes:
+        if flex.edgestiffness > 0:
+            changes.append(f"edges of flex '{flex.name}': springs → constraints of constant length")
+        elif flex.edgedamping > 0:
+            changes.append(f"edges of flex '{flex.name}': damping {flex.edgedamping:g} → 0")
+        else:
+            continue
+        if as_is:
+            continue
+        if flex.edgestiffness > 0 and flex.name not in constrained:
+            equality = spec.add_equality(name1=flex.name)
+            equality.type, equality.active = mujoco.mjtEq.mjEQ_FLEX, True
+        flex.edgestiffness = flex.edgedamping = 0.0
+    return changes
 
 
 def limit_motors_alone(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -119,11 +119,9 @@ def load_scene(
 
     Args:
         source: An MJCF file, one of ``scene_names()``, or a specification built in memory, which
-            is not modified. A run of a specification computes with its exact numbers. A recording
-            keeps it as MuJoCo writes it: numbers with 6 digits, without comments and includes, and
-            with the assets that are in ``MjSpec.assets`` or in a file. The exact compiled model is
-            in the recording too, so the audit simulates it again bit for bit. A what-if loads the
-            written form.
+            is not modified. A run of a specification computes with it as MuJoCo writes it: numbers
+            with 6 digits, and the assets that are in ``MjSpec.assets`` or in a file. A recording
+            keeps this written form, so the audit compiles the scene that ran.
         grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
             ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``).
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
@@ -147,7 +145,7 @@ def load_scene(
             f"a specification has no parameters, and {choices(parameters)} cannot be set; change "
             "the specification itself"
         )
-    return compile_scene(spec_source(source), grip, as_is=as_is, stacklevel=3)
+    return compile_scene(_written(spec_source(source)), grip, as_is=as_is, stacklevel=3)
 
 
 def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
@@ -192,6 +190,16 @@ def spec_source(spec: mujoco.MjSpec) -> SceneSource:
     sources += tuple(SourceFile(name, held[name]) for name in sorted(held.keys() - known))
     check_numbers(sources)
     return SceneSource(path, spec, sources, {}, tuple(check_options(spec)))
+
+
+def _written(source: SceneSource) -> SceneSource:
+    """Returns a specification as it is read back from its recorded sources."""
+    main, *assets = source.sources
+    with _refused(source.path):
+        spec = mujoco.MjSpec.from_string(
+            main.data.decode(), assets={asset.name: asset.data for asset in assets}
+        )
+    return replace(source, spec=spec)
 
 
 def plain_model(source: SceneSource) -> mujoco.MjModel:

@@ -132,7 +132,7 @@ def scene_parameters(scene: Path) -> tuple[Parameter, ...]:
         return ()
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8")).get("parameters", {})
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SceneError(f"cannot read the scene's parameters in '{file}': {error}") from None
     if not isinstance(tables, dict):
         raise SceneError(f"'parameters' in '{file}' must be a table of parameters")

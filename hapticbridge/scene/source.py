@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
+from hapticbridge.errors import SceneError
 from hapticbridge.scene.parameters import parameters_file
 
 _FILE_ATTRIBUTES = (
@@ -28,7 +29,8 @@ _FILE_ATTRIBUTES = (
 
 # MuJoCo's parser accepts more than well-formed XML ("--" in a comment, a bare "&"), so these
 # patterns must accept it too.
-_NOT_AN_ELEMENT = re.compile(r"<!--.*?-->|<\?.*?\?>|<![A-Z].*?>", re.DOTALL)
+# What is never closed ends with the text: else each of many starts would be sought to the end.
+_NOT_AN_ELEMENT = re.compile(r"<!--.*?(?:-->|\Z)|<\?.*?(?:\?>|\Z)|<![A-Z].*?(?:>|\Z)", re.DOTALL)
 _ELEMENT = re.compile(r"<([A-Za-z_][\w.:-]*)((?:\s+[\w.:-]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*)\s*/?>")
 _ATTRIBUTE = re.compile(r"([\w.:-]+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 
@@ -86,6 +88,37 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
         SourceFile(name.as_posix(), main if main and file is path else file.read_bytes())
         for name, file in zip(names, found.values(), strict=True)
     )
+
+
+_FILE_NAME = re.compile(
+    r"""(?=\b(?:file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:"([^"]*)"|'([^']*)'))"""
+)
+
+
+def refuse_outside(data: bytes, name: str) -> None:
+    """Refuses a file of a foreign scene that names files outside the scene's folder.
+
+    Every text that looks like a file's name counts, also in a comment: this pattern and MuJoCo's
+    parser need not agree on what a comment is.
+
+    Args:
+        data: Content of the file.
+        name: Its path in the scene's folder, with forward slashes.
+
+    Raises:
+        SceneError: A name is absolute, or leads out of the folder.
+    """
+    text = data.decode("utf-8-sig", errors="replace")
+    names = {unescape(double or single) for double, single in _FILE_NAME.findall(text)}
+    depth = name.count("/")
+    for found in names:
+        parts = found.replace("\\", "/").split("/")
+        is_absolute = found[:1] in ("/", "\\", "~") or ":" in parts[0]
+        if is_absolute or parts.count("..") > depth:
+            raise SceneError(
+                f"'{name}' names the file '{found:.80}', which lies outside the scene's folder; a "
+                "recording's scene may only name its own files"
+            )
 
 
 def read_elements(data: bytes) -> Iterator[Element]:

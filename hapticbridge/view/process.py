@@ -19,10 +19,10 @@ from typing import IO, Any
 import mujoco
 import numpy as np
 
-from hapticbridge.audit.replay import attached_model
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.film_process import MIN_REFERENCE, is_held
 from hapticbridge.record import force_on_hand
+from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
@@ -68,7 +68,7 @@ class LiveRun:
 
     def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
         self.parameters = parameters_of(run.meta)
-        self.model = attached_model(run, self.parameters)
+        self.model = compile_recorded(run, self.parameters, is_trusted=True).model
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,6 @@ from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import period_of
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.files import read_json
 from hapticbridge.guard import (
     CONTROLLERS,
     IDLE_FORCE,
@@ -27,17 +24,17 @@ from hapticbridge.guard import (
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
-from hapticbridge.recording import Recording
-from hapticbridge.rendering import Method, prepare
-from hapticbridge.run_description import (
-    CARRIED,
-    SOURCE_PREFIX,
-    compiled_model,
-    method_of,
-    parameters_of,
-    requested_of,
+from hapticbridge.recorded_scene import (
+    compile_recorded,
+    is_as_recorded,
+    load_unpacked,
+    recorded_values,
+    unpack_scene,
 )
-from hapticbridge.scene import Scene, load_scene, scene_parameters
+from hapticbridge.recording import Recording
+from hapticbridge.rendering import Method
+from hapticbridge.run_description import method_of, parameters_of, requested_of
+from hapticbridge.scene import Scene
 from hapticbridge.whatif.settings import Settings
 
 # Exact inversion of a floating-point function
@@ -63,41 +60,6 @@ def invert_exactly(wanted: float, function: Callable[[float], float], guess: flo
                 return candidate
         up, down = math.nextafter(up, math.inf), math.nextafter(down, -math.inf)
     return guess
-
-
-# Scene files of a recording
-
-
-def unpack_scene(recording: Recording, folder: Path) -> Path:
-    """Writes a recording's scene files to a folder; returns the main file.
-
-    The folder is created if missing; nothing is written outside it.
-
-    Raises:
-        RecordingError: The recording carries no scene, or files that cannot be written there.
-    """
-    main: Path | None = None
-    for name, data in recording.attachments.items():
-        if not name.startswith(SOURCE_PREFIX):
-            continue
-        inner = PurePosixPath(name.removeprefix(SOURCE_PREFIX))
-        # a foreign recording must not write outside the folder
-        if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
-            raise RecordingError(
-                f"the attachment {name!r:.80} would lie outside the scene's folder"
-            )
-        path = folder / inner
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-        except (OSError, ValueError) as error:
-            raise RecordingError(
-                f"the attachment {name!r:.80} cannot be unpacked: {error}"
-            ) from None
-        main = main or path
-    if main is None:
-        raise RecordingError(f"{recording.path} carries no scene, so it cannot be simulated again")
-    return main
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +93,7 @@ class RecordedRun:
         method = method_of(recording.meta)
         try:
             info = DeviceInfo.from_json(recording.meta.get("device", ""))
-            values = dict(read_json(recording.meta.get("scene_parameters", "{}")))
-        except (HapticBridgeError, ValueError, TypeError) as error:
+        except HapticBridgeError as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
         settings = Settings(
             coupling=requested_of(recording.meta),
@@ -142,7 +103,7 @@ class RecordedRun:
             scale=parameters.scale,
             force_scale=parameters.force_scale,
             contact_stiffness=parameters.contact_stiffness or None,
-            scene={str(name): float(value) for name, value in values.items()},
+            scene=recorded_values(recording.meta),
             controller=_controller(info, parameters, method),
         )
         return cls(recording, parameters, info, settings, unpack_scene(recording, folder))
@@ -215,26 +176,16 @@ class RecordedRun:
         Raises:
             SceneError: A parameter is out of range, or the scene cannot be loaded.
         """
-        defaults = {each.name: each.default for each in scene_parameters(self.scene_file)}
-        # a default that is set may differ from the file's number in its last digit
-        values = {n: v for n, v in settings.scene.items() if defaults.get(n) != v}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-            scene = load_scene(self.scene_file, self.parameters.grip, as_is=False, **values)
-        if self.recording.meta.get("tool_weight") == CARRIED:
-            scene.carry_tool("as recorded")
-        return scene
+        return load_unpacked(
+            self.scene_file, self.parameters.grip, settings.scene, self.recording.meta
+        )
 
     def is_scene_as_recorded(self) -> bool:
         """Returns True if the attached sources compile to the recorded model.
 
         They do not if a program changed the model after loading.
         """
-        scene, settings = self.scene(self.settings), self.settings
-        step = settings.rate, settings.substeps, settings.method
-        prepare(scene, settings.coupling, 1.0 / step[0], *step[1:], warns=False)
-        found = hashlib.sha256(compiled_model(scene.model)).hexdigest()
-        return found == self.recording.meta.get("scene_sha256")
+        return is_as_recorded(compile_recorded(self.recording, self.parameters), self.recording)
 
 
 def _requested_hold(hold: float, load: float) -> float:

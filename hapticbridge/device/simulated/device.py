@@ -90,7 +90,7 @@ def _check_hands(
 ) -> None:
     is_line = isinstance(hand, WorstHand)
     if rotational_hand is not None and not is_line:
-        raise DeviceError("rotational_hand requires a WorstHand as hand")
+        raise DeviceError("a rotational worst hand requires a worst hand in translation too")
     if is_line and friction:
         raise DeviceError(f"friction = {friction!r} N: a worst hand is linear and has none")
 

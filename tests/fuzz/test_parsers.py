@@ -1,0 +1,122 @@
+"""Any bytes end in a value or in one of the program's own errors, in every parser of foreign files.
+
+``SEEDS`` are inputs that once broke a parser; they are tried before the random ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from audit_cases import tapped
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hapticbridge.device import DeviceInfo
+from hapticbridge.device.profile import read_profile
+from hapticbridge.device.trajectory import read_motion
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.parameters import GuardParameters
+from hapticbridge.recording import read_recording
+from hapticbridge.scene import scene_parameters
+from hapticbridge.scene.source import read_elements, refuse_outside
+
+SEEDS = (
+    b"a=" + b"[" * 100_000,
+    b"a=" + b"9" * 5000,
+    b"\xff\xfe",
+    b"<!--" * 75_000,
+    b"<a " + b" " * 300_000,
+    b"[" * 100_000,
+    b"{}",
+    b"",
+)
+
+WORDS = st.sampled_from(
+    (
+        *(b"[parameters.a]\n", b"unit='m'\n", b"default=", b"sets=[{kind='geom'}]\n", b"1e999"),
+        *(b"<mujoco>", b"<mesh file='", b"/dev/zero", b"'/>", b"<!--", b"-->", b"&#47;"),
+        *(b'{"damping":', b"null", b"NaN", b"}", b"t,x,y,z,qw,qx,qy,qz\n", b"0,", b"\n", b"\0"),
+    )
+)
+TEXTS = st.lists(st.one_of(WORDS, st.binary(max_size=8)), max_size=20).map(b"".join)
+
+
+def toml(data: bytes, folder: Path) -> None:
+    (folder / "scene.toml").write_bytes(data)
+    scene_parameters(folder / "scene.xml")
+
+
+def profile(data: bytes, folder: Path) -> None:
+    (folder / "profile.toml").write_bytes(data)
+    read_profile(folder / "profile.toml")
+
+
+def trajectory(data: bytes, folder: Path) -> None:
+    (folder / "hand.csv").write_bytes(data)
+    read_motion(folder / "hand.csv")
+
+
+def recording(data: bytes, folder: Path) -> None:
+    (folder / "run.mcap").write_bytes(data)
+    read_recording(folder / "run.mcap")
+
+
+PARSERS: dict[str, Callable[[bytes, Path], object]] = {
+    "scene parameters": toml,
+    "device profile": profile,
+    "trajectory": trajectory,
+    "recording": recording,
+    "elements": lambda data, _: list(read_elements(data)),
+    "file names": lambda data, _: refuse_outside(data, "main.xml"),
+    "guard": lambda data, _: GuardParameters.from_json(data.decode(errors="replace")),
+    "device": lambda data, _: DeviceInfo.from_json(data.decode(errors="replace")),
+}
+
+
+def tried(parse: Callable[[bytes, Path], object], data: bytes, folder: Path) -> None:
+    try:
+        parse(data, folder)
+    except HapticBridgeError as error:
+        assert str(error)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+@settings(
+    max_examples=250,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(data=TEXTS)
+def test_any_text_is_read_or_refused(name: str, data: bytes, tmp_path: Path) -> None:
+    tried(PARSERS[name], data, tmp_path)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+@pytest.mark.parametrize("seed", SEEDS, ids=range(len(SEEDS)))
+def test_what_once_broke_a_parser_is_read_or_refused(
+    name: str, seed: bytes, tmp_path: Path
+) -> None:
+    tried(PARSERS[name], seed, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return tapped(tmp_path_factory.mktemp("whole")).read_bytes()
+
+
+@settings(
+    max_examples=150,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(at=st.floats(0, 1), data=st.binary(min_size=1, max_size=12), cut=st.floats(0.5, 1))
+def test_a_changed_recording_is_read_or_refused(
+    whole: bytes, at: float, data: bytes, cut: float, tmp_path: Path
+) -> None:
+    start = int(at * len(whole))
+    changed = whole[:start] + data + whole[start + len(data) :]
+    tried(recording, changed[: int(cut * len(whole)) or 1], tmp_path)

@@ -1,0 +1,436 @@
+"""Kinds of forgery of a recording, all checksums and digests written anew, and what becomes of it.
+
+Each is judged twice: simulated again, and as if recorded with another MuJoCo, from its records
+alone. Without a key a few cannot be seen; the table says why.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import report_runs
+from audit_cases import ScriptedDevice, SlowClock, recorded, verdict_of
+
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.commands import Couple, Reset
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo, SimulatedDevice
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.guard import Limits, guard_parameters_for
+from hapticbridge.kernel.parameters import UNGUARDED
+from hapticbridge.record import CLOCK_FIELDS, TickFlag
+from hapticbridge.recording import Recording, read_recording
+from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
+
+SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
+SHEET = SCENE.replace(".xml", ".toml")
+
+MOTION = "t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.1,0.0006,0.0001,-0.0125,0.9998,0.0141,0.0141,0\n"
+
+Parts = dict[str, Any]
+Change = Callable[[Recording], Parts]
+
+
+# Honest recordings
+
+
+def hand(folder: Path) -> Path:
+    """A hand taps with a peg; the guard has its usual limits."""
+    path, motion = folder / "hand.mcap", folder / "hand.csv"
+    motion.write_text(MOTION)
+    limits = Limits(force=10.0, torque=0.5, ramp=0.05)
+    recorded(path, device=f"simulated:path={motion}", duration=0.2, limits=limits, controller=None)
+    return path
+
+
+def busy(folder: Path) -> Path:
+    """Commands, inputs, a mark and missed deadlines."""
+    path = folder / "busy.mcap"
+
+    def act(bridge: Bridge, tick: int) -> None:
+        bridge.session.commands.now = lambda: 1e-3 * tick
+        if tick == 100:
+            bridge.command(Couple(1000.0, 0.5))
+        elif tick in (240, 260):
+            bridge.set_input(body_wrench={"tool": (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)})
+        elif tick == 420:
+            bridge.command(Reset())
+
+    device = ScriptedDevice(lambda tick: (1e-4 * tick, 0, 0, 1, 0, 0, 0))
+    clock = SlowClock({180: 2, 200: 1})
+    recorded(
+        path, "point_mass", device, Coupling(800.0, 0.5), duration=0.6, on_tick=act, clock=clock
+    )
+    return path
+
+
+def tripped(folder: Path) -> Path:
+    """The tool is left behind."""
+    path = folder / "tripped.mcap"
+    device = ScriptedDevice(lambda tick: (0.001 * max(tick - 50, 0), 0, 0, 1, 0, 0, 0))
+    limits = Limits(force=10.0, torque=0.5, stretch=0.005)
+    with suppress(SafetyTrip):
+        recorded(path, "point_mass", device, duration=0.3, limits=limits)
+    return path
+
+
+def swung(folder: Path) -> Path:
+    """A coupling too stiff for its device swings up: the run is active."""
+    scene = report_runs.ANVIL.replace(
+        "<worldbody>",
+        '<custom><numeric name="simulated_hand" data="60 0"/></custom><worldbody>',
+    )
+    device = SimulatedDevice(mass=0.2, damping=0.1, hand=report_runs.LIGHT_HAND)
+    coupling = Coupling(10_000.0, 0.05, 0.1, 1e-4)
+    path = folder / "swung.mcap"
+    return report_runs.made_in(path, scene, device, coupling, duration=1.0, controller="off")
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Any], Recording]:
+    folder, kept = tmp_path_factory.mktemp("honest"), dict[Any, Recording]()
+
+    def of(run: Callable[[Path], Path]) -> Recording:
+        if run not in kept:
+            kept[run] = read_recording(run(folder))
+        return kept[run]
+
+    return of
+
+
+# Changes
+
+
+def meta(name: str, change: Callable[[Any], Any]) -> Change:
+    """Changes a JSON value of the metadata."""
+
+    def parts(recording: Recording) -> Parts:
+        return {"meta": {name: json.dumps(change(json.loads(recording.meta[name])))}}
+
+    return parts
+
+
+def text(**values: str) -> Change:
+    return lambda _: {"meta": values}
+
+
+def times(name: str, factor: float = 1.01) -> Change:
+    return meta(name, lambda value: value * factor if value else factor)
+
+
+def component(name: str, index: int) -> Change:
+    return meta(name, lambda values: [v + 1e-4 * (i == index) for i, v in enumerate(values)])
+
+
+def entry(field: str, **values: Any) -> Change:
+    return meta(field, lambda old: old | values)
+
+
+def guard(name: str, factor: float) -> Change:
+    def change(old: dict[str, Any]) -> dict[str, Any]:
+        value = old[name]
+        if isinstance(value, int):
+            return old | {name: int(value + factor)}
+        return old | {name: 1.0 if value is None else value * factor}
+
+    return meta("guard", change)
+
+
+def ticks(name: str, change: Callable[[Any], Any]) -> Change:
+    def parts(recording: Recording) -> Parts:
+        rows = recording.ticks.copy()
+        rows[name] = change(rows[name])
+        return {"ticks": rows}
+
+    return parts
+
+
+def rows(change: Callable[[Any], Any]) -> Change:
+    return lambda recording: {"ticks": change(recording.ticks.copy())}
+
+
+def without(name: str) -> Change:
+    return lambda r: {"events": [e for e in r.events if e["event"] != name]}
+
+
+def event(kind: str, **values: Any) -> Change:
+    def parts(recording: Recording) -> Parts:
+        first = next(e for e in recording.events if e["event"] == kind)
+        return {"events": [e | values if e is first else e for e in recording.events]}
+
+    return parts
+
+
+def attached(name: str, change: Callable[[bytes], bytes]) -> Change:
+    return lambda recording: {"attachments": {name: change(recording.attachments[name])}}
+
+
+def dropped(prefix: str) -> Change:
+    """Leaves attachments out."""
+    return lambda _: {"without": prefix}
+
+
+def shortened(recording: Recording) -> Parts:
+    """Cuts the tail off, and ends the run there."""
+    count = len(recording.ticks) // 2
+    kept = [e | {"tick": min(e["tick"], count)} for e in recording.events]
+    return {"ticks": recording.ticks[:count], "events": kept}
+
+
+def on_time(recording: Recording) -> Parts:
+    """Hides the missed deadlines everywhere."""
+    late = recording.ticks.copy()
+    late["flags"] &= ~int(TickFlag.OVERRUN)
+    for name in CLOCK_FIELDS:
+        late[name] = 1_000_000 * (1 + late["tick"])
+    clean = {"overruns": 0, "skipped": 0}
+    return {
+        "ticks": late,
+        "events": [e | clean if "overruns" in e else e for e in recording.events],
+    }
+
+
+def other_law(recording: Recording) -> Parts:
+    """Doubles the stiffness in request and law."""
+    stiffness = 2 * float(recording.meta["stiffness"])
+    requested = json.loads(recording.meta["requested"])
+    changed = {"stiffness": repr(stiffness), "requested": json.dumps([stiffness, *requested[1:]])}
+    return {"meta": changed}
+
+
+def other_sheet(recording: Recording, **values: Any) -> Parts:
+    """Changes the data sheet, and all guard parameters that follow from it."""
+    sheet = json.loads(recording.meta["device"]) | values
+    info = DeviceInfo.from_json(json.dumps(sheet))
+    old = json.loads(recording.meta["guard"])
+    limits = Limits(force=10.0, torque=0.5)
+    new = guard_parameters_for(info, limits, float(recording.meta["period_s"]), controller="off")
+    names = ("assumed_damping", "assumed_rotational_damping", "max_damping")
+    changed = {name: getattr(new, name) for name in (*names, "max_rotational_damping")}
+    return {"meta": {"device": json.dumps(sheet), "guard": json.dumps(old | changed)}}
+
+
+def no_trip(recording: Recording) -> Parts:
+    """Removes the trip, and lets the run end by itself."""
+    kept = [e for e in recording.events if e["event"] != "trip"]
+    return {"events": [e | {"reason": "duration"} if e["event"] == "stop" else e for e in kept]}
+
+
+def doubled(recording: Recording) -> Parts:
+    return {"events": [recording.events[0], *recording.events]}
+
+
+@dataclass(frozen=True)
+class Forgery:
+    """A kind of forgery.
+
+    Attributes:
+        run: Honest recording that is forged.
+        change: Parts that are changed.
+        seen: Verdict where the run can be simulated again.
+        blind: Verdict from the records alone.
+        why: Reason why only a key would show it; empty if it is seen.
+    """
+
+    run: Callable[[Path], Path]
+    change: Change
+    seen: str = "invalid"
+    blind: str = "invalid"
+    why: str = ""
+
+
+def seen(run: Callable[[Path], Path], change: Change) -> Forgery:
+    """Returns a forgery that the records alone give away."""
+    return Forgery(run, change)
+
+
+def again(run: Callable[[Path], Path], change: Change) -> Forgery:
+    """Returns a forgery that only the simulation gives away."""
+    return Forgery(run, change, blind="unverified")
+
+
+def hidden(run: Callable[[Path], Path], change: Change, why: str) -> Forgery:
+    """Returns a forgery that only a key would give away."""
+    return Forgery(run, change, "passive", "unverified", why)
+
+
+UNREACHED = "a limit that the run never reached: an honest run with it has the same records"
+OWN_WORD = "a statement of the user or the machine, that nothing else in the file depends on"
+LESS = "it claims less: an uncertified device, or a run without a guard"
+PUNCTUAL = "an honest run that met all its deadlines has these records"
+SHORTER = "an honest run that ended earlier has these records"
+
+FORGERIES: dict[str, Forgery] = {
+    # coupling and method
+    "stiffness": seen(hand, times("stiffness")),
+    "law damping": seen(hand, times("damping")),
+    "rotational stiffness": seen(hand, times("rotational_stiffness")),
+    "requested coupling": seen(hand, component("requested", 0)),
+    "requested coupling and law": seen(hand, other_law),
+    "effective coupling": seen(hand, text(effective="[1, 1, 1, 1]")),
+    "method": seen(hand, text(method="implicit")),
+    "contact": seen(hand, text(contact="scene")),
+    "discretization": seen(hand, text(discretization="forward")),
+    "contact stiffness": seen(hand, text(contact_stiffness="1000.0")),
+    "grip": again(hand, text(grip="elsewhere")),
+    # workspace and time
+    "period": seen(hand, times("period_s")),
+    "substeps": seen(hand, text(substeps="2")),
+    "scale": seen(hand, times("scale")),
+    "force scale": seen(hand, times("force_scale")),
+    "axes": seen(hand, component("axes", 0)),
+    "ramp": seen(hand, times("ramp_ticks", 2)),
+    "device origin": seen(hand, component("device_origin", 0)),
+    "handle origin": again(hand, component("handle_origin", 0)),
+    "device start": again(hand, component("device_start", 0)),
+    "handle start": seen(hand, component("handle_start", 1)),
+    "tool start": seen(hand, component("tool_start", 2)),
+    "start kinetic": seen(hand, times("start_kinetic")),
+    "start potential": seen(hand, times("start_potential")),
+    "clock": seen(hand, text(clock="sundial")),
+    "started": hidden(hand, text(started="2001-01-01T00:00:00+00:00"), OWN_WORD),
+    # device
+    "device damping": seen(hand, entry("device", damping=50.0)),
+    "damping of an active run": seen(swung, entry("device", damping=50.0)),
+    "rotational damping": seen(hand, entry("device", rotational_damping=1.0)),
+    "device mass": seen(hand, entry("device", mass=5e-4)),
+    "device rate": seen(hand, entry("device", rate=100.0)),
+    "speed limit": seen(hand, entry("device", speed_limit=0.9)),
+    "axes of the device": seen(hand, entry("device", axes=["x", "y", "z"])),
+    "real device": hidden(hand, entry("device", is_real=True), OWN_WORD),
+    "prescribed motion": seen(hand, entry("device", is_prescribed=True)),
+    "unknown damping": hidden(hand, entry("device", damping=None), LESS),
+    "device name": hidden(hand, entry("device", name="other"), OWN_WORD),
+    "damping and all that follows from it": hidden(
+        swung, partial(other_sheet, damping=50.0, rotational_damping=1.0), OWN_WORD
+    ),
+    "force limit above the device's": seen(hand, text(force_limit="1000.0")),
+    "force limit below the force": seen(hand, text(force_limit="0.01")),
+    # guard
+    **{
+        f"guard: {name}": seen(hand, guard(name, 2.0))
+        for name in (
+            *("controller", "assumed_damping", "assumed_rotational_damping", "max_damping"),
+            *("max_rotational_damping", "energy_credit_limit", "stale_ticks", "fade_ticks"),
+            *("has_hand", "dead_man", "speed", "turn_speed", "full_speed", "motors"),
+            *("swing_energy", "runaway_speed"),
+        )
+    },
+    "guard: idle force": again(hand, guard("idle_force", 2.0)),
+    "guard: idle torque": again(hand, guard("idle_torque", 2.0)),
+    "guard: hold force below the load": seen(hand, guard("hold_force", -1.0)),
+    **{
+        f"guard: {name}": hidden(hand, guard(name, 1.1), UNREACHED)
+        for name in ("stretch", "angle", "energy", "hold_force", "hold_torque")
+    },
+    "guard: all off": hidden(hand, text(guard=UNGUARDED.to_json()), LESS),
+    "guard: out of range": seen(hand, guard("angle", 1.5)),
+    # scene
+    "scene says hello": again(hand, attached(SCENE, lambda _: b"hello")),
+    "scene is empty": again(hand, attached(SCENE, lambda _: b"<mujoco/>")),
+    "heavier peg": again(
+        hand, attached(SCENE, lambda data: data.replace(b"mass=", b"mass='9' m="))
+    ),
+    "no wall": again(hand, attached(SCENE, lambda data: data.replace(b"hole_east", b"hole_feast"))),
+    "no parameter file": again(hand, attached(SHEET, lambda _: b"")),
+    "scene parameters": again(hand, entry("scene_parameters", mass=0.12)),
+    "lacking scene parameter": again(hand, text(scene_parameters="{}")),
+    "scene name": seen(hand, text(scene="harmless")),
+    "scene file": seen(hand, text(scene_file="harmless.xml")),
+    "scene changes": again(hand, text(scene_changes='["none"]')),
+    "scene hash": again(hand, text(scene_sha256="0" * 64)),
+    "start state": again(hand, attached(STATE_ATTACHMENT, lambda data: data[:-8] + b"\1" * 8)),
+    "no start state": Forgery(hand, dropped(STATE_ATTACHMENT), "unverified", "unverified"),
+    "no scene": Forgery(hand, dropped(SOURCE_PREFIX), "unverified", "unverified"),
+    # machine
+    "no versions": Forgery(hand, text(versions="{}"), "unverified", "unverified"),
+    "another version": Forgery(hand, entry("versions", numba="0.1"), "unverified", "unverified"),
+    "another processor": hidden(hand, entry("host", processor="abacus"), OWN_WORD),
+    # events
+    "no start": seen(hand, without("start")),
+    "two starts": seen(hand, doubled),
+    "no stop": seen(hand, without("stop")),
+    "stop elsewhere": seen(hand, event("stop", tick=100)),
+    "overruns of the stop": seen(busy, event("stop", overruns=0)),
+    "skipped of the stop": seen(busy, event("stop", skipped=0)),
+    "dropped of the stop": seen(busy, event("stop", dropped=7)),
+    "reason of the stop": hidden(hand, event("stop", reason="caller"), OWN_WORD),
+    "event after the end": seen(busy, event("input", tick=100_000)),
+    "event without a tick": seen(busy, event("input", tick=None)),
+    "no input": again(busy, without("input")),
+    "another input": again(busy, event("input", writes=[])),
+    "input earlier": again(busy, event("input", tick=230)),
+    "no change of the coupling": seen(busy, without("coupling")),
+    "another coupling": seen(busy, event("coupling", stiffness=999.0)),
+    "no reset": seen(busy, without("reset")),
+    "no trip": seen(tripped, without("trip")),
+    "no trip, another end": hidden(tripped, no_trip, SHORTER),
+    # records
+    "tail cut off": hidden(hand, shortened, SHORTER),
+    "tail cut off, stop kept": seen(hand, rows(lambda r: r[:-10])),
+    "head cut off": seen(hand, rows(lambda r: r[10:])),
+    "row missing": seen(hand, rows(lambda r: np.delete(r, 50))),
+    "row twice": seen(hand, rows(lambda r: np.insert(r, 50, r[50]))),
+    "rows exchanged": seen(hand, rows(lambda r: r[[*range(50), 51, 50, *range(52, len(r))]])),
+    "wrench on the device": seen(hand, ticks("wrench_on_device", lambda v: 0.9 * v)),
+    "wrench on the tool": seen(hand, ticks("wrench_on_tool", lambda v: 0.9 * v)),
+    "work of the coupling": seen(hand, ticks("coupling_work", lambda v: 0.9 * v)),
+    "kinetic energy": seen(hand, ticks("kinetic", lambda v: 0.9 * v)),
+    "environment energy": seen(hand, ticks("environment_energy", lambda v: v - 1e-3)),
+    "device energy": seen(hand, ticks("device_energy", lambda v: v - 1e-3)),
+    "tool position": seen(hand, ticks("tool_position", lambda v: v + 1e-6)),
+    "contacts": seen(hand, ticks("contacts", lambda v: 0 * v)),
+    "buttons": seen(hand, ticks("buttons", lambda v: v | 1 << 40)),
+    "no flags": seen(hand, ticks("flags", lambda v: 0 * v)),
+    "missed deadlines": seen(busy, ticks("flags", lambda v: v & ~int(TickFlag.OVERRUN))),
+    "missed deadlines and their times": hidden(busy, on_time, PUNCTUAL),
+    "late forces": seen(hand, ticks("write_ns", lambda v: v - 2_000_000)),
+}
+
+
+def judged(forgery: Forgery, recording: Recording, folder: Path, *, is_blind: bool) -> AuditReport:
+    parts = forgery.change(recording)
+    if (prefix := parts.pop("without", None)) is not None:
+        kept = {n: d for n, d in recording.attachments.items() if not n.startswith(prefix)}
+        recording = Recording(**{**vars(recording), "attachments": kept})
+    if is_blind:
+        other = {"versions": json.dumps(versions() | {"mujoco": "3.0"})}
+        parts["meta"] = {**other, **parts.get("meta", {})}
+    return verdict_of(recording, folder, **parts)
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forgery_is_not_called_passive(
+    name: str, honest: Callable[[Any], Recording], tmp_path: Path
+) -> None:
+    forgery = FORGERIES[name]
+    recording = honest(forgery.run)
+    report = judged(forgery, recording, tmp_path, is_blind=False)
+    assert report.verdict == forgery.seen, report.reason
+    assert (report.exit_code == 0) == bool(forgery.why), "only a forgery with a reason may pass"
+    blind = judged(forgery, recording, tmp_path, is_blind=True)
+    assert blind.verdict == forgery.blind, blind.reason
+    assert blind.exit_code == 1
+
+
+def test_the_honest_recordings_are_what_the_forgeries_hide(
+    honest: Callable[[Any], Recording],
+) -> None:
+    expected = {hand: "passive", busy: "passive", tripped: "passive", swung: "active"}
+    for run, verdict in expected.items():
+        report = audit(honest(run).path)
+        assert (report.verdict, report.resimulation) == (verdict, "bit for bit"), report.reason
+    assert audit(honest(hand).path).certified is True
+    assert len(FORGERIES) >= 60
+    assert math.isfinite(audit(honest(swung).path).joules)
+    assert processor()

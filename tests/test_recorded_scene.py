@@ -1,0 +1,243 @@
+"""The scene of a foreign recording: what it names, and what it may take."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from audit_cases import recorded, rewritten, tapped
+
+from hapticbridge.audit import audit
+from hapticbridge.audit.replay import compare_resimulation
+from hapticbridge.errors import HapticBridgeError, RecordingError, SceneError
+from hapticbridge.film_process import Stage
+from hapticbridge.recorded_scene import ForeignSceneError, compile_recorded, in_bounds
+from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording.container import MAX_RATIO
+from hapticbridge.run_description import SOURCE_PREFIX, parameters_of
+from hapticbridge.scene.source import refuse_outside
+
+SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
+SHEET = f"{SOURCE_PREFIX}peg_in_hole.toml"
+
+PROCESSOR_TIME, MEMORY = 5.0, 1 << 30
+"""Most that a bomb may take: s of processor, bytes."""
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return read_recording(tapped(tmp_path_factory.mktemp("honest")))
+
+
+def told(path: Path) -> str:
+    """Returns what the audit says of a file that it does not call passive."""
+    try:
+        report = audit(path)
+    except HapticBridgeError as error:
+        return str(error)
+    assert report.verdict == "invalid"
+    return report.reason
+
+
+def before_world(element: bytes) -> Callable[[bytes], bytes]:
+    return lambda text: text.replace(b"<worldbody>", element + b"<worldbody>", 1)
+
+
+GRID = b'<replicate count="100" offset="0 0 1">'
+BOMBS: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
+    "hello": (SCENE, lambda _: b"hello", "not well-formed"),
+    "nested replication": (
+        SCENE,
+        lambda text: text.replace(
+            b"<worldbody>",
+            b"<worldbody>" + 5 * GRID + b'<geom size=".1"/>' + 5 * b"</replicate>",
+            1,
+        ),
+        "made MuJoCo fail",
+    ),
+    "40 000 x 40 000 height field": (
+        SCENE,
+        before_world(b'<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>'),
+        "made MuJoCo fail",
+    ),
+    "6.4 GB of state": (SCENE, before_world(b'<size memory="6400M"/>'), "allocate memory"),
+    "a device as a mesh": (
+        SCENE,
+        before_world(b'<asset><mesh name="m" file="/dev/zero"/></asset>'),
+        "names the file '/dev/zero'",
+    ),
+    "a file above": (
+        SCENE,
+        before_world(b'<asset><mesh name="m" file="../secret.stl"/></asset>'),
+        "names the file '../secret.stl'",
+    ),
+    "300 kB of open comments": (SCENE, lambda text: b"<!--" * 75_000 + text, "cannot read scene"),
+    "300 kB of spaces": (SCENE, before_world(b"<a " + b" " * 300_000), "cannot read scene"),
+    "300 kB of a name": (SCENE, before_world(b"<" + b"a" * 300_000), "cannot read scene"),
+    "deep TOML": (SHEET, lambda _: b"a=" + b"[" * 100_000, "recursion depth"),
+    "5000 digits of TOML": (SHEET, lambda _: b"a=" + b"9" * 5000, "digits"),
+    "TOML that is no text": (SHEET, lambda _: b"\xff\xfe", "cannot read the scene's parameters"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_hostile_scene_ends_in_a_sentence_with_little_time_and_memory(
+    name: str, honest: Recording, tmp_path: Path
+) -> None:
+    attachment, change, words = BOMBS[name]
+    changed = {attachment: change(honest.attachments[attachment])}
+    path = rewritten(honest, tmp_path / "bomb.mcap", attachments=changed)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    reason = told(path)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert words in reason
+    assert "\n" not in reason and str(tmp_path.parent) not in reason.replace(str(path), "")
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < PROCESSOR_TIME
+    assert 1024 * after.ru_maxrss < MEMORY
+    with pytest.raises(HapticBridgeError, match=r"."):
+        Stage(path)
+
+
+def chunk(content: bytes) -> bytes:
+    packed = zstandard.ZstdCompressor(level=19).compress(content)
+    head = struct.pack("<QQQI", 0, 0, len(content), zlib.crc32(content))
+    body = head + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+@pytest.mark.parametrize(
+    ("content", "count", "words"),
+    [
+        (bytes(1 << 22), 20, "more than 100 times the file"),
+        (bytes(1 << 23), 20, "is beyond"),
+        (struct.pack("<BQ", 0x7F, 0) * 400_000, 1, "holds a record of kind 127"),
+        (struct.pack("<BQHIQQ", 5, 22, 99, 0, 0, 0) * 100_000, 1, "does not match"),
+    ],
+    ids=[
+        "80 MB in small chunks",
+        "160 MB in large chunks",
+        "unknown records",
+        "messages of no topic",
+    ],
+)
+def test_a_small_file_that_unpacks_to_much_is_not_unpacked(
+    content: bytes, count: int, words: str, honest: Recording, tmp_path: Path
+) -> None:
+    data, at, path = honest.path.read_bytes(), 8, tmp_path / "bomb.mcap"
+    while data[at] != 6:
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    path.write_bytes(data[:at] + count * chunk(content) + data[at:])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+    assert words in "; ".join(read_recording(path).problems)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < PROCESSOR_TIME
+
+
+def test_a_run_at_rest_compresses_far_less_than_is_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "rest.mcap"
+    recorded(path, "point_mass", duration=5.0)
+    recording = read_recording(path)
+    assert not recording.problems
+    assert recording.ticks.nbytes < 0.5 * MAX_RATIO * path.stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("text", "is_refused"),
+    [
+        ("<mesh file='a.stl'/>", False),
+        ("<mesh file='m/../a.stl'/>", True),
+        ("<mesh file='/etc/passwd'/>", True),
+        ("<mesh file='&#47;etc/passwd'/>", True),
+        ("<mesh file='C:/a.stl'/>", True),
+        ("<mesh file='\\\\host\\a.stl'/>", True),
+        ("<mesh name='file=\"' file='/etc/passwd'/>", True),
+        ("<!-- '--> <mesh name='<!--' file='/etc/passwd'/> -->", True),
+        ("<texture fileright='/dev/zero'/>", True),
+        ("<compiler meshdir='/etc'/>", True),
+        ("<compiler\n assetdir\n =\n '..'/>", True),
+        ("<include file='../b.xml'/>", True),
+    ],
+)
+def test_a_scene_names_only_files_of_its_own_folder(text: str, is_refused: bool) -> None:
+    data = text.encode()
+    if is_refused:
+        with pytest.raises(SceneError, match="outside the scene's folder"):
+            refuse_outside(data, "main.xml")
+    else:
+        refuse_outside(data, "main.xml")
+    refuse_outside(b"<mesh file='../shared/a.stl'/>", "scenes/main.xml")
+
+
+# Child process
+
+
+def test_work_in_bounds_returns_its_result_and_raises_its_refusal() -> None:
+    assert in_bounds(lambda _: {"a": [1.5, None]}, "it") == {"a": [1.5, None]}
+
+    def refuse(_: object) -> None:
+        raise RecordingError("no")
+
+    with pytest.raises(RecordingError, match=r"^no$"):
+        in_bounds(refuse, "it")
+
+
+def spin(_: object) -> None:
+    while True:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        (lambda _: os.kill(os.getpid(), signal.SIGSEGV), r"crashed MuJoCo \(SIGSEGV\)"),
+        (lambda _: np.ones(1 << 28).sum(), "needs more than 700 MB of memory"),
+        (spin, "needs too much processor time"),
+        (lambda _: sys.exit(9), "made MuJoCo fail: SystemExit: 9"),
+    ],
+    ids=["crash", "memory", "time", "exit"],
+)
+def test_work_out_of_bounds_is_named(work: Callable[[object], object], words: str) -> None:
+    with pytest.raises(ForeignSceneError, match=f"^the scene {words}"):
+        in_bounds(work, "the scene")
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_a_child_has_the_time_that_it_is_allowed() -> None:
+    def work(allow: Callable[[float], None]) -> int:
+        allow(100.0)
+        return resource.getrlimit(resource.RLIMIT_CPU)[0]
+
+    assert in_bounds(work, "it") in (100, 101, 102)
+
+
+def test_a_crash_of_a_scene_is_exit_code_2_and_a_row(
+    honest: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., object]
+) -> None:
+    path = rewritten(honest, tmp_path / "a.mcap")
+    crash = lambda *_, **__: os.kill(os.getpid(), signal.SIGSEGV)  # noqa: E731
+    monkeypatch.setattr(sys.modules[compare_resimulation.__module__], "Resimulator", crash)
+    code, _, err = call("audit", path)  # type: ignore[misc]
+    assert code == 2
+    assert "crashed MuJoCo (SIGSEGV)" in err
+    code, out, _ = call("audit", path, honest.path)  # type: ignore[misc]
+    assert code == 2
+    assert "2 unreadable" in out
+
+
+def test_a_trusted_scene_is_compiled_here(
+    honest: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fork", lambda: pytest.fail("a child process was started"))
+    assert audit(honest.path, in_process=True).resimulation == "bit for bit"
+    scene = compile_recorded(honest, parameters_of(honest.meta), is_trusted=True)
+    assert scene.name == json.loads(json.dumps(honest.meta["scene"]))
