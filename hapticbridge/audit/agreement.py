@@ -25,7 +25,7 @@ from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, gua
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import loaded_handle, static_load
+from hapticbridge.rendering import start_handle, static_load
 from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, start_state
 from hapticbridge.scene import Scene
 
@@ -198,14 +198,14 @@ def scene_statements(
     yield Statement(f"attachment '{STATE_ATTACHMENT}'", agrees or "another", True, source)
     if not run.method.has_law:
         return
-    load, guard = static_load(scene), parameters.guarding
+    load, guard = static_load(scene, parameters), parameters.guarding
     weights = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
     idle = IDLE_FORCE + weights[0], IDLE_TORQUE + weights[1]
     pairs = [("idle_force", guard.idle_force, idle[0]), ("idle_torque", guard.idle_torque, idle[1])]
     if guard == UNGUARDED:
         pairs = []
     if parameters.handle_origin != IDENTITY_POSE:
-        origin = loaded_handle(scene.grip_pose(), load, parameters.coupling)
+        origin = start_handle(scene, parameters, load)
         pairs.append(("handle_origin", parameters.handle_origin, origin))
     for name, given, expected in pairs:
         if not _agrees(given, expected, is_exact=is_exact):
