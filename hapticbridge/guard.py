@@ -285,8 +285,8 @@ _REASONS = {
 }
 _REMEDIES = {
     JUMPED: "check the motion's unit (m) and its times (s)",
-    STRETCHED: "check the motion's unit (m) and speed, and the tool's mass; with another reach in "
-    "mind raise --stretch-limit",
+    STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
+    "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
     TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
     GAVE_ENERGY: "lower --stiffness; if the scene's motors are meant to push the hand, raise "
     "--energy-limit",

@@ -88,12 +88,9 @@ SMALL = 'size="0.01 0.01 0.01"'
 FIRM, FRICTION = 'solreffriction="0.002 1"', 'solimpfriction="0.999 0.999 0.001"'
 
 PLANTS = (
-    Plant("integrator", 'integrator="discrete"', 'integrator="implicitfast"'),
     Plant("time step", 'timestep="0.001"', 'timestep="0.002"'),
-    Plant("solver", 'solver="Newton"', 'solver="CG"'),
     Plant("solver iterations", 'iterations="100"', 'iterations="1"'),
     Plant("pyramidal cone", 'cone="elliptic"', 'cone="pyramidal"'),
-    Plant("diagexact", ' diagexact="enable"', ' energy="enable"', at="<flag"),
     Plant("keyframe", "<!-- keys -->", f'<keyframe><key name="start" qpos="{START}"/></keyframe>'),
     Plant("heavy tool", 'pos="0 0 0.03" gravcomp="1"', 'pos="0 0 0.03"'),
     Plant("far grip", '<site name="grip"/>', '<site name="grip" pos="0 0 0.2"/>'),

@@ -32,39 +32,12 @@ _SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
 
 
 def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields options that the bridge replaces, and concerns from loading the scene.
+    """Yields a time step that is not the run's, and concerns from loading the scene.
 
-    The scene runs, but not as it did in a viewer; the remedy writes down the options that it runs
-    with.
+    Integrator, solver and flags that a run needs are set when the scene is loaded
+    (``Scene.changes``), so that they are no faults.
     """
     option, places = case.source.spec.option, case.places
-    if option.integrator != mujoco.mjtIntegrator.mjINT_DISCRETE:
-        name = str(mujoco.mjtIntegrator(option.integrator).name).removeprefix("mjINT_")
-        yield Fault(
-            "integrator",
-            places.option("integrator"),
-            f"the scene has integrator {name}, under which a coupling is not passive; it runs "
-            "under 'discrete'",
-            places.option_change("integrator", "discrete"),
-        )
-    if option.solver != mujoco.mjtSolver.mjSOL_NEWTON:
-        name = str(mujoco.mjtSolver(option.solver).name).removeprefix("mjSOL_")
-        yield Fault(
-            "solver",
-            places.option("solver"),
-            f"the scene has solver {name}; it runs with Newton's",
-            places.option_change("solver", "Newton"),
-        )
-    if not option.enableflags & mujoco.mjtEnableBit.mjENBL_DIAGEXACT:
-        yield Fault(
-            "diagexact",
-            places.flag(),
-            "flag diagexact is not set; it runs with it, because contacts that share a body "
-            "create energy without",
-            'diagexact="enable"'
-            if places.flag().element == "<flag>"
-            else '<flag diagexact="enable"/> in <option>',
-        )
     step = float(option.timestep)
     if not case.has_chosen_period and abs(step - case.period) > _SAME_STEP * case.period:
         yield Fault(
