@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, scene_file
 from scipy.spatial.transform import Rotation
 
@@ -346,11 +347,11 @@ def test_other_bodies_may_start_in_contact_and_tool_inside_cloth_may_not_as_is(
     assert "geom 'ball' and flex 'cloth'" in message
 
 
-def still_run(path: Path, **options: str) -> tuple[hb.Scene, np.ndarray, str]:
+def still_run(path: Path, contact: str | None = None) -> tuple[hb.Scene, NDArray[np.float64], str]:
     """Holds the device still for 1 s; returns scene, heights of the tool and verdict."""
     scene = load_scene(path)
     device = SimulatedDevice(path=Motion([0.0, 2.0], np.zeros((2, 3))))
-    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), **options) as bridge:
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), contact=contact) as bridge:
         summary = bridge.run(duration=1.0)
         ticks = bridge.latest_records(1000)
     return scene, ticks["tool_position"][:, 2].copy(), summary.environment
