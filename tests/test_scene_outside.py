@@ -251,7 +251,7 @@ def test_tool_that_the_device_cannot_hold_is_carried(
         assert re.fullmatch(
             r"weight of the tool: felt → carried \(it pulls with up to 1[01]\.\d N, and the device "
             r"holds 10 N\)",
-            *said,
+            "".join(said),
         )
         assert abs(in_hand) < 0.2  # it has inertia still, and the hand moves
         model = mujoco.MjModel.from_xml_string(text)
