@@ -29,7 +29,7 @@ from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
 from hapticbridge.scene.handle import measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
-from hapticbridge.theory.compensation import (
+from hapticbridge.theory.bounds import (
     IMPLICIT_SHARE,
     MIDPOINT_SHARE,
     effective_damping,
@@ -152,7 +152,7 @@ class Method:
             CouplingError: The time step is not finite and > 0.
 
         References:
-            ``theory.compensation``.
+            ``theory.bounds``.
         """
         return self._with_damping(coupling, timestep, law_damping)
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.energy import EnergyBalance, energy_balances
-from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.state import AuditState
+from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.wrench_limits import AuditedBlock
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock

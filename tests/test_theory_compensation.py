@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.theory.compensation import (
+from hapticbridge.theory.bounds import (
     effective_damping,
     largest_effective_damping,
     law_damping,

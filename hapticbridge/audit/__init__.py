@@ -4,9 +4,9 @@ Read ``verdict`` first; its function decide() alone names the verdict. The audit
 file is whole (``structure``), computes the energies again in plain NumPy (``energy``), checks the
 wrench against the coupling law (``motion``) and the guard's limits (``wrench_limits``), the time
 that the run kept (``timing``), that no part contradicts another (``agreement``), and simulates the
-scene again (``replay``). ``state`` is carried from block to block, ``events`` reads external
-actions during the run, ``report`` holds the result, ``batch`` audits folders. Heavy imports are
-deferred to the first call.
+scene again (``replay``). ``events`` holds the external actions of the run and the state that goes
+from block to block, ``report`` the result, ``batch`` audits folders. Heavy imports are deferred to
+the first call.
 """
 
 from __future__ import annotations

@@ -14,9 +14,8 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.motion import Array, Motion, turn_between
-from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.state import AuditState
+from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.record import TickFlag, has_flag
 
 Array = NDArray[np.float64]

@@ -17,10 +17,9 @@ from hapticbridge.audit.agreement import (
     metadata_statements,
 )
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
-from hapticbridge.audit.events import AuditedRun, RunEvents
+from hapticbridge.audit.events import AuditedRun, AuditState, RunEvents
 from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation
 from hapticbridge.audit.report import AuditReport, Verdict
-from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import (
     TOLERANCE,
     Fault,

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.audit.events import RunEvents
+from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.motion import (
     Array,
     Motion,
@@ -28,7 +28,6 @@ from hapticbridge.audit.motion import (
     turn_between,
     wrench_by_law,
 )
-from hapticbridge.audit.state import AuditState
 from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import UNITS, TickFlag, has_flag

@@ -20,7 +20,7 @@ from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.theory.compensation import largest_effective_damping, law_damping
+from hapticbridge.theory.bounds import largest_effective_damping, law_damping
 from hapticbridge.theory.transfer import scalar
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (

@@ -19,7 +19,7 @@ In contact, half a wrench that is one step late would create energy. The tool th
 the implicit form before it touches, and back after it has been free for ``HOLDOFF`` ticks. Both
 changes keep S. B' is equal on both sides, so one device condition covers both. If B' were larger in
 contact, a device with just enough damping for free motion would bounce off the wall again and again
-(``theory.compensation``).
+(``theory.bounds``).
 
 Springs and dampers of the tool's joints and tendons are taken at the midpoint too
 (``kernel.springs``).

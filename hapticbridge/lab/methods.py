@@ -19,7 +19,7 @@ from hapticbridge.kernel.law import Gains, no_gains
 from hapticbridge.rendering import METHODS, Method
 from hapticbridge.scene.checks import check_massless_tool
 from hapticbridge.scene.handle import check_weldable
-from hapticbridge.theory.compensation import IMPLICIT_SHARE
+from hapticbridge.theory.bounds import IMPLICIT_SHARE
 
 __all__ = ["METHODS", "THEORIES"]
 

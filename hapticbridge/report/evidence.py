@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.energy import energy_balances
-from hapticbridge.audit.events import AuditedRun
-from hapticbridge.audit.state import AuditState
+from hapticbridge.audit.events import AuditedRun, AuditState
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError

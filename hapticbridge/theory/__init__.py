@@ -1,21 +1,21 @@
 """Theory of passive haptic display, without MuJoCo.
 
 Device damping: ``transfer`` holds the sampled coupling, ``spectrum`` the damping needed at each
-frequency, ``bounds`` its supremum (also with delay and in several dimensions). ``sampled_loop``
-finds the same limit in the time domain with the worst hand. ``virtual_mass`` treats the tool's
-integrator, ``compensation`` the damping rendered by each method, ``transmission_line`` a wave-based
-law. ``device_limits`` (quantisation, friction, a free device) bounds a ``z_width``.
+frequency, ``bounds`` its supremum (also with delay) and the damping that each method adds.
+``sampled_loop`` finds the same limit in the time domain with the worst hand. ``virtual_mass``
+treats the tool's integrator, ``transmission_line`` a wave-based law. ``device_limits``
+(quantisation, friction, a free device) bounds a ``z_width``.
 
 Reference mechanics: ``rigid_body`` moves a body by four integrators of known energy and a mass
 behind the coupling; ``impact`` is Routh's method with three laws of restitution.
 """
 
+from hapticbridge.theory.bounds import effective_damping as effective_damping
+from hapticbridge.theory.bounds import law_damping as law_damping
 from hapticbridge.theory.bounds import maximum_stiffness as maximum_stiffness
 from hapticbridge.theory.bounds import minimum_damping as minimum_damping
 from hapticbridge.theory.bounds import stiffest_coupling as stiffest_coupling
 from hapticbridge.theory.bounds import worst_frequency as worst_frequency
-from hapticbridge.theory.compensation import effective_damping as effective_damping
-from hapticbridge.theory.compensation import law_damping as law_damping
 from hapticbridge.theory.device_limits import QuantizationLimit as QuantizationLimit
 from hapticbridge.theory.device_limits import free_device_damping as free_device_damping
 from hapticbridge.theory.device_limits import free_device_stiffness as free_device_stiffness
