@@ -422,7 +422,10 @@ TOO_FAST = SimulatedDevice(friction=0.1, hand=Hand(mass=0, stiffness=1e12))
             "tuned to a period of 0.001 s, the loop's is 0.002 s",
         ),
         (lambda: SimulatedDevice(hand=WORST, friction=0.1), "friction = 0.1 N"),
-        (lambda: SimulatedDevice(hand=Hand(), rotational_hand=WORST), "rotational_hand"),
+        (
+            lambda: SimulatedDevice(hand=Hand(), rotational_hand=WORST),
+            "a worst hand in translation too",
+        ),
     ],
 )
 def test_bad_parameters_are_refused(build: Callable[[], object], words: str) -> None:

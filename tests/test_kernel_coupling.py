@@ -173,5 +173,5 @@ def test_invalid_gains_are_refused_by_name_and_only_the_stiffness_must_not_be_ze
 ) -> None:
     values = dict.fromkeys(GAINS, 0.0) | {"stiffness": 1.0}
     Coupling(**values)
-    with pytest.raises(CouplingError, match=f"coupling {name} is"):
+    with pytest.raises(CouplingError, match=f"coupling {name.replace('_', ' ')} is"):
         Coupling(**{**values, name: value})

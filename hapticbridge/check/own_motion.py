@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from hapticbridge.check.observe import Setting, quiet, rehearse
+from hapticbridge.check.observe import Setting, quiet, rehearsal_parameters
 from hapticbridge.coupling import Coupling
-from hapticbridge.errors import SceneError
+from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.scene import SceneSource, compile_scene, plain_model
+from hapticbridge.scene import Scene, SceneSource, compile_scene, plain_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.units import format_si
 
@@ -113,11 +116,7 @@ def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | 
         mujoco.mj_comPos(model, data)
         alone = data.xipos.copy()
         scene = compile_scene(source, grip, warns=False, checks_start=False)
-        still = np.zeros(max(round(SECONDS / setting.period), 1), SAMPLE_DTYPE)
-        still["quaternion"][:, 0] = 1.0
-        try:
-            rehearse(scene, still, replace(setting, coupling=NO_HAND))
-        except SceneError:
+        if not _has_moved_alone(scene, replace(setting, coupling=NO_HAND)):
             return OwnMotion("", math.inf, 0.0, step)
     data.qpos[:] = scene.data.qpos
     mujoco.mj_kinematics(model, data)
@@ -127,6 +126,27 @@ def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | 
     most = int(np.argmax(apart / np.maximum(LEAST, SHARE * moved)))
     name = str(model.body(most).name) or str(most)
     return OwnMotion(name, float(apart[most]), float(moved[most]), step)
+
+
+def _has_moved_alone(scene: Scene, setting: Setting) -> bool:
+    """Moves a scene by its ticks in the bridge; returns False if it diverges."""
+    binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
+    state, row, step = binding.state, binding.row, binding.step
+    still, period = np.zeros(1, SAMPLE_DTYPE), setting.period
+    still["quaternion"][:, 0] = 1.0
+    before = direct(before_step, state, still, row, 0, period)
+    after = direct(after_step, state, row, 0)
+    try:
+        for _ in range(max(round(SECONDS / period), 1)):
+            for substep in range(setting.substeps):
+                if before(state, still, row, substep, period) != OK:
+                    return False
+                step(scene.model, scene.data)
+                if after(state, row, substep) != OK:
+                    return False
+    finally:
+        binding.release()
+    return True
 
 
 def own_substeps(source: SceneSource, grip: str, period: float) -> tuple[int, OwnMotion | None]:

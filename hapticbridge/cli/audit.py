@@ -104,7 +104,7 @@ _USUAL_EVENTS = ("start", "stop", "input")
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """Judge recorded runs offline: passive, unverified, active or invalid, and why.
+    """Judge recorded runs offline: passive, active, unverified, and why.
 
     Several recordings, a folder (searched through and through) or a pattern give a table, sorted by
     the margin: the least share left, of the slack and of the device's damping; negative beyond the

@@ -24,7 +24,7 @@ COMMANDS = {
     "run": "Put a scene behind a haptic device and feel it.",
     "scenes": "List the scenes, or the parameters of one.",
     "check": "Find what is wrong with a scene, and what a tick of it costs.",
-    "audit": "Judge recorded runs offline: passive, unverified, active or invalid, and why.",
+    "audit": "Judge recorded runs offline: passive, active, unverified, and why.",
     "view": "Show a recorded run in a browser.",
     "render": "Draw a recorded run: a picture, or a film of it.",
     "compare": "Find the first tick and field where two runs differ.",
