@@ -147,6 +147,8 @@ def _allow(seconds: float) -> None:
         used = resource.getrusage(resource.RUSAGE_SELF)
         until = int(used.ru_utime + used.ru_stime + seconds) + 1
         _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+        if hard != resource.RLIM_INFINITY:
+            until = min(until, hard)
         resource.setrlimit(resource.RLIMIT_CPU, (until, hard))
 
 
