@@ -185,11 +185,11 @@ def scene_statements(
 ) -> Iterator[Statement]:
     """Yields what the scene determines; ``is_exact`` is False for another processor's."""
     meta, source = recording.meta, "the attached sources"
-    for name, derived in (
-        ("scene_parameters", scene.parameters),
-        ("scene_changes", list(scene.changes)),
-    ):
-        yield Statement(f"metadata '{name}'", _json(meta, name), derived, source)
+    values, changes = _json(meta, "scene_parameters"), _json(meta, "scene_changes")
+    yield Statement("metadata 'scene_parameters'", values, scene.parameters, source)
+    yield Statement(
+        "metadata 'scene_changes'", _reasoned(changes), _reasoned(scene.changes), source
+    )
     parameters = run.parameters
     state = recording.attachments.get(STATE_ATTACHMENT, b"")
     start = start_state(scene.model, scene.data)
@@ -214,6 +214,13 @@ def scene_statements(
     for name, given, expected in pairs:
         if not _agrees(given, expected, is_exact=is_exact):
             yield Statement(f"metadata '{name}'", given, expected, source)
+
+
+def _reasoned(changes: Any) -> Any:
+    """Returns changes of a scene without the reason in brackets, which may be the user's wish."""
+    if not isinstance(changes, (list, tuple)):
+        return changes
+    return [str(change).partition(" (")[0] for change in changes]
 
 
 def _agrees(stated: Any, derived: Any, *, is_exact: bool) -> bool:
