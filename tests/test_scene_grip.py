@@ -74,7 +74,7 @@ def test_run_that_holds_a_point_of_a_body_is_simulated_again(tmp_path: Path, cal
     code, out, err = call("run", str(path), "--grip", "hand@.04,0,.02", *options)
     assert (code, "passive" in out) == (0, True), err
     changes = ["integrator: Euler → discrete", "noslip_iterations: 2 → 0"]
-    assert f"options changed in the scene: {', '.join(changes)}" in err
+    assert all(f"changed in the scene: {change}" in err for change in changes)
     assert json.loads(hb.read_recording(file).meta["scene_changes"]) == changes
     report = hb.audit(file)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
