@@ -63,7 +63,8 @@ def test_stiffness_is_of_the_cone(tmp_path: Path, cone: str, condim: int, fricti
     path = hand_rows([(0.3, (0.0, 0.0, -0.003)), (0.5, (0.0, 0.0, -0.003))])
     option = GOOD_OPTION.replace("elliptic", cone)
     world = f'<geom name="floor" type="plane" size="1 1 1" {rubs}/>'
-    case = case_of(written(tmp_path, mjcf(option, body=tool, world=world), path))
+    scene = written(tmp_path, mjcf(option, body=tool, world=world), path)
+    case = case_of(scene, contact="scene")
     assert case.observation is not None
     ((pair, seen),) = case.observation.meetings.items()
     force = float(case.observation.force[-1])  # at rest since 0.5 s
@@ -81,7 +82,7 @@ def test_nothing_that_pushes_back_lets_a_force_sink_for_ever() -> None:
 
 @pytest.mark.parametrize("name", ["virtual_wall", "drawer"])
 def test_stiffness_seen_in_a_motion_is_that_of_the_settings(name: str) -> None:
-    case = case_of(scene_path(name))
+    case = case_of(scene_path(name), contact="scene")
     assert case.observation is not None
     ((pair, seen),) = list(case.observation.meetings.items())[:1]
     model = case.model

@@ -26,6 +26,7 @@ from hapticbridge.errors import SceneError
 from hapticbridge.scene import read_scene
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
+OWN_CONTACT = Setting(COUPLING, contact="scene")
 OPTION = '<option gravity="0 0 0" cone="elliptic"/>'
 CONTACT = 'solref="0.002 1" solimp="0.9 0.95 0.001"'
 
@@ -114,16 +115,21 @@ def ball_on_floor(condim: int = 6) -> str:
         ("condim 3", TWIST, IS_FELT),
         ("condim 4", TWIST, MAY_GO),
         ("condim 4", ROLL, IS_FELT),
-        ("pyramidal cone", PRESS, MAY_GO),
-        ("pyramidal cone", SLIDE, IS_FELT),
     ],
 )
 def test_unfelt_friction_goes(tmp_path: Path, name: str, motion: Motion, expected: str) -> None:
     assert judged(draft_of(tmp_path, ball_on_floor()), motion, name).verdict == expected
 
 
+def test_unfelt_cone_goes_and_stays_where_the_run_makes_it_elliptic(tmp_path: Path) -> None:
+    draft = draft_of(tmp_path, ball_on_floor(), OWN_CONTACT)
+    assert judged(draft, PRESS, "pyramidal cone").verdict == MAY_GO
+    assert judged(draft, SLIDE, "pyramidal cone").verdict == IS_FELT
+    assert tried(draft_of(tmp_path, ball_on_floor()), PRESS, "pyramidal cone") is None
+
+
 def test_contact_dimensions_that_are_not_there_cannot_be_taken(tmp_path: Path) -> None:
-    draft = draft_of(tmp_path, ball_on_floor(condim=1))
+    draft = draft_of(tmp_path, ball_on_floor(condim=1), OWN_CONTACT)
     for name in ("no friction", "condim 3", "condim 4", "pyramidal cone"):
         assert tried(draft, PRESS, name) is None
 
@@ -167,23 +173,30 @@ def test_motion_that_a_scene_does_not_survive_is_refused(tmp_path: Path) -> None
     assert witness(draft_of(tmp_path, mjcf(OPTION, body=tool.format("1"))), up).near == set()
 
 
-def shipped(name: str) -> tuple[SceneVariant, Motion]:
-    draft = variant(name)
+def shipped(name: str, setting: Setting | None = None) -> tuple[SceneVariant, Motion]:
+    draft = variant(name, setting)
     motion = motion_for(draft.compiled())
     assert motion is not None
     return draft, motion
 
 
 def test_solver_may_stop_where_it_has_arrived_and_nothing_may_be_less_passive() -> None:
-    draft, motion = shipped("peg_in_hole")
+    draft, motion = shipped("peg_in_hole", OWN_CONTACT)
     assert judged(draft, motion, "5 iterations", budget=0.1).verdict == MAY_GO
     assert judged(draft, motion, "1 iteration", budget=0.1).verdict == IS_FELT
     trial = judged(draft, motion, "no friction", budget=10.0)
     assert (trial.verdict, trial.environment) == (lean.CREATES, "within slack")
 
 
+def test_solver_limit_stays_where_the_run_raises_it() -> None:
+    draft, motion = shipped("peg_in_hole")
+    limits = [name for name in all_of(draft, motion) if "iteration" in name]
+    assert limits
+    assert not any(tried(draft, motion, name) for name in limits)
+
+
 def test_what_makes_mujoco_warn_is_refused_though_within_budget() -> None:
-    draft, motion = shipped("hammer")
+    draft, motion = shipped("hammer", OWN_CONTACT)
     trial = judged(draft, motion, "2 iterations", budget=10.0)
     assert trial.verdict == lean.WARNS
     assert trial.warnings > 0
@@ -311,7 +324,8 @@ def test_substeps_go_where_they_were_not_needed(tmp_path: Path) -> None:
     draft = draft_of(tmp_path, ball_on_floor(), setting)
     slow = through((1.0, (0.02, 0, 0.01), NOWHERE))
     assert judged(draft, slow, "1 substep").verdict == MAY_GO
-    assert judged(draft, SLIDE, "1 substep", budget=0.1).verdict == IS_FELT
+    strike = through((0.03, (0, 0, -0.004), NOWHERE), (0.1, (0.01, 0.006, -0.004), NOWHERE))
+    assert judged(draft, strike, "1 substep", budget=0.1).verdict == IS_FELT
 
 
 def test_change_that_saves_nothing_is_not_taken(tmp_path: Path) -> None:

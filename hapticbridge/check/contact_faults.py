@@ -67,7 +67,8 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
-            if is_cone and is_cone_reported:  # one option changes it for all contacts
+            # one option changes it for all contacts, and rigid ones have an elliptic cone anyway
+            if is_cone and (is_cone_reported or case.contact == "rigid"):
                 continue
             is_cone_reported |= is_cone
             yield Fault(

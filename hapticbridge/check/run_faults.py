@@ -111,6 +111,8 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         return
     if seen.full_ticks:
         limit = int(case.model.opt.iterations)
+        if case.contact == RIGID:  # which raises a lower limit to MuJoCo's
+            limit = max(limit, ITERATIONS)
         yield Fault(
             "solver iterations",
             option("iterations"),

@@ -65,9 +65,10 @@ def solver_simplifications(seen: MotionTrace) -> list[Simplification]:
 def _iterations(count: int, used: int) -> Simplification:
     def limit(draft: SceneVariant) -> bool:
         option = draft.spec.option
-        changed = option.iterations > count
-        option.iterations = min(option.iterations, count)
-        return bool(changed)
+        if draft.setting.contact == "rigid" or option.iterations <= count:
+            return False  # rigid contact raises the limit again
+        option.iterations = count
+        return True
 
     name = f"{count} iteration{'s' * (count > 1)}"
     return Simplification(name, f"the solver stops after {count} of up to {used}", limit)
@@ -160,8 +161,8 @@ def _condim(most: int, name: str, sentence: str) -> Simplification:
 
 def _make_pyramidal(draft: SceneVariant) -> bool:
     spec = draft.spec
-    if spec.option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        return False
+    if draft.setting.contact == "rigid" or spec.option.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return False  # rigid contact makes the cone elliptic again
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     rubbing = [geom for geom in spec.geoms if collides(geom) and geom.condim > 1]
     return bool(rubbing) or any(pair.condim > 1 for pair in spec.pairs)
