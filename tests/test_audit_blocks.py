@@ -14,9 +14,10 @@ from recording_cases import random_rows, same, write
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo, SimulatedDevice
+from hapticbridge.device import SimulatedDevice, device_for
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import open_recording, read_recording, reader
+from hapticbridge.scene import load_scene
 
 TOO_STIFF = Coupling(9000, 0.5, 1, 1e-3)
 
@@ -68,11 +69,11 @@ def test_a_device_that_answers_late_is_judged_alike_where_blocks_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a late device is given depends on motion that stands in the next block."""
-    path = tmp_path / "late.mcap"
-    late = DeviceInfo.from_json(SimulatedDevice().info.to_json())
-    recorded(path, "virtual_wall", "simulated:damping=0.5", TOO_STIFF, duration=0.5)
-    meta = {"device": replace(late, damping=0.5, delay=3e-3).to_json()}
-    path = rewritten(read_recording(path), tmp_path / "told.mcap", meta=meta)
+    path, scene = tmp_path / "late.mcap", load_scene("virtual_wall")
+    late = device_for(scene, "simulated:damping=0.5")
+    assert isinstance(late, SimulatedDevice)
+    late.info = replace(late.info, delay=3e-3)
+    recorded(path, scene, late, TOO_STIFF, duration=0.5)
     whole = audit(path)
     assert (whole.verdict, whole.port) == ("active", "device")
     for size in (2, 40):
