@@ -108,6 +108,10 @@ LAYOUTS: dict[str, Layout] = {
         "shared/a.stl": stl_bytes(),
         "common.xml": PART.format(LOW),
     },
+    "out of its folder and back": {
+        "scenes/main.xml": mjcf(MESH.format("../scenes/meshes/a.stl"), body=MESHED),
+        "scenes/meshes/a.stl": stl_bytes(),
+    },
     "comments and names that only MuJoCo's parser accepts": {
         "main.xml": "<!-- a -- b <include file='gone.xml'/> -->\n"
         + mjcf(MESH.format("R&D.stl"), "<include file='a&amp;b.xml'/>", body=MESHED),

@@ -81,7 +81,8 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
     if main is None and parameters.is_file():
         found.setdefault(_key(parameters), parameters)
     root = path.absolute().parent
-    while not all(file.is_relative_to(root) for file in found) and root != root.parent:
+    passed = [folder for file in found.values() for folder in _left_folders(file)]
+    while not all(file.is_relative_to(root) for file in (*found, *passed)) and root != root.parent:
         root = root.parent
     names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in found)
     return tuple(
@@ -166,6 +167,17 @@ def _key(path: Path) -> Path:
         else:
             parts.append(part)
     return Path(*parts)
+
+
+def _left_folders(path: Path) -> Iterator[Path]:
+    """Yields the folders to which each ``..`` of a path leads, as in ``../objects/peg.stl``."""
+    parts: list[str] = []
+    for part in path.absolute().parts:
+        if part == "..":
+            del parts[-1:]
+            yield Path(*parts)
+        else:
+            parts.append(part)
 
 
 def _expanded(
