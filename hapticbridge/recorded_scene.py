@@ -116,6 +116,8 @@ def _work_and_exit(work: Work, folder: str, answer: int) -> None:
         found, code = json.dumps(work(_allow)).encode(), _DONE
     except RecordingError as error:
         found, code = json.dumps(str(error)).encode(), _REFUSED
+        if "allocate memory" in str(error):  # MuJoCo's words
+            found, code = b"", _NO_MEMORY
     except MemoryError:
         code = _NO_MEMORY
     except BaseException as error:
@@ -154,7 +156,10 @@ def _allow(seconds: float) -> None:
 
 def _death(code: int) -> str:
     if code == _NO_MEMORY:
-        return f"needs more than {MEMORY >> 20} MB of memory"
+        return (
+            f"needs more than {MEMORY >> 20} MB of memory; audit --in-process sets no limit, for a "
+            "scene that you trust"
+        )
     if sys.platform != "win32" and code == -signal.SIGXCPU:
         return "needs too much processor time"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"

@@ -71,7 +71,7 @@ BOMBS: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
         before_world(b'<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>'),
         "made MuJoCo fail",
     ),
-    "6.4 GB of state": (SCENE, before_world(b'<size memory="6400M"/>'), "allocate memory"),
+    "6.4 GB of state": (SCENE, before_world(b'<size memory="6400M"/>'), "needs more than"),
     "a device as a mesh": (
         SCENE,
         before_world(b'<asset><mesh name="m" file="/dev/zero"/></asset>'),
