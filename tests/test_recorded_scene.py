@@ -64,7 +64,7 @@ BOMBS: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
             b"<worldbody>" + 5 * GRID + b'<geom size=".1"/>' + 5 * b"</replicate>",
             1,
         ),
-        "made MuJoCo fail",
+        "made MuJoCo fail|needs too much processor time",  # as fast as the machine is
     ),
     "40 000 x 40 000 height field": (
         SCENE,
@@ -101,7 +101,7 @@ def test_a_hostile_scene_ends_in_a_sentence_with_little_time_and_memory(
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     reason = told(path)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert words in reason
+    assert any(each in reason for each in words.split("|"))
     assert "\n" not in reason and str(tmp_path.parent) not in reason.replace(str(path), "")
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < PROCESSOR_TIME
     # a child begins as large as its parent; the largest one so far counts
