@@ -95,7 +95,7 @@ the velocity that is left in the rows of friction."""
 
 _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 
-_LAST_ROWS = int(mujoco.mjtEq.mjEQ_TENDON)
+LAST_RIGID = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
 
 _PARAMETERS = (
@@ -145,7 +145,7 @@ def bind_contact(
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
-    is_rigid = model.eq_type <= _LAST_ROWS
+    is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
         contact["row_capacity"] = (
@@ -232,7 +232,7 @@ def _parameters_of(s: State, kind: int) -> tuple[int, int, int, int]:
 def _is_held(s: State, kind: int, i: int) -> bool:
     """Returns True for a row of a limit or of an equality constraint that is rigid."""
     if kind == EQUALITY:
-        return bool(ints(s.contact.eq_type, i + 1)[i] <= _LAST_ROWS)
+        return bool(ints(s.contact.eq_type, i + 1)[i] <= LAST_RIGID)
     return bool(kind in (LIMIT_JOINT, LIMIT_TENDON))
 
 
