@@ -8,7 +8,9 @@ Each contact has a wanted normal velocity at the end of the step, in m/s,
 h is the time step in s, v the relative velocity at the start, μ|v_t| = sqrt(Σ (μ_j v_j)²) over the
 rows of friction and σ the share of the depenetration. The convex cone lifts a contact by μ times
 its sliding, which is subtracted; the impulse that stops the normal velocity v_n slows the sliding
-first. The wanted velocities of the friction rows are 0. MuJoCo's convex problem, with the
+first. A point that still sinks by more than ``SUNK``, as the corner of a box does that stops more
+than slides, is aimed again with the sliding that is left at the end of the step. The wanted
+velocities of the friction rows are 0. MuJoCo's convex problem, with the
 regularisation R of each row, then gives impulses h λ with
 
     C = h λᵀ J v⁺ = h λᵀ ŵ − h² λᵀ R λ   <=   Σ_{p>0} (σ β p/h)² / (4 R)
@@ -81,6 +83,13 @@ LARGEST_MARGIN = 5e-3
 """Largest margin in m that a geom's speed adds, that of 5 m/s at 1 ms. A faster geom may be first
 seen in penetration, which the tank then pays for."""
 
+SUNK = 5e-6
+"""Depth in m by which a sliding contact may sink in a step before the step is repeated. A smaller
+value repeats more steps; most sinks of an impact are above it."""
+
+MOST_CORRECTIONS = 3
+"""Largest number of such repetitions of a step."""
+
 SPENDABLE = 0.9
 """Largest share of the tank that one tick spends, without unit. The rest covers the remainder of
 the integration."""
@@ -120,6 +129,7 @@ RIGID_DTYPE = np.dtype(
         ("repetitions", "<i8"),
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
+        ("corrections", "<i8"),
         ("row_capacity", "<i8"),
         *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
@@ -128,15 +138,17 @@ RIGID_DTYPE = np.dtype(
         ("tank", "<f8"),
         ("cap", "<f8"),
         ("last_energy", "<f8"),
+        ("lift", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
-last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of limits and equality
-constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
-of copies, and of the rows' own positions. Of margins: addresses and counts of the geoms that move,
-of pairs, and of the bodies' velocities."""
+last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
+repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it. Of limits
+and equality constraints: largest count of rows (0 if there are none), and addresses of the model's
+parameters, of copies, and of the rows' own positions. Of margins: addresses and counts of the geoms
+that move, of pairs, and of the bodies' velocities."""
 
 
 def bind_contact(
@@ -189,22 +201,29 @@ def _aim(s: State) -> None:
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
     contacts = pointer_at(mj.contact)
+    s.contact.lift = 0.0
     for c in range(ints(mj.ncon, 1)[0]):
         contact = contacts + c * mj.contact_size
         row = ints(contact + mj.contact_row, 1)[0]
         if row < 0:
             continue
         friction = floats(contact + mj.contact_friction, 5)
-        slide = 0.0
+        slide, rest = 0.0, 0.0
         for j in range(1, ints(contact + mj.contact_dim, 1)[0]):
             slide += (friction[j - 1] * velocities[row + j]) ** 2
+            if s.contact.corrections > 0:
+                rest += (friction[j - 1] * _end_velocity(s, row + j)) ** 2
         distance = floats(contact + mj.contact_distance, 1)[0]
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
         if s.energy.mocap_has_moved:
             opened = max(opened_by_mocap(s, contact), 0.0)
             wanted -= max(opened - max(distance, 0.0), 0.0) / h
         stop = max(wanted - velocities[row], 0.0)
-        wanted -= max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
+        lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
+        if s.contact.corrections > 0:
+            lift = min(lift, math.sqrt(rest))
+        s.contact.lift = max(s.contact.lift, lift)
+        wanted -= lift
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         solref = floats(contact + mj.contact_solref, 2)
@@ -300,6 +319,7 @@ def aim_contacts(s: State) -> None:
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.share = 1.0 if has_energy else 0.0
+        contact.corrections = 0
         _aim(s)
         contact.is_aimed = 1
 
@@ -328,14 +348,52 @@ def returned_energy(s: State) -> float:
 
 
 @compiled
-def lower_share(s: State) -> bool:
-    """Aims at less depenetration if the step that just ended spent more than the tank allows.
+def _end_velocity(s: State, row: int) -> float:
+    """Returns J v⁺ of a row of the step that just ended, in m/s."""
+    mj, h = s.mj, s.run.timestep
+    velocity = floats(pointer_at(mj.efc_vel), row + 1)[row]
+    reference = floats(pointer_at(mj.efc_aref), row + 1)[row]
+    regularisation = floats(pointer_at(mj.efc_R), row + 1)[row]
+    force = floats(pointer_at(mj.efc_force), row + 1)[row]
+    return float(velocity + h * (reference - regularisation * force))
+
+
+@compiled
+def _has_sunk(s: State) -> bool:
+    """Returns True if a contact sank in the step because it slid less than at the start."""
+    mj, h = s.mj, s.run.timestep
+    if h * s.contact.lift <= SUNK or s.contact.corrections >= MOST_CORRECTIONS:
+        return False
+    contacts = pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = contacts + c * mj.contact_size
+        row = ints(contact + mj.contact_row, 1)[0]
+        if row < 0 or ints(contact + mj.contact_dim, 1)[0] == 1:
+            continue
+        gap = max(floats(contact + mj.contact_distance, 1)[0], 0.0)
+        if gap + h * _end_velocity(s, row) < -SUNK:
+            return True
+    return False
+
+
+@compiled
+def aim_again(s: State) -> bool:
+    """Corrects what the step that just ended aimed at: less sinking, or less depenetration.
+
+    Contacts that sank aim higher. If the step spent more than the tank allows, the share is lower.
 
     Returns:
         True if it did; the step must then be repeated.
     """
     contact = s.contact
-    if not contact.is_aimed or contact.share <= 0.0:
+    if not contact.is_aimed:
+        return False
+    if _has_sunk(s):
+        contact.corrections += 1
+        contact.repetitions += 1
+        _aim(s)
+        return True
+    if contact.share <= 0.0:
         return False
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
