@@ -491,6 +491,12 @@ LIGHT = 0.1
 """Wrench in N and N m below which changes are measured against it. A tool that rests on a table
 has no load to compare with."""
 
+MAX_WORK, LEAST_STEPS = 6e5, 100
+"""Largest work of one rehearsal in degrees of freedom and constraint rows, summed over its steps,
+and the steps that it always takes. A unit costs 3 to 7 µs: a scene of 130 takes all steps, one of
+400 half of them. More would let heavy scenes start later; a limit in seconds would give another
+start on another machine, and the audit could not repeat it."""
+
 TRIAL_STEPS = 50
 """Steps in which a load must prove better than none. A longer trial would judge the motion of a
 tool that hangs on its grip, not its start."""
@@ -518,19 +524,25 @@ class Rehearsal:
     def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
         """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
 
+        It ends early if the scene diverges, or after ``MAX_WORK``.
+
         Args:
             handle: Pose of the handle.
-            count: Number of steps.
+            count: Largest number of steps.
         """
         data = self.data
         data.mocap_pos[self._handle], data.mocap_quat[self._handle] = handle[:3], handle[3:]
         bound = BoundKernel(self.model, data, self._parameters)
         record, step = bound.state[0], bound.step
-        finish = direct(finish_contacts, record)
+        finish, work = direct(finish_contacts, record), 0
         try:
-            for _ in range(count):
+            for done in range(count):
                 step(self.model, data)
                 finish(record)
+                work += self.model.nv + data.nefc
+                is_long = work > MAX_WORK and done >= LEAST_STEPS
+                if is_long or not np.isfinite(data.qvel).all():
+                    return
                 yield data.actuator_force[self._outputs].copy()
         finally:
             bound.release()
@@ -604,8 +616,9 @@ def start_handle(
     has_spring, strays = stiffness > 0.0, []
     for pose in poses:
         wrenches = np.array(list(Rehearsal(scene, parameters).steps(pose, TRIAL_STEPS)))
-        change = (wrenches - wrenches[0])[:, has_spring]
-        strays.append(float((change**2 / stiffness[has_spring]).sum(axis=1).max()))
+        change = (wrenches - wrenches[:1]).reshape(-1, 6)[:, has_spring]
+        strayed = (change**2 / stiffness[has_spring]).sum(axis=1)
+        strays.append(float(strayed.max()) if len(wrenches) == TRIAL_STEPS else math.inf)
     return poses[int(np.argmin(strays))]
 
 
@@ -630,7 +643,7 @@ def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool =
     try:
         scene.model.opt.gravity *= has_weight
         steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
-        return max(float(np.linalg.norm(wrench[:3])) for wrench in steps)
+        return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
     finally:
         scene.model.opt.gravity = gravity
 

@@ -20,6 +20,7 @@ from hapticbridge.check.observe import Observation, Setting
 from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
 from hapticbridge.rendering import RIGID
+from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
@@ -68,7 +69,8 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a fault if the scene alone moves noticeably differently than its file says."""
     if case.refused:
         return  # the file's own scene does not compile
-    found = own_motion(case.source, case.scene.grip, Setting(case.coupling, case.period))
+    scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
+    found = own_motion(case.source, scene, Setting(case.coupling, case.period))
     if found is not None and found.jnd > 1.0:
         yield Fault(
             "own motion", case.places.option("timestep"), str(found), found.remedy(case.period)
