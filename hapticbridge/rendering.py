@@ -27,7 +27,7 @@ from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
-from hapticbridge.scene.handle import measured_weld
+from hapticbridge.scene.handle import PROBE, measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.theory.bounds import (
     IMPLICIT_SHARE,
@@ -646,6 +646,89 @@ def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool =
         return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
     finally:
         scene.model.opt.gravity = gravity
+
+
+TIPPED = 0.1
+"""Distance in m by which the grip of a tool that topples is moved, that of a hand that lets it go.
+Farther away a tool pulls more, and one that a device can hold longer would be carried."""
+
+SLOWEST_TOPPLING = 1.0
+"""Rate in 1/s from which a tool topples. A hand leads a slower one, such as a pole of 15 m."""
+
+LEAST_LEVER = 1e-3
+"""Way of the grip over the way of the joints in a mode, in m, below which the mode leaves the grip
+where it is, and the hand cannot feel it."""
+
+RESTING = 1.0
+"""Acceleration in m/s² of a grip, a tenth of gravity's, below which a tool without hand stands."""
+
+
+def toppling_force(scene: Scene, parameters: RunParameters) -> float:
+    """Returns the largest force in N with which a tool pulls once it has toppled in the hand.
+
+    A tool stands without a hand if no contact or other constraint holds it and its grip hardly
+    accelerates. It topples if the stiffness of its tree, of gravity, springs and servos but without
+    the coupling,
+
+        K_t = −∂Q/∂q,    K_t φ = λ M φ,    rate = √−λ
+
+    has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. The
+    handle then holds the grip at ``TIPPED`` along the fastest mode φ. Zero if it does not topple,
+    or the mode does not move the grip.
+
+    Args:
+        scene: The prepared scene, at its start; it is not changed.
+        parameters: Parameters of the run.
+    """
+    rehearsal, site = Rehearsal(scene, parameters), scene.model.site(scene.grip).id
+    model, data = rehearsal.model, rehearsal.data
+    dofs = np.flatnonzero(tree_of_tool(model, int(model.site_bodyid[site])).dofs)
+    jacobian, mass = np.zeros((3, model.nv)), np.zeros((model.nv, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, site)
+    is_held = np.any(data.qfrc_constraint[dofs])
+    if is_held or np.linalg.norm(jacobian[:, dofs] @ data.qacc[dofs]) > RESTING:
+        return 0.0
+    mujoco.mj_fullM(model, data, mass)
+    root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(dofs, dofs)]))
+    stiffness = root @ _stiffness_without_hand(model, data, dofs) @ root.T
+    squares, modes = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
+    mode = np.zeros(model.nv)
+    mode[dofs] = root.T @ modes[:, 0]
+    way = float(np.linalg.norm(jacobian @ mode))
+    if squares[0] > -(SLOWEST_TOPPLING**2) or way < LEAST_LEVER * float(np.linalg.norm(mode)):
+        return 0.0
+    mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
+    mujoco.mj_kinematics(model, data)
+    orientation = np.zeros(4)
+    mujoco.mju_mat2Quat(orientation, data.site_xmat[site])
+    handle = (*data.site_xpos[site].tolist(), *orientation.tolist())
+    steps = rehearsal.steps(handle, HOLDING_STEPS)
+    return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
+
+
+def _stiffness_without_hand(
+    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Returns −∂Q/∂q of some degrees of freedom at rest, without the coupling."""
+    start, own, columns = data.qpos.copy(), list(coupling_ids(model)), []
+    bias = model.actuator_biasprm[own].copy()
+    model.actuator_biasprm[own] = 0.0
+    try:
+        for unit in np.eye(model.nv)[dofs]:
+            forces = []
+            for size in (-PROBE, PROBE):
+                data.qpos[:] = start
+                mujoco.mj_integratePos(model, data.qpos, unit, size)
+                for stage in (mujoco.mj_fwdKinematics, mujoco.mj_transmission):
+                    stage(model, data)
+                mujoco.mj_fwdVelocity(model, data)
+                mujoco.mj_fwdActuation(model, data)
+                forces.append((data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator)[dofs])
+            columns.append((forces[0] - forces[1]) / (2.0 * PROBE))
+    finally:
+        model.actuator_biasprm[own] = bias
+        data.qpos[:] = start
+    return np.array(columns).T
 
 
 def loaded_handle(

@@ -293,6 +293,31 @@ def test_force_of_a_motor_is_not_taken_for_weight(tmp_path: Path) -> None:
         assert not bridge.scene.is_carried  # 15 N at an arm of 0.1 m, with or without gravity
 
 
+@pytest.mark.parametrize(
+    ("mass", "end", "is_carried"), [(5.0, 0.6, True), (0.5, 0.6, False), (5.0, -0.6, False)]
+)
+def test_heavy_pole_that_topples_in_the_hand_is_carried(
+    tmp_path: Path, mass: float, end: float, *, is_carried: bool
+) -> None:
+    """A rod of 0.6 m on a hinge, held at its middle; 0.1 m beside it pulls with m g tan 19.5°."""
+    text = f"""<mujoco><worldbody><body><joint axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 {end}" size="0.02" mass="{mass}"/>
+      <site name="grip" pos="0 0 {end / 2}"/></body></worldbody></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        said = [change for change in bridge.scene.changes if "weight" in change]
+        bridge.run(duration=2.0)
+    assert bool(said) == is_carried
+    if is_carried:
+        reason = re.search(
+            r"stands upright and topples: 0\.1 m beside, .* ([\d.]+) N, and", said[0]
+        )
+        assert reason
+        pull = mass * WEIGHT * np.tan(np.arcsin(0.1 / 0.3))
+        assert float(reason[1]) == pytest.approx(pull, rel=0.1)
+        with pytest.raises(hb.SceneError, match="topples"), started(tmp_path, text, as_is=True):
+            pass
+
+
 FLOPPY = """<mujoco>
   <worldbody>
     <body name="trunk" pos="0 0 1">
