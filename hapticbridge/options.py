@@ -415,7 +415,7 @@ class RunSetup:
             reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
         elif (force := self._sent(toppling_force(scene, parameters))) > most:
             reason = (
-                f"it stands upright and topples: {TIPPED:g} m beside, it pulls with up to "
+                f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
                 f"{force:.3g} N, and the device holds {most:.3g} N"
             )
         else:

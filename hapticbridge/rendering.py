@@ -664,7 +664,7 @@ RESTING = 1.0
 
 
 def toppling_force(scene: Scene, parameters: RunParameters) -> float:
-    """Returns the largest force in N with which a tool pulls once it has toppled in the hand.
+    """Returns the force in N with which a still hand holds a tool that has toppled in it.
 
     A tool stands without a hand if no contact or other constraint holds it and its grip hardly
     accelerates. It topples if the stiffness of its tree, of gravity, springs and servos but without
@@ -702,8 +702,8 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
     orientation = np.zeros(4)
     mujoco.mju_mat2Quat(orientation, data.site_xmat[site])
     handle = (*data.site_xpos[site].tolist(), *orientation.tolist())
-    steps = rehearsal.steps(handle, HOLDING_STEPS)
-    return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
+    wrenches = np.array(list(rehearsal.steps(handle, HOLDING_STEPS)))
+    return float(np.linalg.norm(wrenches.reshape(-1, 6)[:, :3].mean(axis=0)))  # it swings
 
 
 def _stiffness_without_hand(

@@ -67,14 +67,14 @@ class OwnMotion:
         """The difference as a sentence."""
         if math.isinf(self.apart):
             return (
-                f"without a hand, the scene diverges here within {self.seconds:.2g} s, and not under "
-                f"the file's own options (time step {format_si(self.step, 's')})"
+                f"without a hand, the scene diverges here within {self.seconds:.2g} s, and not "
+                f"under the file's own options (time step {format_si(self.step, 's')})"
             )
         return (
             f"without a hand, '{self.body}' is after {self.seconds:.2g} s "
             f"{format_si(self.apart, 'm')} from where the file's own options take it "
-            f"({format_si(self.moved, 'm')} from its start, time step {format_si(self.step, 's')}): {self.jnd:.2g} just noticeable "
-            "differences"
+            f"({format_si(self.moved, 'm')} from its start, time step "
+            f"{format_si(self.step, 's')}): {self.jnd:.2g} just noticeable differences"
         )
 
     def remedy(self, period: float) -> str:
