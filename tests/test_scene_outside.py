@@ -450,3 +450,22 @@ def test_body_welded_to_a_moved_mocap_body_follows_and_its_mover_pays(tmp_path: 
         assert bridge.scene.data.body("x").xpos[2] == pytest.approx(0.1999, abs=6e-4)
         weight = 0.2 * 9.81 * 0.0999
         assert bridge.ledger.external_work == pytest.approx(weight, rel=0.02)
+
+
+@pytest.mark.parametrize(("solref", "solimp", "hertz"), [("0.01 1", 0.25, 9.2), ("0.02 1", 0.9, 0)])
+def test_equality_meant_as_a_spring_is_announced_where_it_becomes_rigid(
+    tmp_path: Path, solref: str, solimp: float, hertz: float
+) -> None:
+    """ω² = d/(1 − d)/(timeconst dampratio)²; MuJoCo's default is stiffer."""
+    text = f"""<mujoco><worldbody><body name="m" mocap="true" pos="0 .1 .1"/>{_BALL}</worldbody>
+      <equality><weld name="spring" body1="m" body2="t" relpose="0 -.1 0 1 0 0 0"
+        solref="{solref}" solimp="{solimp} {solimp} 0.001"/></equality></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        said = [change for change in bridge.scene.changes if "equality" in change]
+        bridge.run(duration=0.1)
+    assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+    assert len(said) == bool(hertz)
+    if hertz:
+        assert f"'spring': a spring of {hertz:g} Hz → rigid (--contact scene keeps it" in said[0]
+        with started(tmp_path, text, contact="scene") as bridge:
+            assert not any("equality" in change for change in bridge.scene.changes)
