@@ -81,3 +81,24 @@ def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
     assert (code, "10 MuJoCo steps per tick" in err) == (0, True)
     code, _, err = call(*command, "--substeps", 1)
     assert (code, "stretch limit" in err) == (3, True)
+
+
+SPINNING = """<mujoco><option gravity="0 0 0"/><worldbody>
+<body><joint axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
+<body pos=".3 0 0"><joint axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .2 0 .1" size=".02" mass=".5"/></body></body>
+<body name="t" pos="0 1 0"><freejoint/><geom size=".02" mass=".1"/><site name="grip"/></body>
+</worldbody><keyframe><key name="home" qpos="0 0 0 1 0 1 0 0 0" qvel="{0} {1} 0 0 0 0 0 0"/>
+</keyframe></mujoco>"""
+"""An arm of two joints without friction beside the tool."""
+
+
+def test_energy_that_fast_joints_create_is_told_with_its_size(tmp_path: Path) -> None:
+    created = []
+    for substeps in (1, 2, 4):
+        found = moved(scene(tmp_path, SPINNING.format(8, 20)), substeps)
+        assert "fast joints" in found.creation
+        created.append(found.created)
+    assert 1.8 < created[0] / created[1] < 2.2  # in proportion to the step
+    assert 1.8 < created[1] / created[2] < 2.2
+    assert not moved(scene(tmp_path, SPINNING.format(0, 0.5))).creation

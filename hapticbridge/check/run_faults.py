@@ -71,10 +71,11 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         return  # the file's own scene does not compile
     scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
     found = own_motion(case.source, scene, Setting(case.coupling, case.period))
+    place = case.places.option("timestep")
     if found is not None and found.jnd > 1.0:
-        yield Fault(
-            "own motion", case.places.option("timestep"), str(found), found.remedy(case.period)
-        )
+        yield Fault("own motion", place, str(found), found.remedy(case.period))
+    if found is not None and found.creation:
+        yield Fault("own motion", place, found.creation, "--substeps, or slower joints")
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

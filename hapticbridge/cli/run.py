@@ -401,6 +401,8 @@ class Run:
             )
         elif moved is not None and moved.jnd > 1.0:
             notify(f"{moved}; {moved.remedy(period)}")
+        if moved is not None and moved.creation:
+            notify(moved.creation)
         return count
 
     def _feel(
