@@ -50,6 +50,7 @@ from hapticbridge.kernel.parameters import (
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import wants_real_time
 from hapticbridge.rendering import (
+    TIPPED,
     Method,
     default_method,
     holding_force,
@@ -58,6 +59,7 @@ from hapticbridge.rendering import (
     resolve_contact_stiffness,
     start_handle,
     static_load,
+    toppling_force,
 )
 from hapticbridge.scene import Scene
 
@@ -418,7 +420,8 @@ class RunSetup:
         """Returns the parameters of a run that starts now and whose device can hold the tool.
 
         If a still hand would need more than the device's force limit because of the tool's weight,
-        the weight is carried, which replaces the scene's model.
+        or if the tool topples in a moving one and then pulls more, the weight is carried, which
+        replaces the scene's model.
 
         Args:
             start: As for ``parameters``.
@@ -429,13 +432,20 @@ class RunSetup:
             HapticBridgeError: A value is out of range.
         """
         parameters, scene, most = self.parameters(start, effective), self.scene, self.limits.force
-        is_held = not self.method.has_law or self.info.is_prescribed or scene.is_carried
-        if is_held or (force := self._sent(holding_force(scene, parameters))) <= most:
+        if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
             return parameters
-        weightless = self._sent(holding_force(scene, parameters, has_weight=False))
-        if weightless > max(most, force / 2):
-            return parameters  # motors or springs push, more than the weight
-        reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        if (force := self._sent(holding_force(scene, parameters))) > most:
+            weightless = self._sent(holding_force(scene, parameters, has_weight=False))
+            if weightless > max(most, force / 2):
+                return parameters  # motors or springs push, more than the weight
+            reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        elif (force := self._sent(toppling_force(scene, parameters))) > most:
+            reason = (
+                f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
+                f"{force:.3g} N, and the device holds {most:.3g} N"
+            )
+        else:
+            return parameters
         if scene.as_is:
             raise SceneError(
                 f"the tool is too heavy ({reason}): let its weight be carried (--no-tool-weight, "

@@ -114,15 +114,16 @@ def _work_and_exit(work: Work, folder: str, answer: int) -> None:
         tempfile.tempdir = folder
         _limit_this_process()
         found, code = json.dumps(work(_allow)).encode(), _DONE
-    except RecordingError as error:
-        found, code = json.dumps(str(error)).encode(), _REFUSED
-        if "allocate memory" in str(error):  # MuJoCo's words
-            found, code = b"", _NO_MEMORY
     except MemoryError:
         code = _NO_MEMORY
     except BaseException as error:
-        words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        found, code = json.dumps(words).encode(), _FAILED
+        is_refusal = isinstance(error, RecordingError)
+        words = str(error)
+        if not is_refusal:
+            words = " ".join(f"{type(error).__name__}: {words}".split())[:200]
+        found, code = json.dumps(words).encode(), _REFUSED if is_refusal else _FAILED
+        if "allocate memory" in words:  # MuJoCo's
+            found, code = b"", _NO_MEMORY
     finally:
         while found:
             found = found[os.write(answer, found) :]

@@ -19,6 +19,7 @@ from hapticbridge.check.model_faults import constraint_faults, geometry_faults, 
 from hapticbridge.check.observe import Observation
 from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
+from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
@@ -67,11 +68,13 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a fault if the scene alone moves noticeably differently than its file says."""
     if case.refused:
         return  # the file's own scene does not compile
-    found = own_motion(case.source, case.scene.grip, case.setting)
+    scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
+    found = own_motion(case.source, scene, case.setting)
+    place = case.places.option("timestep")
     if found is not None and found.jnd > 1.0:
-        yield Fault(
-            "own motion", case.places.option("timestep"), str(found), found.remedy(case.setting)
-        )
+        yield Fault("own motion", place, str(found), found.remedy(case.setting))
+    if found is not None and found.creation:
+        yield Fault("own motion", place, found.creation, "--substeps, or slower joints")
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

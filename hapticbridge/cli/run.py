@@ -375,25 +375,26 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        source = read_scene(self.scene, **settings_from(self.settings))
-        scene = compile_scene(source, self.grip, as_is=self.as_is)
-        chosen = (
-            self
-            if self.substeps is not None
-            else replace(self, substeps=self._own_substeps(source))
-        )
+        with err.status("reading and trying the scene …"):
+            source = read_scene(self.scene, **settings_from(self.settings))
+            scene = compile_scene(source, self.grip, as_is=self.as_is)
+            chosen = (
+                self
+                if self.substeps is not None
+                else replace(self, substeps=self._own_substeps(source, scene))
+            )
         with ExitStack() as stack:
             callbacks = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
             return chosen._feel(scene, device, clock, stack, window, callbacks)
 
-    def _own_substeps(self, source: SceneSource) -> int:
+    def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.method is not None:
             return 1
         setting = Setting(NO_HAND, period_of(self.rate), contact=self.contact or "rigid")
-        count, moved = own_substeps(source, self.grip, setting)
+        count, moved = own_substeps(source, scene, setting)
         if count > 1:
             notify(
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
@@ -401,6 +402,8 @@ class Run:
             )
         elif moved is not None and moved.jnd > 1.0:
             notify(f"{moved}; {moved.remedy(setting)}")
+        if moved is not None and moved.creation:
+            notify(moved.creation)
         return count
 
     def _feel(
