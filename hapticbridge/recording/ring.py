@@ -134,17 +134,12 @@ def _opened(path: str | Path, flags: int) -> int:
     file = os.open(path, flags | _GUARDED, 0o600)
     if sys.platform == "win32":
         return file
-    try:
-        found = os.fstat(file)
-        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid():
-            raise OSError(errno.EPERM, "it is not a file of this user")
-        if flags & os.O_CREAT:
-            os.fchmod(file, 0o600)
-        elif found.st_mode & 0o022:
-            raise OSError(errno.EPERM, "other users can write it")
-    except BaseException:
+    found = os.fstat(file)
+    if flags & os.O_CREAT:
+        os.fchmod(file, 0o600)
+    elif not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
         os.close(file)
-        raise
+        raise OSError(errno.EPERM, "it is not a file that this user alone can write")
     return file
 
 
