@@ -304,7 +304,8 @@ def fault_of(folder: Path) -> str:
     the folder or one above it.
     """
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for each in (*reversed(folder.parents), folder):
+            each.mkdir(mode=0o700, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             return f"'{folder}' cannot be written"
         if sys.platform == "win32":
