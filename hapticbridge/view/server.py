@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import viser
+import viser._gui_handles
 import viser._messages
 import websockets.asyncio.server
 from websockets.datastructures import Headers
@@ -52,6 +53,8 @@ def serve(address: Address) -> viser.ViserServer:
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     _take_values_alone(server)
+    # viser would read any file of this user that an image in a text names
+    viser._gui_handles._parse_markdown = lambda text, _: text
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     return server
