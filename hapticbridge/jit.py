@@ -51,11 +51,13 @@ def _digest(function: Callable[..., object], *more: object) -> str:
     only the file of the function that it loads. Code and constants are those in memory: a file may
     have changed since it was imported.
     """
-    texts, found = [repr((_environment(), more))], [cast(FunctionType, function)]
-    for each in found:
-        text, callees = _ingredients(each)
+    texts, left = [_environment(), repr(more)], [cast(FunctionType, function)]
+    found = set(left)
+    while left:
+        text, callees = _ingredients(left.pop())
         texts.append(text)
-        found += (callee for callee in callees if callee not in found)
+        left += (callee for callee in dict.fromkeys(callees) if callee not in found)
+        found.update(callees)
     return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
@@ -99,8 +101,9 @@ def _content(value: object) -> object:
         return sorted(map(repr, value))
     if isinstance(value, bool | int | float | str | bytes | np.generic | np.dtype):
         return type(value).__qualname__, repr(value)
-    # a module, a class or what numba knows by a name; the versions of packages are counted
-    return type(value).__qualname__, getattr(value, "__name__", "")
+    # a module, a class or a C function; the versions of packages are counted
+    names = "__name__", "_fields", "symbol", "sig"
+    return type(value).__qualname__, [str(getattr(value, name, "")) for name in names]
 
 
 @cache
