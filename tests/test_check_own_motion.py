@@ -52,7 +52,9 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
     found = moved(scene(tmp_path, SWING.format(step=0.01, integrator="implicitfast")))
     assert found.jnd > 5.0
     assert found.body == "swing"
-    assert "--rate 100" in found.remedy(PERIOD)
+    assert "--rate 100" in found.remedy(Setting(NO_HAND, PERIOD))
+    assert "--contact scene" in found.remedy(Setting(NO_HAND, 0.01))
+    assert "--substeps" in found.remedy(Setting(NO_HAND, 0.01, contact="scene"))
     for step in (0.0002, 0.001):
         assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
 
@@ -60,12 +62,12 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
 def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
     needs = scene(tmp_path, FILTER)
     assert moved(needs).jnd > 1.0
-    substeps, found = own_substeps(needs, "grip", PERIOD)
+    substeps, found = own_substeps(needs, "grip", Setting(NO_HAND, PERIOD))
     assert substeps == 10
     assert found is not None
     assert found.jnd < 1.0
     does_not = scene(tmp_path, SWING.format(step=0.0002, integrator="RK4"))
-    assert own_substeps(does_not, "grip", PERIOD)[0] == 1
+    assert own_substeps(does_not, "grip", Setting(NO_HAND, PERIOD))[0] == 1
 
 
 def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) -> None:

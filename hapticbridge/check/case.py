@@ -22,7 +22,7 @@ from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import default_method
+from hapticbridge.rendering import RIGID, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
@@ -139,6 +139,16 @@ class SceneUnderCheck:
     def model(self) -> mujoco.MjModel:
         """Compiled scene with handle, at its running time step."""
         return self.scene.model
+
+    @property
+    def is_rigid(self) -> bool:
+        """True if contacts, limits and equality constraints are rigid in the run."""
+        return self.contact == RIGID
+
+    @property
+    def setting(self) -> Setting:
+        """Coupling, period and contact of the run."""
+        return Setting(self.coupling, self.period, contact=self.contact)
 
     @property
     def law(self) -> Coupling:

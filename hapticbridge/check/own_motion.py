@@ -16,6 +16,7 @@ from hapticbridge.kernel.parameters import MAX_SUBSTEPS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.rendering import RIGID
 from hapticbridge.scene import Scene, SceneSource, compile_scene, plain_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.units import format_si
@@ -68,13 +69,16 @@ class OwnMotion:
             "differences"
         )
 
-    def remedy(self, period: float) -> str:
-        """Returns advice for a run with period T in s."""
+    def remedy(self, setting: Setting) -> str:
+        """Returns advice for a run with a setting."""
+        period = setting.period
         if self.step > (1.0 + ROUNDING) * period:
             return f"--rate {1.0 / self.step:g} takes the file's own time step"
         if self.step < (1.0 - ROUNDING) * period:
             return f"--substeps {_substeps(self.step, period)} keeps the file's own time step"
-        return "--contact scene keeps the file's own contacts"
+        if setting.contact == RIGID:
+            return "--contact scene keeps the file's own contacts"
+        return "a shorter time step (--rate or --substeps) brings the two closer"
 
 
 def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | None:
@@ -149,7 +153,7 @@ def _has_moved_alone(scene: Scene, setting: Setting) -> bool:
     return True
 
 
-def own_substeps(source: SceneSource, grip: str, period: float) -> tuple[int, OwnMotion | None]:
+def own_substeps(source: SceneSource, grip: str, setting: Setting) -> tuple[int, OwnMotion | None]:
     """Returns the substeps that keep the file's own time step, and the motion with them.
 
     There is one if the file's step is not shorter than T, or if its motion does not differ
@@ -158,16 +162,16 @@ def own_substeps(source: SceneSource, grip: str, period: float) -> tuple[int, Ow
     Args:
         source: The scene; it is not changed.
         grip: Site, ``BODY`` or ``BODY@x,y,z``.
-        period: T in s.
+        setting: Period and contact; coupling and substeps are not used.
 
     Raises:
         SceneError: The scene does not compile.
     """
-    one = own_motion(source, grip, Setting(NO_HAND, period))
-    count = _substeps(source.spec.option.timestep, period)
+    one = own_motion(source, grip, replace(setting, substeps=1))
+    count = _substeps(source.spec.option.timestep, setting.period)
     if one is None or one.jnd <= 1.0 or count <= 1:
         return 1, one
-    more = own_motion(source, grip, Setting(NO_HAND, period, count))
+    more = own_motion(source, grip, replace(setting, substeps=count))
     return (count, more) if more is not None and more.jnd < one.jnd else (1, one)
 
 

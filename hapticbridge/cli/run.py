@@ -17,7 +17,8 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
-from hapticbridge.check.own_motion import own_substeps
+from hapticbridge.check.observe import Setting
+from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -391,15 +392,15 @@ class Run:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.method is not None:
             return 1
-        period = period_of(self.rate)
-        count, moved = own_substeps(source, self.grip, period)
+        setting = Setting(NO_HAND, period_of(self.rate), contact=self.contact or "rigid")
+        count, moved = own_substeps(source, self.grip, setting)
         if count > 1:
             notify(
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
                 "scene alone would move noticeably differently (--substeps 1 takes one)"
             )
         elif moved is not None and moved.jnd > 1.0:
-            notify(f"{moved}; {moved.remedy(period)}")
+            notify(f"{moved}; {moved.remedy(setting)}")
         return count
 
     def _feel(
