@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.check.physics import matrix_of
+from hapticbridge.files import printable
 from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import RunCoupling
@@ -273,6 +275,18 @@ def linear(colour: ArrayLike) -> tuple[int, int, int]:
     return red, green, blue
 
 
+def quoted(text: object) -> str:
+    """Writes a text that is not of this program for a page of viser, which reads Markdown.
+
+    Names and reasons may come from a foreign scene. Between more backticks than it holds, a text
+    is shown as it is: no markup, link, image or HTML in it counts.
+    """
+    line = printable(str(text))
+    longest = max(map(len, re.findall("`+", line)), default=0)
+    fence = "`" * (longest + 1)
+    return f"{fence} {line} {fence}"
+
+
 class Page:
     """Draws instants of one run on viser's page.
 
@@ -299,7 +313,7 @@ class Page:
         self._extent, self._strongest = float(model.stat.extent), 0.0
         self._build_scene(model)
         self._ghost = Ghost(server.scene, model, parameters.grip)
-        server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
+        server.gui.set_panel_label(printable(f"hapticbridge: {facts.get('scene', '')}"))
         self.status = server.gui.add_markdown("waiting for the first tick")
         self._caption = _caption(model, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []

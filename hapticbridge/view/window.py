@@ -6,6 +6,7 @@ import contextlib
 import hmac
 import importlib.util
 import json
+import re
 import secrets
 import subprocess
 import sys
@@ -32,7 +33,7 @@ HOST = "127.0.0.1"
 PATIENCE = 2.0
 """Longest wait in s for the process to end. The run is over by then, and the force is zero."""
 
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?")
 
 _BOOTSTRAP = """
 import sys
@@ -46,9 +47,10 @@ run()
 class Address:
     """The port of a page on this machine, and the token that admits a visitor.
 
-    Other users of the machine reach the port, too; without the token they are refused. A browser
-    also sends requests that a foreign page made it send. Those carry that page's Origin or, where
-    a name was bound anew to this machine, a foreign Host; both are refused. From another machine,
+    Other users of the machine reach the port, too; without the token they are refused. The address
+    carries it once: the browser is sent on without it, and keeps a cookie. A browser also sends
+    requests that a foreign page made it send. Those carry that page's Origin or, where a name was
+    bound anew to this machine, a foreign Host; both are refused. From another machine,
     ``ssh -L 8080:localhost:8080 MACHINE`` leads to the page.
 
     Attributes:
@@ -78,16 +80,13 @@ class Address:
         """
         lower = {name.lower(): value for name, value in headers.items()}
         host = lower.get("host", "")
-        try:
-            name = urlsplit(f"http://{host}").hostname
-        except ValueError:
-            name = None
-        if name not in _LOOPBACK:
+        if not _LOOPBACK.fullmatch(host):
             return "this is not the host of this page"
         origin = lower.get("origin")
         if origin is not None and origin != f"http://{host}":
             return "a request made by another page is refused"
-        if not (self.is_in_query(path) or self._is_in_cookie(host, lower.get("cookie", ""))):
+        is_shown = self.is_in_query(path) and "upgrade" not in lower  # a socket has the cookie
+        if not (is_shown or self._is_in_cookie(host, lower.get("cookie", ""))):
             return "the token is missing or wrong; open the address that hapticbridge printed"
         return ""
 
