@@ -91,14 +91,21 @@ def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
     assert not list(tmp_path.glob("*LOG*"))
 
 
-SIGNALS = pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+ENDINGS = {
+    "SIGINT": (130, "interrupted"),
+    "SIGTERM": (143, "stopped by SIGTERM"),
+    "SIGHUP": (129, "stopped by SIGHUP"),
+}
+"""Exit code and sentence of a signal that comes before the first tick."""
+
+SIGNALS = pytest.mark.parametrize("name", ENDINGS)
 
 
 @pytest.fixture
 def unheeded() -> Iterator[list[int]]:
     """What Python's own handler would have got; that would end the tests with this one."""
     got: list[int] = []
-    numbers = signal.SIGINT, signal.SIGTERM
+    numbers = [signal.Signals[name] for name in ENDINGS]
     before = {each: signal.signal(each, lambda number, _: got.append(number)) for each in numbers}
     yield got
     for each, handler in before.items():
@@ -128,15 +135,15 @@ def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     monkeypatch.setattr(f"hapticbridge.{moment}", signalled)
     code, out, err = call("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
     assert device.is_closed and not np.any(device.writes) and not unheeded
-    if moment == "session.prepare":
-        assert (code, out, err.splitlines()[-1]) == (130, "", "interrupted")
+    if moment in {"session.prepare", "bridge.Bridge.run"}:  # before the first tick
+        ending = *ENDINGS[name], ""
+        assert (code, err.splitlines()[-1], out) == ending
+        assert not path.exists()
         return
-    ticks, words = (0, "signal") if moment.endswith("run") else (10, "duration")
-    assert (code, f"{ticks} ticks ({words})" in out) == (0, True)
+    assert (code, "10 ticks (duration)" in out) == (0, True)
     recording = read_recording(path)
-    assert not recording.is_cut and len(recording.ticks) == ticks and device.writes
-    assert recording.events[-1]["reason"] == words
-    assert recording.events[-1].get("signal", name) == name
+    assert not recording.is_cut and len(recording.ticks) == 10 and device.writes
+    assert recording.events[-1]["reason"] == "duration"
 
 
 @SIGNALS
@@ -163,7 +170,7 @@ def test_a_signal_while_a_device_is_measured_leaves_no_force(
     device = ScriptedDevice(sway, on_write=strike)
     monkeypatch.setattr(f"hapticbridge.cli.{module}.open_device", lambda *_, **__: device)
     code, _, err = call(*arguments)
-    assert (code, err.splitlines()[-1]) == (130, "interrupted")
+    assert (code, err.splitlines()[-1]) == ENDINGS[name]
     assert struck
     assert not device.writes[-1].any() and device.is_closed
     assert not unheeded
