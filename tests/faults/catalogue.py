@@ -363,7 +363,7 @@ def _suspended(rig: Rig) -> None:
     rig.around, rig.device.corrupt = around, corrupt
 
 
-_SPECTATOR = """
+SPECTATOR = """
 import json, sys, time
 sys.path.insert(0, sys.argv[1])
 from hapticbridge.recording import Ring
@@ -384,7 +384,7 @@ def _watched(how: int) -> Callable[[Rig], None]:
     def do(rig: Rig) -> None:
         def around(stack: ExitStack) -> None:
             stack.enter_context(patch("hapticbridge.view.window.check_view"))
-            stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", _SPECTATOR))
+            stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", SPECTATOR))
             rig.options["observer"] = window = Window(Address(0))
 
             def act(bridge: Bridge, tick: int) -> None:
