@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import HEAD, TAIL, Ring
+from hapticbridge.recording import ring as ring_module
 
 
 def numbered(start: int, stop: int) -> NDArray[np.void]:
@@ -203,3 +204,22 @@ def test_what_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
         for capacity in (0, -1):
             with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
                 make(capacity)
+
+
+def test_a_fence_releases_a_lock_before_it_acquires_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On ARMv8 this order alone is a full barrier: acquiring, then releasing, lets both sides in.
+
+    The machines of these tests are x86, where each of them is one.
+    """
+    steps: list[str] = []
+
+    class Noting:
+        def __enter__(self) -> None:
+            steps.append("acquire")
+
+        def __exit__(self, *_: object) -> None:
+            steps.append("release")
+
+    monkeypatch.setattr(ring_module, "ORDER", Noting())
+    ring_module.fence()
+    assert "acquire" in steps[steps.index("release") :]

@@ -41,11 +41,9 @@ REASONS = {
     "identify/identify.py: clock.wait()": "a clock's: at most one period",
     "identify/z_width.py: self.clock.wait()": "a clock's: at most one period",
     "realtime/doctor.py: wait()": "a clock's: at most one period",
-    "realtime/doctor.py: sleep(left * 1e-09)": "to the doctor's next period, for its duration",
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
     "device/watchdog.py: select.select([ready], [], [], START_PATIENCE)": "its last argument",
-    "device/watchdog.py: ready.read(1)": "select says that it is there",
     # records, and the processes that read them
     "recording/recorder.py: for line in answers": f"{DAEMON} longer than STANDSTILL",
     "recording/recorder_process.py: for line in stream": DAEMON,

@@ -78,8 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             code = _execute(words[0], words[1:])
     except KeyboardInterrupt as interrupt:
-        words, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
-        print(words, file=sys.stderr)
+        sentence, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
+        print(sentence, file=sys.stderr)
     except SafetyTrip as trip:
         from hapticbridge.guard import with_remedy  # noqa: PLC0415 - imports numba
 
