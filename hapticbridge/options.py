@@ -11,11 +11,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TypedDict, cast
+from typing import Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import default_coupling, required_axis_damping
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
@@ -91,9 +92,11 @@ class Workspace:
 
     def __post_init__(self) -> None:
         for name, value in zip(("scale", "force scale"), self.scales, strict=True):
-            if not math.isfinite(value) or value <= 0:
-                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+            if not is_number(value) or not 0 < value < math.inf:
+                raise HapticBridgeError(f"{name} is {shown(value)}; it must be finite and > 0")
         object.__setattr__(self, "axes", rotation_numbers(self.axes))
+        if not isinstance(self.absolute, bool):
+            raise HapticBridgeError(f"absolute is {shown(self.absolute)}; it must be True or False")
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -108,6 +111,23 @@ class Workspace:
 
 SAME_FRAME = Workspace()
 """Workspace with equal axes and scales; the device starts at the grip."""
+
+
+_FLAG, _FLAG_OR_NONE, _NAME = bool, bool | None, str | None
+_WORDS: dict[Any, str] = {
+    _FLAG: "True or False",
+    _FLAG_OR_NONE: "True, False or None",
+    _NAME: "a name, or None for the default",
+    Workspace: "a Workspace",
+    Limits | None: "Limits, or None for the device's own",
+}
+_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("i_know", "tool_weight", "live"), _FLAG),
+    **dict.fromkeys(("realtime", "pipelined"), _FLAG_OR_NONE),
+    **dict.fromkeys(("method", "contact", "controller"), _NAME),
+    "workspace": Workspace,
+    "limits": Limits | None,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,6 +186,12 @@ class BridgeOptions:
     live: bool = False
 
     def __post_init__(self) -> None:
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise HapticBridgeError(
+                    f"{name.replace('_', ' ')} is {shown(value)}; it must be {_WORDS[kind]}"
+                )
         period_of(self.rate)
         refuse_substeps(self.rendering_method.scheme, checked_substeps(self.substeps))
         if self.controller is not None and self.controller not in CONTROLLERS:
