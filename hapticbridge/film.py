@@ -213,12 +213,12 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
     finally:
         watch.cancel()
         process.kill()
-        process.wait()  # Ctrl-C can leave Popen without waiting for the process
+        process.wait(PATIENCE)  # Ctrl-C can leave Popen without waiting for the process
 
 
-def _follow(lines: IO[str], watch: threading.Timer, progress: Progress | None) -> bool:
+def _follow(answers: IO[str], watch: threading.Timer, progress: Progress | None) -> bool:
     is_ready = False
-    for line in lines:
+    for line in answers:
         if not line.startswith("{"):  # drivers print, too
             continue
         answer = json.loads(line)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import HEAD, TAIL, Ring
+from hapticbridge.recording import ring as ring_module
 
 
 def numbered(start: int, stop: int) -> NDArray[np.void]:
@@ -291,3 +292,22 @@ def test_a_segment_that_others_can_write_is_not_mapped(shared: Ring, mode: int) 
     Path(str(shared.name)).chmod(mode)
     with pytest.raises(RecordingError, match="this user alone"):
         Ring.attach(str(shared.name))
+
+
+def test_a_fence_releases_a_lock_before_it_acquires_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On ARMv8 this order alone is a full barrier: acquiring, then releasing, lets both sides in.
+
+    The machines of these tests are x86, where each of them is one.
+    """
+    steps: list[str] = []
+
+    class Noting:
+        def __enter__(self) -> None:
+            steps.append("acquire")
+
+        def __exit__(self, *_: object) -> None:
+            steps.append("release")
+
+    monkeypatch.setattr(ring_module, "ORDER", Noting())
+    ring_module.fence()
+    assert "acquire" in steps[steps.index("release") :]

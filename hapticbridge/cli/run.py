@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from signal import Signals
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
@@ -35,7 +36,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
-from hapticbridge.signals import interrupting_on_signals
+from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
 
@@ -384,10 +385,10 @@ class Run:
                 else replace(self, substeps=self._own_substeps(source, scene))
             )
         with ExitStack() as stack:
-            callbacks = stack.enter_context(interrupting_on_signals())
+            interrupts = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return chosen._feel(scene, device, clock, stack, window, callbacks)
+            return chosen._feel(scene, device, clock, stack, window, interrupts)
 
     def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
@@ -413,7 +414,7 @@ class Run:
         clock: Clock,
         stack: ExitStack,
         window: Window | None,
-        callbacks: list[Callable[[str], None]],
+        interrupts: Interrupts,
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         options = self._options(device.info)
@@ -427,13 +428,15 @@ class Run:
             announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
-        callbacks.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
+        interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
             notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
         stack.close()
+        if not summary.ticks and (name := bridge.session.signal):
+            raise StopSignal(Signals[name])
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
             print_json(values | {"recording": str(self.record or "") or None})

@@ -166,7 +166,7 @@ class _Session:
     def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
         self.ring = Ring.attach(configuration["ring"])
         self._parent = configuration["parent"]
-        self._writer = None
+        self._writer, self._path = None, Path(configuration["path"] or "")
         if configuration["path"] is not None:
             self._writer = RecordingWriter(
                 configuration["path"],
@@ -203,6 +203,8 @@ class _Session:
             self._write_event({"event": "bridge_died", "tick": self._last_tick}, self._last_time)
         if self._writer is not None:
             self._writer.close()
+            if end == "died" and self._last_tick < 0:  # before its first tick
+                _remove_file(self._path)
         if self._live is not None:
             self._live.close()
 
@@ -240,6 +242,12 @@ class _Session:
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:
             self._writer.write_event(event, time_ns)
+
+
+def _remove_file(path: Path) -> None:
+    if path.is_file():
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:

@@ -65,16 +65,21 @@ def removed(name: str | None) -> None:
             Path(name).unlink()
 
 
-_ORDER = threading.Lock()
+ORDER = threading.Lock()
+"""Lock of ``fence``, free between its calls."""
 
 
 def fence() -> None:
-    """Orders the accesses to shared memory before and after it.
+    """Orders all accesses to shared memory before it and all after it (full barrier).
 
-    Python has no memory fence; acquiring and releasing a lock acts as one.
+    Python has no memory fence. On x86 one atomic operation is a full barrier. On ARMv8 acquiring
+    and releasing a lock is none: accesses from both sides may move into it and pass each other
+    there. A release followed by an acquisition is one (ARM's manual, B2.3: barrier-ordered-before),
+    so the lock is used twice. Not tested on ARM hardware.
     """
-    with _ORDER:
-        pass
+    for _ in range(2):
+        with ORDER:
+            pass
 
 
 def _created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:

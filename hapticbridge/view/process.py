@@ -159,7 +159,7 @@ def _follow(
     plotted, due, over = 0.0, time.monotonic(), ""
     while True:
         while not inbox.empty():
-            event = inbox.get()
+            event = inbox.get_nowait()
             if event is None:
                 return over
             over = over or _ending(event)
