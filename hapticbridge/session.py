@@ -38,6 +38,7 @@ from hapticbridge.options import RunSetup
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest, warn_of_refusals
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare
 from hapticbridge.run_description import attachments, describe_run, start_state
@@ -87,11 +88,13 @@ class RecordOutput:
         path: File of the recording; None records nothing.
         observer: Second reader of the records, such as ``view.Window``; None without one.
         live: True shows the state of the run on standard error.
+        signer: Key that signs the recording when it is closed; None leaves it unsigned.
     """
 
     path: Path | None = None
     observer: RingObserver | None = None
     live: bool = False
+    signer: Signer | None = None
 
     def open_stream(
         self, period: float, snapshot: Snapshot | None, *, may_wait: bool
@@ -252,7 +255,7 @@ class Session:
         if self._snapshot is not None:
             resources.callback(self._snapshot.close)
         self.stream = self.output.open_stream(setup.period, self._snapshot, may_wait=clock.may_wait)
-        resources.callback(self.stream.close)
+        resources.callback(self.stream.close, self.output.signer)
         sample = np.zeros(1, SAMPLE_DTYPE)
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.seal import DIGEST, Digest, seal_fault
 
 # Metadata, attachments, events and ticks of a container
 
@@ -48,7 +49,7 @@ class Contents:
         events: Payload and JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
-        digest: Digest stored in the file.
+        seal: Entries of the seal; None before it is read.
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events.
     """
@@ -59,7 +60,7 @@ class Contents:
     events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
-    digest: str | None = None
+    seal: dict[str, str] | None = None
     refusal: str | None = None
     keeps_events: bool = True
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
@@ -82,9 +83,9 @@ class Contents:
                 raise DamageError(f"there is a second metadata record '{name}'")
             self.meta = entries
         elif name == layout.DIGEST_NAME:
-            if self.digest is not None:
+            if self.seal is not None:
                 raise DamageError(f"there is a second metadata record '{name}'")
-            self.digest = entries.get(layout.DIGEST_KEY, "")
+            self.seal = entries
 
     def add_attachment(self, fields: Fields) -> None:
         """Adds an attachment.
@@ -192,6 +193,15 @@ class Contents:
         self.events.append((payload, event))
 
 
+_CUT = "the end of the file is missing ('hapticbridge repair' makes a whole file of the rest)"
+
+CUTTING_EVENTS = {
+    "bridge_died": "the bridge died during the run",
+    "recorder_died": "the recorder died during the run; the bridge wrote the file anew",
+    "repaired": "the file had lost its end and was repaired",
+}
+"""Events of a file that lacks the end of its run, with their meaning. No export leaves them out."""
+
 BLOCK = 1 << 14
 """Number of records per block: 16 s at 1 kHz, 6.5 MB. Larger blocks take more memory, smaller ones
 more time."""
@@ -212,10 +222,9 @@ class RecordingFile:
         attachments: Attached files by name.
         is_cut: True if the end of the file is missing because recorder or machine died; everything
             up to the last whole chunk is available.
-        digest: SHA-256 stored at the end, or None.
-        computed_digest: SHA-256 of the contents that were read.
-        problems: Damage, one sentence each; empty for an undamaged file, even a cut one. The caller
-            compares the two digests.
+        seal: Entries of the seal (``recording.seal``) at the end of the file; empty without one.
+        computed_seal: Digest, chain and index hash of what was read.
+        problems: Damage, one sentence each; empty for an undamaged file, even a cut one.
     """
 
     path: Path
@@ -227,9 +236,32 @@ class RecordingFile:
     meta: dict[str, str]
     attachments: dict[str, bytes] = field(repr=False)  # megabytes
     is_cut: bool
-    digest: str | None
-    computed_digest: str
-    problems: tuple[str, ...]
+    seal: Mapping[str, str] = field(default_factory=dict)
+    computed_seal: Mapping[str, str] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+
+    @property
+    def digest(self) -> str | None:
+        """SHA-256 stored at the end, or None."""
+        return self.seal.get(DIGEST)
+
+    @property
+    def computed_digest(self) -> str:
+        """SHA-256 of the contents that were read."""
+        return self.computed_seal[DIGEST]
+
+    @property
+    def seal_fault(self) -> str:
+        """Sentence if a whole file is not as it was sealed, else empty."""
+        return "" if self.is_cut else seal_fault(self.seal, self.computed_seal)
+
+    @property
+    def cut_sentence(self) -> str:
+        """Sentence if the run's end is or was missing in the file, else empty."""
+        found = [_CUT] if self.is_cut else []
+        names = {event.get("event") for event in self.events}
+        found += [words for name, words in CUTTING_EVENTS.items() if name in names]
+        return "; ".join(found)
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, in blocks of equal size (the last: shorter).
@@ -307,7 +339,7 @@ def _read_through(
 
     ``runs`` receives the records if ``keeps``.
     """
-    digest = layout.Digest()
+    digest = Digest()
     count, last, flags = 0, -1, 0
 
     def take(run: NDArray[np.void]) -> None:
@@ -341,8 +373,8 @@ def _read_through(
         "meta": meta,
         "attachments": {item.name: item.data for item in contents.attachments},
         "is_cut": container.is_cut,
-        "digest": contents.digest,
-        "computed_digest": digest.hexdigest(),
+        "seal": contents.seal or {},
+        "computed_seal": {DIGEST: digest.hexdigest(), **container.hashes},
         "problems": tuple(dict.fromkeys(contents.problems)),
     }
     return facts, contents.attachments
@@ -356,7 +388,8 @@ def _read_parts(
         if data[: len(MAGIC)] != MAGIC:
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
-        container = Container(data)
+        # only the first reading keeps events, and compares the seal
+        container = Container(data, is_hashed=keeps_events)
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
         for item in container.records():

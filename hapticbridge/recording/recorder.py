@@ -30,6 +30,7 @@ from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import check_contents
 
 # Second reader of a run
@@ -207,11 +208,12 @@ class Recorder:
         self._send()
         return not self._is_closed and self._process.poll() is None
 
-    def close(self) -> None:
+    def close(self, signer: Signer | None = None) -> None:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing.
+        nothing. ``signer`` signs the file; the process gets the key only here, so that a bridge
+        that dies leaves an unsigned one.
 
         Raises:
             RecordingError: The process died, or could not write the file.
@@ -222,7 +224,8 @@ class Recorder:
         self._sender.join()
         try:
             _set_blocking(self._input, True)
-            _write(self._input, bytes(self._outbox) + b'{"close": true}\n')
+            end = {"close": True, "seed": "" if signer is None else signer.seed.hex()}
+            _write(self._input, bytes(self._outbox) + json.dumps(end).encode() + b"\n")
         except OSError:
             pass  # the process died; its last answer or exit status holds the reason
         self._outbox.clear()
@@ -456,23 +459,25 @@ class RecordStream:
         """Returns copies of the newest records, oldest first."""
         return self._ring.latest(count)
 
-    def close(self) -> None:
+    def close(self, signer: Signer | None = None) -> None:
         """Waits until the recorder has finished the file, and removes the shared memory.
+
+        ``signer`` signs the file.
 
         Raises:
             RecordingError: The recorder's process died, or could not write the file.
         """
         try:
             if self.recorder is not None:
-                self._close_recorder(self.recorder)
+                self._close_recorder(self.recorder, signer)
         finally:
             if self._observer is not None:
                 self._observer.close()
             self._ring.close()
 
-    def _close_recorder(self, recorder: Recorder) -> None:
+    def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:
-            recorder.close()
+            recorder.close(signer)
         except RecordingError as error:
             if self._path is None or not self._path.exists() or not self._ring.rows.size:
                 raise
