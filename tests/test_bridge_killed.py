@@ -132,6 +132,7 @@ def test_killed_bridge_leaves_a_whole_recording_that_says_so(runs: dict[str, Sto
     report = audit(run.path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.events["bridge_died"] == 1
+    assert (report.is_cut, report.cut) == (True, "the bridge died during the run")
 
 
 def test_killed_bridge_and_recorder_leave_a_cut_recording_that_repair_mends(
@@ -147,6 +148,7 @@ def test_killed_bridge_and_recorder_leave_a_cut_recording_that_repair_mends(
         repair(cut, cut)
     repair(cut, mended)
     after = audit(mended)
-    assert (after.verdict, after.is_cut, after.ticks) == ("passive", False, report.ticks)
+    assert (after.verdict, after.is_cut, after.ticks) == ("passive", True, report.ticks)
+    assert after.cut == "the file had lost its end and was repaired"
     before, now = read_recording(cut).ticks, read_recording(mended).ticks
     assert np.array_equal(before, now)

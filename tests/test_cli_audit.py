@@ -37,7 +37,7 @@ def test_active_and_invalid_recordings_are_exit_code_1(
 def test_strict_is_passed_on(call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def judged(path: Path, *, strict: bool, **options: bool) -> Any:
+    def judged(path: Path, *, strict: bool, **options: Any) -> Any:
         seen.append(strict)
         return audit(path, strict=strict, **options)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
+from hapticbridge.recording.reader import CUT
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.sweep.results import Interrupted, Table
 from hapticbridge.units import format_energy
@@ -282,7 +284,9 @@ def _print_report(report: AuditReport) -> None:
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified)}")
     if report.is_cut:
-        out.print(f"  cut: {report.cut}; the verdict is on what it holds")
+        mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
+        hint = f"; {mend}" if CUT in report.cut else ""
+        out.print(plain(f"  {report.cut}: the verdict is on what it holds{hint}"))
     if report.signature not in report.reason:
         out.print(f"  {plain(report.signature)}")
     unusual = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}

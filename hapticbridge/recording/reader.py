@@ -193,7 +193,8 @@ class Contents:
         self.events.append((payload, event))
 
 
-_CUT = "the end of the file is missing ('hapticbridge repair' makes a whole file of the rest)"
+CUT = "the file is cut: its end is missing"
+"""Meaning of a file without its end."""
 
 CUTTING_EVENTS = {
     "bridge_died": "the bridge died during the run",
@@ -258,7 +259,7 @@ class RecordingFile:
     @property
     def cut_sentence(self) -> str:
         """Sentence if the run's end is or was missing in the file, else empty."""
-        found = [_CUT] if self.is_cut else []
+        found = [CUT] if self.is_cut else []
         names = {event.get("event") for event in self.events}
         found += [words for name, words in CUTTING_EVENTS.items() if name in names]
         return "; ".join(found)

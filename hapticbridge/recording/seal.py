@@ -191,8 +191,6 @@ class Signer:
         path = Path(path)
         serialization, ed25519 = _cryptography()
         data = _read(path)
-        if os.name == "posix" and path.stat().st_mode & 0o077:
-            raise RecordingError(f"other users can read the key '{path}': chmod 600 '{path}'")
         is_openssh = b"OPENSSH PRIVATE KEY" in data
         name = f"load_{'ssh' if is_openssh else 'pem'}_private_key"
         try:
@@ -206,6 +204,8 @@ class Signer:
             raise _no_key(path, "private", error) from None
         if not isinstance(key, ed25519.Ed25519PrivateKey):
             raise _no_key(path, "private", TypeError("it is of another kind"))
+        if os.name == "posix" and path.stat().st_mode & 0o077:
+            raise RecordingError(f"other users can read the key '{path}': chmod 600 '{path}'")
         return cls(key.private_bytes_raw())
 
     def signed(self, seal: Mapping[str, str]) -> dict[str, str]:
@@ -294,8 +294,8 @@ def check_signature(
         if SIGNATURE not in seal:
             return SignatureCheck(f"not signed: only a key would prove {UNPROVEN}")
         return SignatureCheck(
-            f"signed by {fingerprint(signer)}, not checked: only its public key (--trust KEY) proves "
-            f"{UNPROVEN}"
+            f"signed by {fingerprint(signer)}, not checked: only its public key (--trust KEY) "
+            f"proves {UNPROVEN}"
         )
     if SIGNATURE not in seal:
         why = f" ({fault})" if fault else ""
