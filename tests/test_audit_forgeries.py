@@ -1,7 +1,8 @@
 """Kinds of forgery of a recording, all checksums and digests written anew, and what becomes of it.
 
 Each is judged twice: simulated again, and as if recorded with another MuJoCo, from its records
-alone. Without a key a few cannot be seen; the table says why.
+alone. A few are seen only under a key; the table says why, and they are judged under one, too.
+``test_audit_signatures`` has the forgeries of file, seal and signature.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from typing import Any
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import ScriptedDevice, SlowClock, recorded, verdict_of
+from audit_cases import (
+    OldSignature,
+    ScriptedDevice,
+    SlowClock,
+    key_pair,
+    recorded,
+    rewritten,
+    verdict_of,
+)
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
@@ -30,6 +39,7 @@ from hapticbridge.guard import Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording.seal import Signer
 from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
 
 SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
@@ -421,6 +431,13 @@ def test_a_forgery_is_not_called_passive(
     blind = judged(forgery, recording, tmp_path, is_blind=True)
     assert blind.verdict == forgery.blind, blind.reason
     assert blind.exit_code == 1
+    if forgery.why:  # the forger of a signed file has only its old signature
+        key = key_pair(tmp_path)
+        signed = rewritten(recording, tmp_path / "signed.mcap", signer=Signer.load(key))
+        old, forged = OldSignature(read_recording(signed).seal), read_recording(report.path)
+        path = rewritten(forged, tmp_path / "forged.mcap", signer=old)
+        keyed = audit(path, trust=key.with_suffix(".pub"), accepts_unverified=True)
+        assert (keyed.verdict, keyed.exit_code) == ("unverified", 1)
 
 
 def test_the_honest_recordings_are_what_the_forgeries_hide(
