@@ -42,8 +42,9 @@ def audit(
     verdict is ``active`` from the tick at which the device has received more than its damping
     dissipates and scene and coupling release.
 
-    The file is read four times, block by block: digest and events, structure, second computation,
-    re-simulation. Memory grows only with the number of events.
+    A long file is read four times, block by block: digest and events, structure, second
+    computation, re-simulation. One of up to two minutes at 1 kHz is read once. Beyond that memory
+    grows only with the number of events.
 
     Args:
         path: The recording.

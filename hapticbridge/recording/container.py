@@ -77,9 +77,13 @@ class FileBytes:
         try:
             with self._lock:
                 self._file.seek(start)
+                piece = self._file.read(wanted)
+                if len(piece) == wanted:
+                    return piece
                 # a read may return fewer bytes than requested
-                while len(pieces) < wanted and (piece := self._file.read(wanted - len(pieces))):
+                while piece and len(pieces) < wanted:
                     pieces += piece
+                    piece = self._file.read(wanted - len(pieces))
         except OSError as error:
             raise self._refusal(error) from error
         if len(pieces) < wanted:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -159,9 +161,7 @@ class Contents:
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
         """Adds the run of records that starts here; returns its end."""
-        message = np.dtype(
-            [*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(self.record))]  # packed
-        )
+        message = _message_dtype(self.record)
         size, count = message.itemsize, 16
         start = position
         while True:
@@ -203,9 +203,20 @@ CUTTING_EVENTS = {
 }
 """Events of a file that lacks the end of its run, with their meaning. No export leaves them out."""
 
+
+@cache
+def _message_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype([*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(record))])  # packed
+
+
 BLOCK = 1 << 14
 """Number of records per block: 16 s at 1 kHz, 6.5 MB. Larger blocks take more memory, smaller ones
 more time."""
+
+
+MAX_KEPT = 1 << 17
+"""Largest number of records that an open recording keeps in memory: two minutes at 1 kHz, 53 MB.
+The files of longer runs are read once per use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,6 +237,7 @@ class RecordingFile:
         seal: Entries of the seal (``recording.seal``) at the end of the file; empty without one.
         computed_seal: Digest, chain and index hash of what was read.
         problems: Damage, one sentence each; empty for an undamaged file, even a cut one.
+        kept: All records if there are at most ``MAX_KEPT``, so that they are read once; else None.
     """
 
     path: Path
@@ -240,6 +252,7 @@ class RecordingFile:
     seal: Mapping[str, str] = field(default_factory=dict)
     computed_seal: Mapping[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
+    kept: NDArray[np.void] | None = field(default=None, repr=False, compare=False)
 
     @property
     def digest(self) -> str | None:
@@ -267,13 +280,16 @@ class RecordingFile:
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, in blocks of equal size (the last: shorter).
 
-        The caller may keep a block. ``size`` is the number of records per block, ``BLOCK`` by
-        default.
+        The caller may keep a block, but not write to it. ``size`` is the number of records per
+        block, ``BLOCK`` by default.
 
         Raises:
             RecordingError: The file cannot be read, or has changed since it was opened.
         """
         size = size or BLOCK
+        if self.kept is not None:
+            yield from (self.kept[start : start + size] for start in range(0, self.count, size))
+            return
         runs: list[NDArray[np.void]] = []
         found = 0
         for _ in _read_parts(self.path, runs.append, keeps_events=False):
@@ -314,31 +330,37 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def open_recording(path: str | Path) -> RecordingFile:
-    """Opens a recording without loading its ticks, in memory independent of its length.
+    """Opens a recording; its ticks are loaded only if there are few (``MAX_KEPT``).
 
-    The file is read once for its digest, events and damage. Events are kept in memory; a run with
+    The file is read once for its digest, events and damage. Memory has a limit for any length of
+    the run, except for events. Events are kept in memory; a run with
     an input in every tick has one per tick.
 
     Raises:
         RecordingError: As for ``read_recording``.
     """
-    facts, _ = _read_through(Path(path), [])
-    return RecordingFile(**facts)
+    runs: list[NDArray[np.void]] = []
+    facts, _ = _read_through(Path(path), runs, max_kept=MAX_KEPT)
+    if facts["count"] > MAX_KEPT:
+        return RecordingFile(**facts)
+    kept = _join(runs, facts["record"])
+    kept.flags.writeable = False
+    return RecordingFile(**facts, kept=kept)
 
 
 def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
-    facts, attachments = _read_through(path, runs, keeps=True)
+    facts, attachments = _read_through(path, runs)
     return Recording(**facts, ticks=_join(runs, facts["record"])), attachments
 
 
 def _read_through(
-    path: Path, runs: list[NDArray[np.void]], *, keeps: bool = False
+    path: Path, runs: list[NDArray[np.void]], *, max_kept: float = math.inf
 ) -> tuple[dict[str, Any], list[Attachment]]:
     """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
 
-    ``runs`` receives the records if ``keeps``.
+    ``runs`` receives the records unless there are more than ``max_kept``.
     """
     digest = Digest()
     count, last, flags = 0, -1, 0
@@ -349,8 +371,10 @@ def _read_through(
         count += run.size
         last = int(run["tick"][-1]) if run.size else last
         flags |= int(np.bitwise_or.reduce(run["flags"]))
-        if keeps:
+        if count <= max_kept:
             runs.append(run)
+        else:
+            runs.clear()
 
     *_, (container, contents) = _read_parts(path, take)
     if not contents.has_ticks:
