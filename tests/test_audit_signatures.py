@@ -165,8 +165,26 @@ class Parts:
         self.seal |= read_recording(self.write(path)).computed_seal
         return self.write(path)
 
+    def sealed_but(self, name: str, path: Path) -> Path:
+        """Writes the file with a new seal in which one hash is the old one."""
+        old = self.seal[name]
+        self.sealed(path)
+        self.seal[name] = old
+        return self.write(path)
+
 
 Forge = Callable[[Bench, Path], Path]
+
+
+def but(name: str, change: Callable[[Parts], object]) -> Forge:
+    """Changes the records and writes the seal anew, with one hash left as it was."""
+
+    def forge(bench: Bench, path: Path) -> Path:
+        parts = Parts.of(bench.run)
+        change(parts)
+        return parts.sealed_but(name, path)
+
+    return forge
 
 
 def kept(change: Callable[[Parts], object]) -> Forge:
@@ -333,6 +351,10 @@ FORGERIES = {
     "metadata added, seal kept": Forgery(kept(foreign)),
     "attachment added, seal kept": Forgery(kept(attachment)),
     "metadata behind the seal, seal kept": Forgery(kept(behind)),
+    # one hash is kept
+    "metadata added, chain kept": Forgery(but("chain", foreign)),
+    "attachment added, digest kept": Forgery(but("sha256", attachment)),
+    "chunk left out of the index, its hash kept": Forgery(but("index", hidden_chunk)),
     # the seal is written anew, the signature kept
     "tail cut off": Forgery(anew(lambda p: p.chunks.pop())),
     "tail cut off and the stop moved": only_a_key(content(shortened), SHORTER),
