@@ -21,10 +21,9 @@ from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import force_on_hand
+from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.snapshot import MAX_CONTACTS
-from hapticbridge.recording.timeline import Timeline
 from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4

@@ -34,6 +34,7 @@ from hapticbridge.guard import (
 )
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
@@ -279,6 +280,9 @@ class Run:
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
+    sign: Annotated[Path | None, tyro.conf.arg(metavar="KEY")] = None
+    """Sign the recording with this private ed25519 key; needs the extra 'sign'. To make KEY and
+    KEY.pub: ssh-keygen -t ed25519 -N '' -f KEY. 'hapticbridge audit --trust KEY.pub' checks it."""
     method: str | None = None
     """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
     carried over; second order away from contact. 'implicit', the default with substeps: all of the
@@ -369,6 +373,10 @@ class Run:
             raise HapticBridgeError(
                 "--overwrite goes with --record FILE; nothing would be recorded"
             )
+        if self.sign is not None:
+            if self.record is None:
+                raise HapticBridgeError("--sign goes with --record FILE; nothing would be signed")
+            Signer.load(self.sign)  # refused before anything is opened
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
@@ -475,6 +483,7 @@ class Run:
             tool_weight=self.tool_weight,
             live=not self.as_json and (err.is_terminal or not self.fast),
             realtime=self.realtime or None,
+            sign=self.sign,
         )
 
     def _window(self) -> Window:

@@ -30,6 +30,7 @@ from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import check_contents
 from hapticbridge.signals import deferring_stops
 
@@ -225,11 +226,12 @@ class Recorder:
         self._send()
         return not self._is_closed and self._process.poll() is None
 
-    def close(self) -> None:
+    def close(self, signer: Signer | None = None) -> None:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing. The wait ends ``STANDSTILL`` after the last sign of life.
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs the file;
+        the process gets the key only here, so that a bridge that dies leaves an unsigned one.
 
         Raises:
             RecordingError: The process died, could not write the file, or stands still and is left
@@ -238,7 +240,8 @@ class Recorder:
         if self._is_closed or self._has_failed:
             self._reap()
             return
-        self._outbox += b'{"close": true}\n'
+        end = {"close": True, "seed": "" if signer is None else signer.seed.hex()}
+        self._outbox += json.dumps(end).encode() + b"\n"
         answer = self._last_answer()
         if answer is None:
             self._leave()
@@ -530,10 +533,11 @@ class RecordStream:
         """Returns copies of the newest records, oldest first."""
         return self._ring.latest(count)
 
-    def close(self, *, is_discarded: bool = False) -> None:
+    def close(self, signer: Signer | None = None, *, is_discarded: bool = False) -> None:
         """Waits until the recorder has finished the file, and removes the shared memory.
 
-        A run that never began has no recording (``is_discarded``): its file is removed.
+        ``signer`` signs the file. A run that never began has no recording (``is_discarded``): its
+        file is removed.
 
         Raises:
             RecordingError: The recorder's process died, could not write the file, or stands still.
@@ -542,7 +546,7 @@ class RecordStream:
             if self.recorder is not None and is_discarded:
                 self._discard(self.recorder)
             elif self.recorder is not None:
-                self._close_recorder(self.recorder)
+                self._close_recorder(self.recorder, signer)
         finally:
             if self._observer is not None:
                 self._observer.close()
@@ -554,9 +558,9 @@ class RecordStream:
             with contextlib.suppress(OSError):
                 self._path.unlink()
 
-    def _close_recorder(self, recorder: Recorder) -> None:
+    def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:
-            recorder.close()
+            recorder.close(signer)
         except RecordingError as error:
             if recorder.is_left:
                 raise  # it may still write the file

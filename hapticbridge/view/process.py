@@ -116,9 +116,6 @@ def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
         meta=metadata,
         attachments=files,
         is_cut=True,
-        digest=None,
-        computed_digest="",
-        problems=(),
     )
 
 
