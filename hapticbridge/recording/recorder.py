@@ -230,7 +230,7 @@ class Recorder:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs the file:
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs it;
         the process gets the key here, so that a bridge that dies leaves an unsigned one.
 
         Raises:
