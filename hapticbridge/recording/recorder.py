@@ -230,8 +230,8 @@ class Recorder:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs the file:
-        the process gets the key here, so that a bridge that dies leaves an unsigned one.
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs the
+        file: the process gets the key here, so that a bridge that dies leaves an unsigned one.
 
         Raises:
             RecordingError: The process died, could not write the file, or stands still and is left
