@@ -158,7 +158,7 @@ def test_a_folder_that_cannot_be_written_costs_only_time(
     tmp_path: Path, no_folder: Callable[[Path], str]
 ) -> None:
     (tmp_path / "file").touch()
-    assert "cannot be written: Not a directory" in no_folder(tmp_path / "file" / "cache")
+    assert "cannot be written: File exists" in no_folder(tmp_path / "file" / "cache")
     table = np.zeros((3, 4))
     assert direct(compiled(rows_of), table)(table) == 43
     assert direct(compiled(allocating), table)(table) == 0.0
