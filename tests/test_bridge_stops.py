@@ -267,4 +267,5 @@ def test_a_recorder_that_takes_no_record_ends_a_simulated_run(
         with pytest.raises(RecordingError, match=r"has taken no record for 0\.2 s"):
             bridge.run(1000.0)
         assert not device.writes[-1].any()
+    assert recorder is not None
     os.kill(recorder.pid, signal.SIGKILL)
