@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -416,7 +417,7 @@ def _confine(job: dict[str, Any], recording: RecordingFile) -> float:
         length = Timeline(recording.blocks(), parameters.period).duration
         span = (length if job["stop"] is None else job["stop"]) - job["start"]
         frames = max(1.0, min(span, length) * job["fps"] / job["speed"])
-    out = str(Path(job["out"]).parent)
+    out = tempfile.tempdir = str(Path(job["out"]).parent)
     devices = [path for path in GRAPHICS if path.startswith("/dev")]
     confine(
         reads=(*bounds["reads"], *GRAPHICS),

@@ -18,7 +18,7 @@ from rich.table import Table
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
 from hapticbridge.check.own_motion import own_substeps
-from hapticbridge.cli.terminal import err, notify, out, print_json
+from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -374,8 +374,9 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        source = read_scene(self.scene, **settings_from(self.settings))
-        scene = compile_scene(source, self.grip, as_is=self.as_is)
+        with compiling(self.scene):
+            source = read_scene(self.scene, **settings_from(self.settings))
+            scene = compile_scene(source, self.grip, as_is=self.as_is)
         chosen = (
             self
             if self.substeps is not None
