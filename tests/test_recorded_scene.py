@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from hapticbridge.confinement import ForeignSceneError, Worker, in_bounds
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError, SceneError
 from hapticbridge.film import Shot, still
 from hapticbridge.recorded_scene import compile_recorded
-from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording import Recording, open_recording, read_recording
 from hapticbridge.recording.container import MAX_RATIO
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
@@ -199,6 +199,86 @@ def test_a_small_file_that_unpacks_to_much_is_not_unpacked(
     before = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     assert words in "; ".join(read_recording(path).problems)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_utime - before < PROCESSOR_TIME
+
+
+def record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def message(channel: int, payload: bytes, sequence: int = 0) -> bytes:
+    return record(5, struct.pack("<HIQQ", channel, sequence, 0, 0) + payload)
+
+
+def walked(data: bytes, start: int) -> Iterator[tuple[int, int, int]]:
+    """Yields opcode, start and stop of an MCAP file's or a chunk's records."""
+    while start < len(data) - 8:
+        opcode, size = struct.unpack_from("<BQ", data, start)
+        yield opcode, start, start + 9 + size
+        start += 9 + size
+
+
+def ticks_of(path: Path) -> tuple[bytes, list[bytes]]:
+    """Returns what precedes the first chunk, and the records of all chunks."""
+    data, records = path.read_bytes(), list[bytes]()
+    first = next(start for opcode, start, _ in walked(data, 8) if opcode == 6)
+    for opcode, start, stop in walked(data, first):
+        if opcode != 6:
+            break
+        inner = start + 9 + 28
+        compressed = data[inner + 4 + data[inner] + 8 : stop]
+        whole = zstandard.ZstdDecompressor().decompress(compressed, 1 << 22)
+        whole += bytes(9)  # for ``walked``, which ends before a file's last magic
+        records += [whole[a:b] for _, a, b in walked(whole, 0) if b < len(whole)]
+    return data[:first], records
+
+
+def plain_chunk(content: bytes, times: tuple[int, int] = (0, 0)) -> bytes:
+    head = struct.pack("<QQQI", *times, len(content), zlib.crc32(content))
+    return record(6, head + struct.pack("<I", 0) + struct.pack("<Q", len(content)) + content)
+
+
+SHAPES: dict[str, Callable[[list[bytes], int], bytes]] = {
+    "tiny chunks": lambda each, n: b"".join(map(plain_chunk, (each * n)[:n])),
+    "tiny messages": lambda _, n: b"".join(
+        plain_chunk(message(9, b"") * 1000) for _ in range(n // 50)
+    ),
+    "chunks backwards in time": lambda each, n: b"".join(
+        plain_chunk(item, (n - at, n - at)) for at, item in enumerate((each * n)[:n])
+    ),
+    "chunks that overlap in time": lambda each, n: b"".join(
+        plain_chunk(item, (0, n)) for item in (each * n)[:n]
+    ),
+    "tiny attachments": lambda _, n: b"".join(
+        record(9, bytes(16) + struct.pack("<I", 6) + b"%06d" % at + bytes(4) + bytes(8) + bytes(4))
+        for at in range(n)
+    ),
+    "records outside of chunks": lambda each, n: b"".join((each * n)[:n]),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_file_of_any_shape_is_walked_in_a_time_that_is_linear_in_its_bytes(
+    shape: str, honest: Recording, tmp_path: Path
+) -> None:
+    """Time of the processor for four times the bytes; a square would take sixteen times."""
+    head, records = ticks_of(honest.path)
+    setup = plain_chunk(b"".join(each for each in records if each[0] in (3, 4)))
+    ticks = [each for each in records if each[0] == 5]
+    largest = max(map(len, ticks))
+    ticks = [each for each in ticks if len(each) == largest]
+    spent = []
+    for count in (4000, 16_000):
+        path = tmp_path / f"{count}.mcap"
+        path.write_bytes(head + setup + SHAPES[shape](ticks, count))
+        start = time.process_time()
+        recording = open_recording(path)
+        with contextlib.suppress(RecordingError):
+            for _ in recording.blocks():
+                pass
+        spent.append(time.process_time() - start)
+    if shape not in ("tiny messages", "tiny attachments"):
+        assert recording.count >= 16_000
+    assert spent[1] < 8.0 * spent[0]
 
 
 def test_a_run_at_rest_compresses_far_less_than_is_allowed(tmp_path: Path) -> None:
