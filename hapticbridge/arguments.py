@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Real
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -148,6 +150,17 @@ class Arguments:
                 f"{name.replace('_', ' ')} {array.shape}" for name, array in arrays.items()
             )
             raise self.error(f"shapes do not broadcast together: {shapes}") from None
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Returns True for a real number that a double holds, also inf and nan; False for a flag."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real):
+        return False
+    try:
+        float(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
+    return True
 
 
 def shown(value: object) -> str:

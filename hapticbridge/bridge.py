@@ -37,6 +37,7 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import real_time
 from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.recording.seal import Signer
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.session import RecordOutput, Session, StopRequest
 from hapticbridge.signals import stopping_on_signals
@@ -96,7 +97,10 @@ class Bridge:
     ) -> None:
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
-        self.output = RecordOutput(path, observer, options.live)
+        if options.sign is not None and path is None:
+            raise HapticBridgeError("sign needs a recording; nothing would be signed")
+        signer = None if options.sign is None else Signer.load(options.sign)
+        self.output = RecordOutput(path, observer, options.live, signer)
         self.clock = clock or RealClock()
         loaded = scene if isinstance(scene, Scene) else load_scene(scene)
         with device_for_run(loaded, device, self.clock) as self.device:

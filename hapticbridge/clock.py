@@ -10,6 +10,7 @@ import sys
 import time
 from typing import Protocol
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.errors import HapticBridgeError
 
 SPIN_NS = 150_000
@@ -33,9 +34,9 @@ def period_of(rate: float) -> float:
     Raises:
         HapticBridgeError: The rate is not 1 Hz to 1 MHz.
     """
-    if not LOWEST_RATE <= rate <= HIGHEST_RATE:
+    if not is_number(rate) or not LOWEST_RATE <= rate <= HIGHEST_RATE:
         raise HapticBridgeError(
-            f"rate is {rate!r} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
+            f"rate is {shown(rate)} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
         )
     return 1.0 / rate
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Real
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.errors import CouplingError
 
 SQUARED_LEVER = 1e-3
@@ -61,9 +61,10 @@ class Coupling:
                 object.__setattr__(self, field.name, SQUARED_LEVER * translational)
                 continue
             name = field.name.replace("_", " ")
-            is_number = isinstance(value, Real) and not isinstance(value, bool)
-            if not is_number or not math.isfinite(value):
-                raise CouplingError(f"coupling {name} is {value!r}; it must be a finite number")
+            if not is_number(value) or not math.isfinite(value):
+                raise CouplingError(
+                    f"coupling {name} is {shown(value)}; it must be a finite number"
+                )
             if value < 0:
                 raise CouplingError(f"coupling {name} is {value:g}; it must be >= 0")
         if self.stiffness == 0:

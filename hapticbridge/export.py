@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra
-from hapticbridge.record import Column, columns_of
+from hapticbridge.record import Column, Timeline, columns_of, due_times
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.recording.timeline import Timeline, due_times
+from hapticbridge.recording.reader import CUTTING_EVENTS
 from hapticbridge.run_description import meta_float
 
 # Interface of table writers
@@ -220,9 +220,8 @@ class Exported:
     def damage(self) -> tuple[str, ...]:
         """Damage of the recording, one sentence each; a cut recording is not damaged."""
         found = self.recording
-        if found.problems or found.is_cut or found.digest == found.computed_digest:
-            return found.problems
-        return ("its content does not match its digest",)
+        fault = found.seal_fault
+        return found.problems or ((fault,) if fault else ())
 
 
 def target_for(path: str | Path, form: str) -> Path:
@@ -255,7 +254,8 @@ def export(
         target: File with an extension of the format; None takes the recording's name with the
             usual one.
         span: Start and end in s of the run's clock, the end excluded. Only ticks due and events
-            in it are written; metadata ``cut`` then holds the two times.
+            in it are written; metadata ``cut`` then holds the two times. Events that say that the
+            recording lacks an end, and metadata ``incomplete`` with the reason, are always written.
         overwrite: True replaces existing files.
 
     Raises:
@@ -314,9 +314,15 @@ def _piece(recording: RecordingFile, span: tuple[float, float]) -> RecordingFile
         raise RecordingError(
             f"the piece from {start:g} s to {end:g} s is empty; its end must be later"
         )
+    if recording.cut_sentence:
+        recording = replace(recording, meta=recording.meta | {"incomplete": recording.cut_sentence})
     if span == EVERYTHING:
         return recording
-    events = [event for event in recording.events if start <= time_of(event) < end]
+    events = [
+        event
+        for event in recording.events
+        if start <= time_of(event) < end or event.get("event") in CUTTING_EVENTS
+    ]
     limits = [time if math.isfinite(time) else None for time in span]
     meta = recording.meta | {"cut": json.dumps(limits)}
     return replace(recording, events=events, meta=meta)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -83,7 +84,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         yield path
         return
-    draft = target.with_name(f".draft-{target.name}")
+    # a name that no other user of the folder can guess, and link elsewhere
+    draft = target.with_name(f".draft-{secrets.token_hex(8)}{target.suffix}")
     try:
         yield draft
         draft.replace(target)

@@ -238,7 +238,7 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
     finally:
         watch.cancel()
         process.kill()
-        process.wait()  # Ctrl-C can leave Popen without waiting for the process
+        process.wait(PATIENCE)  # Ctrl-C can leave Popen without waiting for the process
 
 
 class _Watch:

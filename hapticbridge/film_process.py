@@ -26,11 +26,10 @@ from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import force_on_hand
+from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.snapshot import MAX_CONTACTS
-from hapticbridge.recording.timeline import Timeline
 from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4

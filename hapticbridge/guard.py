@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import AXES, Device, DeviceInfo
@@ -88,10 +89,13 @@ class Limits:
     def __post_init__(self) -> None:
         for name, unit in (("force", "N"), ("torque", "N m")):
             value = getattr(self, name)
-            if not math.isfinite(value) or value <= 0:
-                raise DeviceError(f"{name} limit is {value!r} {unit}; it must be finite and > 0")
-        if self.ramp is not None and not 0 <= self.ramp <= LONGEST_RAMP:
-            raise DeviceError(f"start ramp is {self.ramp!r} s; it must be 0 to {LONGEST_RAMP:g}")
+            if not is_number(value) or not 0 < value < math.inf:
+                raise DeviceError(
+                    f"{name} limit is {shown(value)} {unit}; it must be finite and > 0"
+                )
+        ramp = 0.0 if self.ramp is None else self.ramp
+        if not is_number(ramp) or not 0 <= ramp <= LONGEST_RAMP:
+            raise DeviceError(f"start ramp is {shown(ramp)} s; it must be 0 to {LONGEST_RAMP:g}")
         for name, unit in (
             ("stretch", "m"),
             ("energy", "J"),
@@ -100,14 +104,14 @@ class Limits:
             ("hold_torque", "N m"),
         ):
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is not None and not (is_number(value) and value > 0):
                 words = name.replace("_", " ")
                 raise DeviceError(
-                    f"{words} limit is {value!r} {unit}; it must be > 0, inf for none"
+                    f"{words} limit is {shown(value)} {unit}; it must be > 0, inf for none"
                 )
-        if not (0 < self.angle < math.pi or self.angle == math.inf):
+        if not is_number(self.angle) or not (0 < self.angle < math.pi or self.angle == math.inf):
             raise DeviceError(
-                f"angle limit is {self.angle!r} rad; it must be > 0 and < pi, inf for none"
+                f"angle limit is {shown(self.angle)} rad; it must be > 0 and < pi, inf for none"
             )
 
     def reach_of(self, info: DeviceInfo) -> float:

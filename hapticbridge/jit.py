@@ -6,11 +6,14 @@ import hashlib
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable
-from functools import cache, cached_property, update_wrapper
+from enum import EnumType
+from functools import cache, cached_property, partial, update_wrapper
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any, TypeVar, cast
 
 import llvmlite
@@ -24,20 +27,83 @@ _Function = TypeVar("_Function", bound=Callable[..., object])
 
 
 @cache
-def cache_folder() -> str:
-    """Returns the folder of the machine code, one per state of all compiled sources.
+def cache_folder() -> Path | None:
+    """Returns the folder of the machine code; None if it cannot be kept there safely.
 
-    numba checks only the file of the function that it loads, but compiled functions inline each
-    other across files, and the kernel's constants too. With one folder for all, callers would keep
-    the old code of a changed module. ``NUMBA_CACHE_DIR`` moves the folder.
+    ``NUMBA_CACHE_DIR`` moves the folder. Without a folder everything is compiled in memory, in
+    every process; a warning has the reason.
     """
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        source = path.read_bytes()
-        if b"hapticbridge.jit import" in source or path.parent.name == "kernel":
-            digest.update(source)
     usual = platformdirs.user_cache_dir("hapticbridge", appauthor=False)
-    return str(Path(os.environ.get("NUMBA_CACHE_DIR") or usual) / digest.hexdigest()[:16])
+    folder = (Path(os.environ.get("NUMBA_CACHE_DIR") or usual) / "machine_code").resolve()
+    fault = machine_code.fault_of(folder)
+    if fault:
+        warnings.warn(
+            f"machine code is not kept, so every start compiles for half a minute: {fault}",
+            stacklevel=2,
+        )
+    return None if fault else folder
+
+
+def _digest(function: Callable[..., object], *more: object) -> str:
+    """Returns a digest of all that decides a function's machine code.
+
+    Compiled functions inline each other across files, and constants too; numba's own cache checks
+    only the file of the function that it loads. Code and constants are those in memory: a file may
+    have changed since it was imported.
+    """
+    texts, left = [_environment(), repr(more)], [cast(FunctionType, function)]
+    found = set(left)
+    while left:
+        text, callees = _ingredients(left.pop())
+        texts.append(text)
+        left += (callee for callee in dict.fromkeys(callees) if callee not in found)
+        found.update(callees)
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
+
+
+@cache
+def _ingredients(function: FunctionType) -> tuple[str, tuple[FunctionType, ...]]:
+    """Returns a function's name, code and constants as text, and the functions that it names."""
+    parts: list[object] = [function.__module__, function.__qualname__]
+    callees: list[FunctionType] = []
+
+    def note(value: object) -> None:
+        if isinstance(value, Deferred):
+            value = value.source
+        if isinstance(value, tuple):
+            parts.append(len(value))
+            for item in value:
+                note(item)
+        elif isinstance(value, FunctionType):
+            parts.append(value.__qualname__)
+            callees.append(value)
+        else:
+            parts.append(_content(value))
+
+    codes = [function.__code__]
+    for code in codes:
+        codes += (item for item in code.co_consts if isinstance(item, CodeType))
+        parts.append((code.co_code, code.co_exceptiontable, code.co_names))
+        note(tuple(item for item in code.co_consts if not isinstance(item, CodeType)))
+        note(tuple(function.__globals__.get(name) for name in code.co_names))
+    note(function.__defaults__)
+    note(tuple(cell.cell_contents for cell in function.__closure__ or ()))
+    return repr(parts), tuple(callees)
+
+
+def _content(value: object) -> object:
+    """Returns what numba compiles into a function for a constant of it or a global name."""
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.shape, value.tobytes()
+    if isinstance(value, EnumType):
+        return value.__qualname__, [(each.name, each.value) for each in cast(Any, value)]
+    if isinstance(value, frozenset):
+        return sorted(map(repr, value))
+    if isinstance(value, bool | int | float | str | bytes | np.generic | np.dtype):
+        return type(value).__qualname__, repr(value)
+    # a module, a class or a C function; the versions of packages are counted
+    names = "__name__", "_fields", "symbol", "sig"
+    return type(value).__qualname__, [str(getattr(value, name, "")) for name in names]
 
 
 @cache
@@ -47,7 +113,11 @@ def _environment() -> str:
     assert numba is not None and numba.origin is not None
     files = Path(numba.origin).with_name("_version.py"), Path(machine_code.__file__)
     versions = llvmlite.__version__, mujoco.__version__, np.__version__, sys.version
-    settings = sorted(item for item in os.environ.items() if item[0].startswith("NUMBA_"))
+    settings = sorted(
+        item
+        for item in os.environ.items()
+        if item[0].startswith("NUMBA_") and item[0] != "NUMBA_CACHE_DIR"
+    )
     contents = tuple(file.read_bytes() for file in files)
     return repr((contents, versions, settings, machine_code.processor()))
 
@@ -61,6 +131,11 @@ class Deferred:
 
     def __init__(self, build: Callable[[], Any]) -> None:
         self._build = build
+
+    @property
+    def source(self) -> Callable[..., object]:
+        """Function in Python that decides what is built."""
+        return self._build
 
     @cached_property
     def built(self) -> Any:
@@ -93,6 +168,11 @@ class Compiled(Deferred):
         update_wrapper(self, function)
         self._function, self._nogil = function, nogil
         self._direct: dict[tuple[machine_code.Kind, ...], Callable[..., Any]] = {}
+
+    @property
+    def source(self) -> Callable[..., object]:
+        """The function in Python."""
+        return self._function
 
     def direct(self, arguments: tuple[object, ...]) -> Callable[..., Any]:
         """Returns the machine code for arguments of these types (``jit.direct``)."""
@@ -146,10 +226,10 @@ class Compiled(Deferred):
     ) -> bytes:
         """Returns the machine code on disk, compiled before if it is not there."""
         function, types = self._function, (*map(machine_code.name_of, kinds), *c_types)
-        names = (function.__module__, function.__qualname__, *types)
-        digest = hashlib.sha256(repr((names, _environment())).encode()).hexdigest()[:16]
-        path = Path(cache_folder()) / f"{function.__name__}-{digest}.o"
-        code = machine_code.read(path)
+        folder, code = cache_folder(), None
+        if folder is not None:
+            path = folder / f"{function.__name__}-{_digest(function, types)}.o"
+            code = machine_code.read(path)
         if code is None:
             signature = _signature(arguments)
             dispatcher = self._decorated(is_cached=False)  # a cached one prints no code
@@ -158,19 +238,27 @@ class Compiled(Deferred):
             result = str(found.signature.return_type)
             symbol = found.fndesc.llvm_func_name
             code = machine_code.object_code(ir, symbol, kinds, result, c_types)
-            machine_code.write(path, code)
+            if folder is not None:
+                machine_code.write(path, code)
         return code
 
     def _decorated(self, *, is_cached: bool) -> Any:
         numba = import_module("numba")
-        decorate = numba.njit(cache=is_cached, nogil=self._nogil, error_model="numpy")
+        decorate = partial(numba.njit, nogil=self._nogil, error_model="numpy")
+        folder = cache_folder() if is_cached else None
+        if folder is None:
+            return decorate()(self._function)
+        own = folder / f"{self._function.__name__}-{_digest(self._function)}"
         with _decorating:
             outside = numba.config.CACHE_DIR
-            numba.config.CACHE_DIR = cache_folder()
+            numba.config.CACHE_DIR = str(own)
             try:
-                return decorate(self._function)
+                function = decorate(cache=True)(self._function)
             finally:
                 numba.config.CACHE_DIR = outside
+        # where it cannot write, numba turns to folders beside the sources and of other programs
+        is_ours = Path(function.stats.cache_path).is_relative_to(own)
+        return function if is_ours else decorate()(self._function)
 
 
 _callbacks: list[object] = []

@@ -13,6 +13,8 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import stat
+import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -23,6 +25,10 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numpy as np
+
+if sys.platform != "win32":
+    import grp
+    import pwd
 
 Kind = type | tuple[np.dtype[Any], int]
 """Type of an argument: ``bool``, ``int`` or ``float``; or the type of an array's items and the
@@ -291,14 +297,58 @@ def address_of(code: bytes, name: str) -> int:
     return int(library[_ENTRY])
 
 
+def fault_of(folder: Path) -> str:
+    """Returns the reason why no code may be kept in a folder; empty if it may. Makes the folder.
+
+    Code from the folder runs as this user. No other user may therefore write there, nor exchange
+    the folder or one above it.
+    """
+    try:
+        for each in (*reversed(folder.parents), folder):
+            each.mkdir(mode=0o700, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return f"'{folder}' cannot be written"
+        if sys.platform == "win32":
+            return ""
+        if not _is_trusted(folder.lstat(), 0o077):
+            return f"'{folder}' is open to other users (chmod 700, or set NUMBA_CACHE_DIR)"
+        for above in folder.parents:
+            status = above.lstat()
+            writers = 0o002 if status.st_gid == _own_group() else 0o022
+            # a folder such as /tmp lets users exchange only what is theirs
+            writers = 0 if status.st_mode & stat.S_ISVTX else writers
+            if not _is_trusted(status, writers):
+                return f"other users can write '{above}' (chmod go-w, or set NUMBA_CACHE_DIR)"
+    except OSError as error:
+        return f"'{folder}' cannot be written: {error.strerror}"
+    return ""
+
+
+def _is_trusted(status: os.stat_result, forbidden: int) -> bool:
+    """Returns True for what belongs to this user, root or the owner of this program's sources.
+
+    The last can run anything as this user anyway. None of the ``forbidden`` permissions is given.
+    """
+    owners = (0, os.getuid(), Path(__file__).stat().st_uid)
+    return status.st_uid in owners and not status.st_mode & forbidden
+
+
+@cache
+def _own_group() -> int | None:
+    """Returns the group that holds this user alone, as many systems make for each; else None."""
+    with suppress(KeyError):
+        user = pwd.getpwuid(os.getuid())
+        group = grp.getgrgid(user.pw_gid)
+        if group.gr_name == user.pw_name and set(group.gr_mem) <= {user.pw_name}:
+            return group.gr_gid
+    return None
+
+
 def read(path: Path) -> bytes | None:
     """Returns the object code of a file; None if there is none, or it is damaged or another's."""
     try:
         with path.open("rb") as file:
-            status = os.fstat(file.fileno())
-            if hasattr(os, "getuid") and (
-                status.st_uid not in (0, os.getuid()) or status.st_mode & 0o022
-            ):
+            if sys.platform != "win32" and not _is_trusted(os.fstat(file.fileno()), 0o022):
                 return None
             content = file.read()
     except OSError:
@@ -309,13 +359,11 @@ def read(path: Path) -> bytes | None:
 
 def write(path: Path, code: bytes) -> None:
     """Writes object code behind its digest, as a whole or not at all."""
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            try:
-                file.write(hashlib.sha256(code).digest() + code)
-                file.close()
-                Path(file.name).replace(path)
-            except BaseException:
-                Path(file.name).unlink(missing_ok=True)
-                raise
+    with suppress(OSError), tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        try:
+            file.write(hashlib.sha256(code).digest() + code)
+            file.close()
+            Path(file.name).replace(path)
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise

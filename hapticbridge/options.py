@@ -11,11 +11,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TypedDict, cast
+from pathlib import Path
+from typing import Any, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import default_coupling, required_axis_damping
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
@@ -49,6 +51,7 @@ from hapticbridge.kernel.parameters import (
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import wants_real_time
 from hapticbridge.rendering import (
+    TIPPED,
     Method,
     default_method,
     holding_force,
@@ -57,6 +60,7 @@ from hapticbridge.rendering import (
     resolve_contact_stiffness,
     start_handle,
     static_load,
+    toppling_force,
 )
 from hapticbridge.scene import Scene
 
@@ -91,9 +95,11 @@ class Workspace:
 
     def __post_init__(self) -> None:
         for name, value in zip(("scale", "force scale"), self.scales, strict=True):
-            if not math.isfinite(value) or value <= 0:
-                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+            if not is_number(value) or not 0 < value < math.inf:
+                raise HapticBridgeError(f"{name} is {shown(value)}; it must be finite and > 0")
         object.__setattr__(self, "axes", rotation_numbers(self.axes))
+        if not isinstance(self.absolute, bool):
+            raise HapticBridgeError(f"absolute is {shown(self.absolute)}; it must be True or False")
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -108,6 +114,23 @@ class Workspace:
 
 SAME_FRAME = Workspace()
 """Workspace with equal axes and scales; the device starts at the grip."""
+
+
+_FLAG, _FLAG_OR_NONE, _NAME = bool, bool | None, str | None
+_WORDS: dict[Any, str] = {
+    _FLAG: "True or False",
+    _FLAG_OR_NONE: "True, False or None",
+    _NAME: "a name, or None for the default",
+    Workspace: "a Workspace",
+    Limits | None: "Limits, or None for the device's own",
+}
+_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("i_know", "tool_weight", "live"), _FLAG),
+    **dict.fromkeys(("realtime", "pipelined"), _FLAG_OR_NONE),
+    **dict.fromkeys(("method", "contact", "controller"), _NAME),
+    "workspace": Workspace,
+    "limits": Limits | None,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,6 +166,8 @@ class BridgeOptions:
             sooner, and the whole tick takes 5 % longer. Between two ticks ``Scene.data`` then holds
             the contacts of the new positions, without forces. None does so on a real clock.
         live: True shows the state of the run on standard error, from the recorder's process.
+        sign: File of the private ed25519 key that signs the recording when it is closed
+            (``recording.seal.Signer``); needs the extra ``sign``. None leaves it unsigned.
 
     Raises:
         HapticBridgeError: A value is out of range; the message names the valid ones.
@@ -164,8 +189,15 @@ class BridgeOptions:
     realtime: bool | None = None
     pipelined: bool | None = None
     live: bool = False
+    sign: str | Path | None = None
 
     def __post_init__(self) -> None:
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise HapticBridgeError(
+                    f"{name.replace('_', ' ')} is {shown(value)}; it must be {_WORDS[kind]}"
+                )
         period_of(self.rate)
         refuse_substeps(self.rendering_method.scheme, checked_substeps(self.substeps))
         if self.controller is not None and self.controller not in CONTROLLERS:
@@ -213,6 +245,7 @@ class OptionChanges(TypedDict, total=False):
     realtime: bool | None
     pipelined: bool | None
     live: bool
+    sign: str | Path | None
 
 
 # Setup of a run
@@ -392,7 +425,8 @@ class RunSetup:
         """Returns the parameters of a run that starts now and whose device can hold the tool.
 
         If a still hand would need more than the device's force limit because of the tool's weight,
-        the weight is carried, which replaces the scene's model.
+        or if the tool topples in a moving one and then pulls more, the weight is carried, which
+        replaces the scene's model.
 
         Args:
             start: As for ``parameters``.
@@ -403,13 +437,20 @@ class RunSetup:
             HapticBridgeError: A value is out of range.
         """
         parameters, scene, most = self.parameters(start, effective), self.scene, self.limits.force
-        is_held = not self.method.has_law or self.info.is_prescribed or scene.is_carried
-        if is_held or (force := self._sent(holding_force(scene, parameters))) <= most:
+        if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
             return parameters
-        weightless = self._sent(holding_force(scene, parameters, has_weight=False))
-        if weightless > max(most, force / 2):
-            return parameters  # motors or springs push, more than the weight
-        reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        if (force := self._sent(holding_force(scene, parameters))) > most:
+            weightless = self._sent(holding_force(scene, parameters, has_weight=False))
+            if weightless > max(most, force / 2):
+                return parameters  # motors or springs push, more than the weight
+            reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        elif (force := self._sent(toppling_force(scene, parameters))) > most:
+            reason = (
+                f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
+                f"{force:.3g} N, and the device holds {most:.3g} N"
+            )
+        else:
+            return parameters
         if scene.as_is:
             raise SceneError(
                 f"the tool is too heavy ({reason}): let its weight be carried (--no-tool-weight, "

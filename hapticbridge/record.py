@@ -1,4 +1,4 @@
-"""Record of one tick, and sample of a device.
+"""Record of one tick, sample of a device, and due times of ticks.
 
 All fields are 8 bytes wide and little-endian. A record is therefore a NumPy structured scalar, a
 row of the shared-memory ring, and the payload of a message in the recording.
@@ -6,7 +6,7 @@ row of the shared-memory ring, and the payload of a message in the recording.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -202,3 +202,53 @@ CLOCK_FIELDS = ("deadline_ns", "wake_ns", "read_ns", "write_ns")
 
 SAMPLE_DTYPE = np.dtype([("position", "<f8", 3), ("quaternion", "<f8", 4), ("buttons", "<i8")])
 """Device sample: position in m and orientation in the device's frame, button bits."""
+
+
+# Due times of ticks
+
+
+def due_times(ticks: NDArray[np.void], period: float) -> NDArray[np.float64]:
+    """Returns the due times of ticks in s of the run's clock, with missed deadlines.
+
+    This is the clock of the events' ``time_ns``; without a missed deadline it is (tick + 1) T. If
+    the deadlines of a damaged file run backwards, all are computed as if none had been missed, so
+    that plots over time remain possible. ``period`` is T in s.
+
+    Returns:
+        Shape (n,), increasing if the ticks' numbers are.
+    """
+    due = ticks["deadline_ns"]
+    if due.size and (due[0] <= 0 or (np.diff(due) <= 0).any()):
+        return np.asarray((ticks["tick"] + 1) * period)
+    return np.asarray(1e-9 * due)
+
+
+class Timeline:
+    """Due times of any number of ticks; only missed deadlines are stored.
+
+    Attributes:
+        duration: Due time of the last tick in s; 0 without ticks.
+    """
+
+    def __init__(self, blocks: Iterable[NDArray[np.void]], period: float) -> None:
+        rows, times = list[int](), list[float]()
+        before: list[NDArray[np.void]] = []
+        count = 0
+        for block in blocks:
+            if not len(block):
+                continue
+            part = np.concatenate([*before, block])
+            due, first = due_times(part, period), count - len(before)
+            # keep both sides of every step that is not one period, and the ends
+            gaps = np.flatnonzero(np.abs(np.diff(due) - period) > 0.5 * period)
+            kept = sorted({0, *gaps.tolist(), *(gaps + 1).tolist(), len(part) - 1})
+            rows += [first + row for row in kept]
+            times += due[kept].tolist()
+            count += len(block)
+            before = [part[-1:]]
+        self._rows, self._times = np.array(rows, np.float64), np.array(times)
+        self.duration = times[-1] if times else 0.0
+
+    def row_at(self, time: float) -> int:
+        """Returns the row of the tick due nearest to a time in s, from 0 to ``duration``."""
+        return round(float(np.interp(time, self._times, self._rows)))

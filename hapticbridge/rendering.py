@@ -27,7 +27,7 @@ from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
-from hapticbridge.scene.handle import measured_weld
+from hapticbridge.scene.handle import PROBE, measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.theory.bounds import (
     IMPLICIT_SHARE,
@@ -491,6 +491,12 @@ LIGHT = 0.1
 """Wrench in N and N m below which changes are measured against it. A tool that rests on a table
 has no load to compare with."""
 
+MAX_WORK, LEAST_STEPS = 6e5, 100
+"""Largest work of one rehearsal in degrees of freedom and constraint rows, summed over its steps,
+and the steps that it always takes. A unit costs 3 to 7 µs: a scene of 130 takes all steps, one of
+400 half of them. More would let heavy scenes start later; a limit in seconds would give another
+start on another machine, and the audit could not repeat it."""
+
 TRIAL_STEPS = 50
 """Steps in which a load must prove better than none. A longer trial would judge the motion of a
 tool that hangs on its grip, not its start."""
@@ -518,19 +524,25 @@ class Rehearsal:
     def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
         """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
 
+        It ends early if the scene diverges, or after ``MAX_WORK``.
+
         Args:
             handle: Pose of the handle.
-            count: Number of steps.
+            count: Largest number of steps.
         """
         data = self.data
         data.mocap_pos[self._handle], data.mocap_quat[self._handle] = handle[:3], handle[3:]
         bound = BoundKernel(self.model, data, self._parameters)
         record, step = bound.state[0], bound.step
-        finish = direct(finish_contacts, record)
+        finish, work = direct(finish_contacts, record), 0
         try:
-            for _ in range(count):
+            for done in range(count):
                 step(self.model, data)
                 finish(record)
+                work += self.model.nv + data.nefc
+                is_long = work > MAX_WORK and done >= LEAST_STEPS
+                if is_long or not np.isfinite(data.qvel).all():
+                    return
                 yield data.actuator_force[self._outputs].copy()
         finally:
             bound.release()
@@ -604,8 +616,9 @@ def start_handle(
     has_spring, strays = stiffness > 0.0, []
     for pose in poses:
         wrenches = np.array(list(Rehearsal(scene, parameters).steps(pose, TRIAL_STEPS)))
-        change = (wrenches - wrenches[0])[:, has_spring]
-        strays.append(float((change**2 / stiffness[has_spring]).sum(axis=1).max()))
+        change = (wrenches - wrenches[:1]).reshape(-1, 6)[:, has_spring]
+        strayed = (change**2 / stiffness[has_spring]).sum(axis=1)
+        strays.append(float(strayed.max()) if len(wrenches) == TRIAL_STEPS else math.inf)
     return poses[int(np.argmin(strays))]
 
 
@@ -630,9 +643,92 @@ def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool =
     try:
         scene.model.opt.gravity *= has_weight
         steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
-        return max(float(np.linalg.norm(wrench[:3])) for wrench in steps)
+        return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
     finally:
         scene.model.opt.gravity = gravity
+
+
+TIPPED = 0.1
+"""Distance in m by which the grip of a tool that topples is moved, that of a hand that lets it go.
+Farther away a tool pulls more, and one that a device can hold longer would be carried."""
+
+SLOWEST_TOPPLING = 1.0
+"""Rate in 1/s from which a tool topples. A hand leads a slower one, such as a pole of 15 m."""
+
+LEAST_LEVER = 1e-3
+"""Way of the grip over the way of the joints in a mode, in m, below which the mode leaves the grip
+where it is, and the hand cannot feel it."""
+
+RESTING = 1.0
+"""Acceleration in m/s² of a grip, a tenth of gravity's, below which a tool without hand stands."""
+
+
+def toppling_force(scene: Scene, parameters: RunParameters) -> float:
+    """Returns the force in N with which a still hand holds a tool that has toppled in it.
+
+    A tool stands without a hand if no contact or other constraint holds it and its grip hardly
+    accelerates. It topples if the stiffness of its tree, of gravity, springs and servos but without
+    the coupling,
+
+        K_t = −∂Q/∂q,    K_t φ = λ M φ,    rate = √−λ
+
+    has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. The
+    handle then holds the grip at ``TIPPED`` along the fastest mode φ. Zero if it does not topple,
+    or the mode does not move the grip.
+
+    Args:
+        scene: The prepared scene, at its start; it is not changed.
+        parameters: Parameters of the run.
+    """
+    rehearsal, site = Rehearsal(scene, parameters), scene.model.site(scene.grip).id
+    model, data = rehearsal.model, rehearsal.data
+    dofs = np.flatnonzero(tree_of_tool(model, int(model.site_bodyid[site])).dofs)
+    jacobian, mass = np.zeros((3, model.nv)), np.zeros((model.nv, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, site)
+    is_held = np.any(data.qfrc_constraint[dofs])
+    if is_held or np.linalg.norm(jacobian[:, dofs] @ data.qacc[dofs]) > RESTING:
+        return 0.0
+    mujoco.mj_fullM(model, data, mass)
+    root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(dofs, dofs)]))
+    stiffness = root @ _stiffness_without_hand(model, data, dofs) @ root.T
+    squares, modes = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
+    mode = np.zeros(model.nv)
+    mode[dofs] = root.T @ modes[:, 0]
+    way = float(np.linalg.norm(jacobian @ mode))
+    if squares[0] > -(SLOWEST_TOPPLING**2) or way < LEAST_LEVER * float(np.linalg.norm(mode)):
+        return 0.0
+    mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
+    mujoco.mj_kinematics(model, data)
+    orientation = np.zeros(4)
+    mujoco.mju_mat2Quat(orientation, data.site_xmat[site])
+    handle = (*data.site_xpos[site].tolist(), *orientation.tolist())
+    wrenches = np.array(list(rehearsal.steps(handle, HOLDING_STEPS)))
+    return float(np.linalg.norm(wrenches.reshape(-1, 6)[:, :3].mean(axis=0)))  # it swings
+
+
+def _stiffness_without_hand(
+    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Returns −∂Q/∂q of some degrees of freedom at rest, without the coupling."""
+    start, own, columns = data.qpos.copy(), list(coupling_ids(model)), []
+    bias = model.actuator_biasprm[own].copy()
+    model.actuator_biasprm[own] = 0.0
+    try:
+        for unit in np.eye(model.nv)[dofs]:
+            forces = []
+            for size in (-PROBE, PROBE):
+                data.qpos[:] = start
+                mujoco.mj_integratePos(model, data.qpos, unit, size)
+                for stage in (mujoco.mj_fwdKinematics, mujoco.mj_transmission):
+                    stage(model, data)
+                mujoco.mj_fwdVelocity(model, data)
+                mujoco.mj_fwdActuation(model, data)
+                forces.append((data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator)[dofs])
+            columns.append((forces[0] - forces[1]) / (2.0 * PROBE))
+    finally:
+        model.actuator_biasprm[own] = bias
+        data.qpos[:] = start
+    return np.array(columns).T
 
 
 def loaded_handle(

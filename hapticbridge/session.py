@@ -38,9 +38,11 @@ from hapticbridge.options import RunSetup
 from hapticbridge.realtime import Grant, check_pace, memory_at_rest, warn_of_refusals
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare
 from hapticbridge.run_description import attachments, describe_run, start_state
+from hapticbridge.signals import deferring_stops
 from hapticbridge.summary import RunOutcome, Summary
 
 SUSPENDED_NS = 50_000_000
@@ -87,11 +89,13 @@ class RecordOutput:
         path: File of the recording; None records nothing.
         observer: Second reader of the records, such as ``view.Window``; None without one.
         live: True shows the state of the run on standard error.
+        signer: Key that signs the recording when it is closed; None leaves it unsigned.
     """
 
     path: Path | None = None
     observer: RingObserver | None = None
     live: bool = False
+    signer: Signer | None = None
 
     def open_stream(
         self, period: float, snapshot: Snapshot | None, *, may_wait: bool
@@ -216,6 +220,7 @@ class Session:
         mark: The mark button; None without one.
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
+        signal: Name of the signal that ended the last run; empty if none did.
         is_open: False after ``close``.
 
     Raises:
@@ -230,8 +235,9 @@ class Session:
         self.stop = stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
-        self.stopped_by = self._signal = ""
+        self.stopped_by = self.signal = ""
         self._grants: tuple[Grant, ...] = ()
+        self._is_begun = False
         self.inputs: deque[list[Write]] = deque()
         self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
         with ExitStack() as resources:
@@ -239,7 +245,7 @@ class Session:
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._resources = resources.pop_all()
-        self.is_open = True
+        self._is_begun = self.is_open = True
 
     def _open(self, resources: ExitStack) -> None:
         setup, scene, clock = self.setup, self.setup.scene, self.clock
@@ -248,11 +254,14 @@ class Session:
         if not setup.tool_weight and not scene.is_carried:
             scene.carry_tool("--no-tool-weight")
         effective = prepare(scene, setup.coupling, setup.period, setup.substeps, setup.method)
-        self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
-        if self._snapshot is not None:
-            resources.callback(self._snapshot.close)
-        self.stream = self.output.open_stream(setup.period, self._snapshot, may_wait=clock.may_wait)
-        resources.callback(self.stream.close)
+        with deferring_stops():
+            self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
+            if self._snapshot is not None:
+                resources.callback(self._snapshot.close)
+            self.stream = self.output.open_stream(
+                setup.period, self._snapshot, may_wait=clock.may_wait
+            )
+            resources.callback(self._close_stream)
         sample = np.zeros(1, SAMPLE_DTYPE)
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
@@ -260,6 +269,8 @@ class Session:
             check_pace(scene, setup.method, setup.period, setup.substeps, is_real=is_real)
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
+        # before the recorder is waited for, which may stand still
+        resources.callback(self.device.close)
         sample[:] = self.device.start(setup.period)
         refuse_implausible_pose(self.device.info, sample)
         self.parameters = setup.holding(sample, effective)
@@ -310,6 +321,11 @@ class Session:
         )
         self._resources.close()
 
+    def _close_stream(self) -> None:
+        """Finishes the recording, or removes it if start-up failed or a signal came before."""
+        is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
+        self.stream.close(self.output.signer, is_discarded=is_discarded)
+
     def begin(self, duration: float | None) -> None:
         """Sets the end of a run and its event; a later run starts with a ramp of the force.
 
@@ -330,7 +346,7 @@ class Session:
         if self.tick:  # the device may have moved meanwhile, under zero force
             self.kernel.bound.resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
-        self.stopped_by = self._signal = ""
+        self.stopped_by = self.signal = ""
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
         self.kernel.is_ahead = self.setup.is_pipelined and can_split(model, method.scheme)
@@ -399,7 +415,7 @@ class Session:
         """Takes the requests that ended the run; later ones end the next run."""
         by, signal = self.stop.take()
         if by:
-            self.stopped_by, self._signal = by, signal
+            self.stopped_by, self.signal = by, signal
 
     def command_zero_force(self) -> str:
         """Commands zero force; returns the reason if that failed, or an empty text."""
@@ -420,7 +436,7 @@ class Session:
         self.stream.event(event, self.tick, self.clock.now(), **details)
 
     def _signal_detail(self) -> dict[str, str]:
-        return {"signal": self._signal} if self._signal else {}
+        return {"signal": self.signal} if self.signal else {}
 
     def summary(self) -> Summary:
         """Returns the summary of all ticks so far."""

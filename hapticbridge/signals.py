@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import sys
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 STOP_SIGNALS = tuple(
     getattr(signal, name)
@@ -20,8 +24,10 @@ force on. So does a process killed by Ctrl-\\ (SIGQUIT) or by a limit on its pro
 
 
 @contextmanager
-def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
-    """Calls ``stop`` with the name of each stop signal, in the main thread only.
+def stopping_on_signals(
+    stop: Callable[[str], None], numbers: Sequence[int] = STOP_SIGNALS
+) -> Iterator[None]:
+    """Calls ``stop`` with the name of each of these signals, in the main thread only.
 
     Ignored signals stay ignored, such as SIGHUP under ``nohup``. A signal handled by a library in C
     stays with it, because Python could not restore its handler. A ``KeyboardInterrupt`` during a
@@ -36,7 +42,7 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     others = (signal.SIG_IGN, None)
-    heeded = [number for number in STOP_SIGNALS if signal.getsignal(number) not in others]
+    heeded = [number for number in numbers if signal.getsignal(number) not in others]
     previous = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield
@@ -46,21 +52,108 @@ def stopping_on_signals(stop: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
-def interrupting_on_signals() -> Iterator[list[Callable[[str], None]]]:
-    """Makes every stop signal act like Ctrl-C, so that all resources are closed.
+def deferring_stops() -> Iterator[None]:
+    """Defers stop signals for the main thread while it takes hold of something, such as a process.
 
-    Yields a list of callbacks. While it is empty a signal raises KeyboardInterrupt; otherwise the
-    last callback receives the signal's name.
+    They are raised again at the end. Keep the block short.
     """
-    callbacks: list[Callable[[str], None]] = []
+    noted: list[str] = []
+    try:
+        with stopping_on_signals(noted.append):
+            yield
+    finally:
+        for name in noted:
+            signal.raise_signal(signal.Signals[name])
 
-    def heed(name: str) -> None:
-        if not callbacks:
-            raise KeyboardInterrupt
-        callbacks[-1](name)
 
-    with stopping_on_signals(heed):
-        yield callbacks
+class StopSignal(KeyboardInterrupt):
+    """A signal that ends the program in order, where no run takes it.
+
+    Args:
+        number: Number of the signal.
+
+    Attributes:
+        number: Number of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def stop_words(number: int) -> tuple[str, int]:
+    """Returns the sentence on a signal that ended the program, and its exit code 128 + number."""
+    name = signal.Signals(number).name
+    return "interrupted" if number == signal.SIGINT else f"stopped by {name}", 128 + number
+
+
+RELEASE_TIME = 5.0
+"""Time in s for which a second signal does not interrupt the release of resources that the first
+one began. All waits of a release together are shorter."""
+
+
+class Interrupts:
+    """Stop signals as exceptions, until a run takes them over.
+
+    Code in C may swallow the exception of a signal, such as a callback of the importer or of the
+    compiler; ``check`` raises it again.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._raised_at = -math.inf
+        self._taker: Callable[[str], None] | None = None
+
+    def heed(self, name: str) -> None:
+        """Handles a signal by its name."""
+        if self._taker is not None:
+            self._taker(name)
+            return
+        self.number = self.number or signal.Signals[name]
+        now = time.monotonic()
+        if now - self._raised_at > RELEASE_TIME:
+            self._raised_at = now
+            raise StopSignal(self.number)
+
+    def check(self) -> None:
+        """Raises ``StopSignal`` if a signal came, whatever became of its exception."""
+        if self.number:
+            raise StopSignal(self.number)
+
+    def hand_over(self, taker: Callable[[str], None]) -> None:
+        """Passes the names of later signals to a function; raises ``StopSignal`` if one came."""
+        self._taker = taker
+        self.check()
+
+
+ENDING_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""Signals that end a command in order. One that holds no force may be suspended (SIGTSTP)."""
+
+
+@contextmanager
+def interrupting_on_signals(numbers: Sequence[int] = STOP_SIGNALS) -> Iterator[Interrupts]:
+    """Makes stop signals act like Ctrl-C, so that all resources are closed.
+
+    Raises:
+        StopSignal: A signal came; also in place of an error that its exception became in C code.
+    """
+    interrupts, usual = Interrupts(), sys.unraisablehook
+
+    def report(unraisable: Any) -> None:
+        if not isinstance(unraisable.exc_value, StopSignal):  # ``check`` raises it again
+            usual(unraisable)
+
+    with stopping_on_signals(interrupts.heed, numbers):
+        sys.unraisablehook = report
+        try:
+            yield interrupts
+        except Exception:
+            interrupts.check()
+            raise
+        finally:
+            sys.unraisablehook = usual
 
 
 @contextmanager
@@ -92,19 +185,25 @@ def holding_interrupts() -> Iterator[None]:
 
 
 @contextmanager
-def leaving_on_interrupt(code: int) -> Iterator[None]:
-    """Ends the process at once on Ctrl-C, without a message, while there is nothing to lose.
+def leaving_on_signals() -> Iterator[None]:
+    """Ends the process at once on a signal of ``ENDING_SIGNALS``, while there is nothing to lose.
 
     It is for imports. There a ``KeyboardInterrupt`` is lost in callbacks of the importer, which
     print it, or becomes another error in a library's C code. A handler other than Python's own is
     kept.
     """
-    is_usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not is_usual or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda _number, _frame: os._exit(code))
+
+    def leave(number: int, _frame: FrameType | None) -> None:
+        words, code = stop_words(number)
+        os.write(2, f"{words}\n".encode())
+        os._exit(code)
+
+    usual = (signal.default_int_handler, signal.SIG_DFL)
+    is_main = threading.current_thread() is threading.main_thread()
+    heeded = [n for n in ENDING_SIGNALS if is_main and signal.getsignal(n) in usual]
+    previous = {number: signal.signal(number, leave) for number in heeded}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, handler in previous.items():
+            signal.signal(number, handler)

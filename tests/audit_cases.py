@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
@@ -23,6 +25,7 @@ from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
+from hapticbridge.recording.seal import KEY, SIGNATURE
 from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
@@ -97,8 +100,9 @@ def rewritten(
     meta: Mapping[str, str] | None = None,
     events: Sequence[Mapping[str, object]] | None = None,
     attachments: Mapping[str, bytes] | None = None,
+    signer: Any = None,
 ) -> Path:
-    """Writes a recording with parts changed, and a digest that fits them."""
+    """Writes a recording with parts changed, and a seal that fits them."""
     files = {**recording.attachments, **(attachments or {})}
     writer = RecordingWriter(
         path,
@@ -111,8 +115,40 @@ def rewritten(
     for event in recording.events if events is None else events:
         time = event["time_ns"]
         writer.write_event(event, time if isinstance(time, int) else 0)
-    writer.close()
+    writer.close(signer)
     return path
+
+
+def key_pair(folder: Path, name: str = "lab") -> Path:
+    """Writes a private key and its public one as ssh-keygen does; returns the private one."""
+    key, path = Ed25519PrivateKey.generate(), folder / name
+    path.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.OpenSSH,
+            serialization.NoEncryption(),
+        )
+    )
+    path.chmod(0o600)
+    public = key.public_key().public_bytes(
+        serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
+    )
+    path.with_suffix(".pub").write_bytes(public + f" {name}@bench\n".encode())
+    return path
+
+
+class OldSignature:
+    """Signs a changed file with the signature of another one.
+
+    Args:
+        seal: Seal of the other file.
+    """
+
+    def __init__(self, seal: Mapping[str, str]) -> None:
+        self.old = {name: seal[name] for name in (KEY, SIGNATURE)}
+
+    def signed(self, seal: Mapping[str, str]) -> dict[str, str]:
+        return {**seal, **self.old}
 
 
 def without_model(recording: Recording) -> Recording:

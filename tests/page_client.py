@@ -14,6 +14,8 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
+from hapticbridge.view.window import Address
+
 PATIENCE = 60.0
 """In s, for a page to tell what it holds."""
 
@@ -86,7 +88,12 @@ class Hand:
 def hand(url: str) -> Iterator[Hand]:
     """Connects to a page."""
     version = [Subprotocol(f"viser-v{viser.__version__}")]
-    with connect(url.replace("http", "ws"), subprotocols=version, max_size=None) as socket:
+    page, _, token = url.partition("/?token=")
+    host = page.removeprefix("http://")
+    cookie = {"Cookie": Address(0, token).cookie(host).partition(";")[0]}
+    with connect(
+        f"ws://{host}/", subprotocols=version, max_size=None, additional_headers=cookie
+    ) as socket:
         found = Hand(socket)
         found.introduce()
         yield found

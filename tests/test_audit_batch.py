@@ -146,7 +146,7 @@ def test_the_table_is_sorted_by_margin_and_hides_nothing(runs: Path) -> None:
 def test_a_worker_that_fails_is_a_row_and_no_end(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(path: str, **options: bool) -> AuditReport:
+    def broken(path: str, **options: Any) -> AuditReport:
         if "tap" in path:
             raise MemoryError("too large")
         return audit(path, **options)

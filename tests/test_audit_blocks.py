@@ -27,11 +27,16 @@ def tap(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tapped(tmp_path_factory.mktemp("blocks"))
 
 
+@pytest.mark.parametrize("max_kept", [0, 249, 250])
 @pytest.mark.parametrize("size", [1, 7, 100, 1000])
-def test_blocks_joined_are_the_records_to_the_bit(size: int, tmp_path: Path) -> None:
+def test_blocks_joined_are_the_records_to_the_bit(
+    size: int, max_kept: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "MAX_KEPT", max_kept)
     rows = random_rows(250)
     write(tmp_path / "a.mcap", rows, batch=30)
     file = open_recording(tmp_path / "a.mcap")
+    assert (file.kept is None) == (max_kept < 250)
     blocks = list(file.blocks(size))
     assert same(np.concatenate(blocks), rows)
     assert {len(block) for block in blocks[:-1]} <= {size}
@@ -40,12 +45,17 @@ def test_blocks_joined_are_the_records_to_the_bit(size: int, tmp_path: Path) -> 
 
 def test_a_file_is_described_alike_with_and_without_its_records(tap: Path) -> None:
     whole, file = vars(read_recording(tap)), vars(open_recording(tap))
-    assert len(whole.pop("ticks")) == file["count"] == file["last_tick"] + 1
+    ticks, _ = whole.pop("ticks"), whole.pop("kept")
+    assert len(ticks) == file["count"] == file["last_tick"] + 1
+    assert same(file.pop("kept"), ticks)
     assert whole == file
-    assert file["digest"] == file["computed_digest"]
+    assert file["seal"] == file["computed_seal"]
 
 
-def test_a_file_that_changes_between_two_readings_is_noticed(tmp_path: Path) -> None:
+def test_a_file_that_changes_between_two_readings_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reader, "MAX_KEPT", 0)
     write(tmp_path / "a.mcap", random_rows(50))
     file = open_recording(tmp_path / "a.mcap")
     write(tmp_path / "a.mcap", random_rows(60))

@@ -1,7 +1,8 @@
 """Kinds of forgery of a recording, all checksums and digests written anew, and what becomes of it.
 
 Each is judged twice: simulated again, and as if recorded with another MuJoCo, from its records
-alone. Without a key a few cannot be seen; the table says why.
+alone. A few are seen only under a key; the table says why, and they are judged under one, too.
+``test_audit_signatures`` has the forgeries of file, seal and signature.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from typing import Any
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import ScriptedDevice, SlowClock, recorded, verdict_of
+from audit_cases import (
+    OldSignature,
+    ScriptedDevice,
+    SlowClock,
+    key_pair,
+    recorded,
+    rewritten,
+    verdict_of,
+)
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
@@ -30,6 +39,8 @@ from hapticbridge.guard import Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording.seal import Signer
+from hapticbridge.rendering import start_handle
 from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
 
 SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"
@@ -94,6 +105,15 @@ def swung(folder: Path) -> Path:
     coupling = Coupling(10_000.0, 0.05, 0.1, 1e-4)
     path = folder / "swung.mcap"
     return report_runs.made_in(path, scene, device, coupling, duration=1.0, controller="off")
+
+
+def weighed(folder: Path) -> Path:
+    """A hand carries a tool of 0.5 N."""
+    scene = report_runs.ANVIL.replace('mass="20000"', 'mass="0.05"')
+    scene = scene.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"')
+    device = SimulatedDevice(mass=0.2, damping=2.0, hand=report_runs.LIGHT_HAND)
+    coupling = Coupling(1000.0, 0.5, 0.1, 1e-4)
+    return report_runs.made_in(folder / "weighed.mcap", scene, device, coupling, duration=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -230,6 +250,18 @@ def doubled(recording: Recording) -> Parts:
     return {"events": [recording.events[0], *recording.events]}
 
 
+def added(place: int, event: dict[str, Any]) -> Change:
+    """Adds an event at a place of the list."""
+
+    def parts(recording: Recording) -> Parts:
+        time = recording.events[min(place, len(recording.events) - 1)]["time_ns"]
+        events = [*recording.events]
+        events.insert(place, event | {"time_ns": time})
+        return {"events": events}
+
+    return parts
+
+
 @dataclass(frozen=True)
 class Forgery:
     """A kind of forgery.
@@ -328,7 +360,8 @@ FORGERIES: dict[str, Forgery] = {
     },
     "guard: idle force": again(hand, guard("idle_force", 2.0)),
     "guard: idle torque": again(hand, guard("idle_torque", 2.0)),
-    "guard: hold force below the load": seen(hand, guard("hold_force", -1.0)),
+    "guard: hold force out of range": seen(hand, guard("hold_force", -1.0)),
+    "guard: hold force below the load": seen(weighed, guard("hold_force", 0.2)),
     **{
         f"guard: {name}": hidden(hand, guard(name, 1.1), UNREACHED)
         for name in ("stretch", "angle", "energy", "hold_force", "hold_torque")
@@ -365,6 +398,9 @@ FORGERIES: dict[str, Forgery] = {
     "skipped of the stop": seen(busy, event("stop", skipped=0)),
     "dropped of the stop": seen(busy, event("stop", dropped=7)),
     "reason of the stop": hidden(hand, event("stop", reason="caller"), OWN_WORD),
+    "two stops": seen(hand, lambda r: {"events": [*r.events, r.events[-1]]}),
+    "event before the start": seen(hand, added(0, {"event": "mark", "tick": 0})),
+    "event after the stop": seen(hand, added(2, {"event": "mark", "tick": 200})),
     "event after the end": seen(busy, event("input", tick=100_000)),
     "event without a tick": seen(busy, event("input", tick=None)),
     "no input": again(busy, without("input")),
@@ -421,12 +457,36 @@ def test_a_forgery_is_not_called_passive(
     blind = judged(forgery, recording, tmp_path, is_blind=True)
     assert blind.verdict == forgery.blind, blind.reason
     assert blind.exit_code == 1
+    if forgery.why:  # the forger of a signed file has only its old signature
+        key = key_pair(tmp_path)
+        signed = rewritten(recording, tmp_path / "signed.mcap", signer=Signer.load(key))
+        old, forged = OldSignature(read_recording(signed).seal), read_recording(report.path)
+        path = rewritten(forged, tmp_path / "forged.mcap", signer=old)
+        keyed = audit(path, trust=key.with_suffix(".pub"), accepts_unverified=True)
+        assert (keyed.verdict, keyed.exit_code) == ("unverified", 1)
+
+
+def test_a_run_whose_handle_started_away_from_the_grip_is_invalid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Simulated again it agrees with itself; only the scene tells where the handle belongs."""
+
+    def elsewhere(*arguments: Any) -> tuple[float, ...]:
+        x, *rest = start_handle(*arguments)
+        return (x + 1e-3, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hapticbridge.options.start_handle", elsewhere)
+        path = hand(tmp_path)
+    report = audit(path)
+    assert (report.verdict, "'handle_origin'" in report.reason) == ("invalid", True), report.reason
 
 
 def test_the_honest_recordings_are_what_the_forgeries_hide(
     honest: Callable[[Any], Recording],
 ) -> None:
-    expected = {hand: "passive", busy: "passive", tripped: "passive", swung: "active"}
+    expected = {hand: "passive", busy: "passive", tripped: "passive"}
+    expected |= {swung: "active", weighed: "passive"}
     for run, verdict in expected.items():
         report = audit(honest(run).path)
         assert (report.verdict, report.resimulation) == (verdict, "bit for bit"), report.reason

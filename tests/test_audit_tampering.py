@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hapticbridge.audit import audit
 from hapticbridge.export import export
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.recording.format import Digest
+from hapticbridge.recording.seal import Digest
 from hapticbridge.run_description import (
     SOURCE_PREFIX,
     STATE_ATTACHMENT,

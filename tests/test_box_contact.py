@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.kernel.box_contact import CONE, MOST_POINTS, NEAR
 from hapticbridge.kernel.colliders import EXACT_POINTS, bind_colliders, use_exact_points
+from hapticbridge.kernel.rigid_contact import MARGIN as REST
 
 Floats = NDArray[np.float64]
 
@@ -23,14 +24,18 @@ MARGIN = 2e-4
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
-def two_boxes(first: Floats, second: Floats, *, ours: bool = True) -> mujoco.MjModel:
+def two_boxes(
+    first: Floats, second: Floats, *, ours: bool = True, margin: float = MARGIN
+) -> mujoco.MjModel:
     """Returns a fixed box and a free one, with their half-sizes in m."""
     sizes = [" ".join(map(repr, map(float, size))) for size in (first, second)]
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
-      <default><geom type="box" margin="{MARGIN / 2}"/></default>
+      <default><geom type="box" margin="{margin / 2}"/></default>
       <worldbody>
         <geom size="{sizes[0]}"/>
-        <body><freejoint/><geom size="{sizes[1]}"/></body>
+        <body>
+          <freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><geom size="{sizes[1]}"/>
+        </body>
       </worldbody></mujoco>""")
     if ours:
         use_exact_points(model)
@@ -112,11 +117,15 @@ def separated(
     return np.asarray(position + way.min() * direction)
 
 
-def random_pairs(seed: int, count: int, wanted: float) -> list[Pair]:
+def random_pairs(
+    seed: int, count: int, wanted: float, *, size: float = 0.04, margin: float = MARGIN
+) -> list[Pair]:
+    """Returns pairs of boxes of ``size``/8 to ``size`` in m with a separation in m."""
     random = np.random.default_rng(seed)
     found = []
     for turn in turns(seed, count):
-        pair = Pair(two_boxes(random.uniform(0.005, 0.04, 3), random.uniform(0.005, 0.04, 3)))
+        sizes = random.uniform(size / 8, size, (2, 3))
+        pair = Pair(two_boxes(*sizes, margin=margin))
         direction = random.normal(size=3)
         direction /= np.linalg.norm(direction)
         pair.place(separated(pair.sizes, np.zeros(3), turn, direction, wanted), turn)
@@ -142,6 +151,20 @@ def test_the_smallest_gap_is_at_least_the_depth_of_penetration(wanted: float) ->
         exact = pair.gap()
         # beside the shortest way out a second one may count, of at most twice the depth
         assert 2 * exact - 1.1e-6 <= gaps.min() <= exact + 1e-9
+
+
+@pytest.mark.parametrize("size", [1e-3, 2e-4, 1e-4, 3e-5])
+def test_boxes_smaller_than_their_margin_have_their_own_gap_and_depth(size: float) -> None:
+    for wanted in (0.03 * size, 1e-3 * size, -1e-3 * size, -0.03 * size):
+        for pair in random_pairs(8, 25, wanted, size=size, margin=2 * REST):
+            gaps, positions, normals = pair.points()
+            exact = pair.gap()
+            assert min(2 * exact, exact) - 1e-3 * size <= gaps.min() <= exact + 1e-9
+            assert np.abs(positions).max() < 3 * size
+            # a normal along which the boxes are really that far apart
+            rotation, place = pair.data.geom_xmat[1].reshape(3, 3), pair.data.geom_xpos[1]
+            reach = np.abs(normals) @ pair.sizes[0] + np.abs(normals @ rotation) @ pair.sizes[1]
+            assert np.abs(normals @ place - reach - gaps).max() < 2 * CONE * size * np.sqrt(3)
 
 
 def test_a_normal_is_the_gradient_of_its_gap() -> None:

@@ -20,9 +20,8 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple
 from hapticbridge.guard import Limits
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.record import TICK_DTYPE, Timeline, due_times
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.recording.timeline import Timeline, due_times
 from hapticbridge.summary import Summary
 
 MISSED = {0: 2, 50: 1, 51: 7, 120: 30}

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from audit_cases import key_pair
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError
@@ -32,7 +33,7 @@ def tell(tick):
             time.sleep(60)
         print(bridge.session.stream.recorder.pid, child, flush=True)
 
-with hb.Bridge("virtual_wall", recording=sys.argv[1]) as bridge:
+with hb.Bridge("virtual_wall", recording=sys.argv[1], sign=sys.argv[3]) as bridge:
     summary = bridge.run(60.0, tell)
 print(summary.stopped_by, summary.ticks, summary.overruns, summary.dropped, summary.verdict)
 """
@@ -60,12 +61,13 @@ HOW = ("SIGINT", "SIGTERM", "SIGKILL", "both")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped]]:
     """Four runs at once, each stopped in its own way: most of their time is start and wait."""
     folder = tmp_path_factory.mktemp("killed")
+    key = key_pair(folder)
     started = {}
     stopped = {}
     try:
         for how in HOW:
             path = folder / f"{how}.mcap"
-            command = [sys.executable, "-c", SCRIPT, str(path), how]
+            command = [sys.executable, "-c", SCRIPT, str(path), how, str(key)]
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
             )
@@ -107,8 +109,9 @@ def test_signal_ends_a_run_cleanly(runs: dict[str, Stopped], how: str) -> None:
     assert stop["tick"] == len(recording.ticks) == int(ticks)
     assert 600 < int(ticks) < 60_000
     assert (stop["overruns"], stop["dropped"]) == (int(overruns), int(dropped))
-    report = audit(run.path)
+    report = audit(run.path, trust=run.path.with_name("lab.pub"))
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert report.is_trusted
 
 
 def test_real_clock_counts_every_skipped_deadline(runs: dict[str, Stopped]) -> None:
@@ -132,6 +135,10 @@ def test_killed_bridge_leaves_a_whole_recording_that_says_so(runs: dict[str, Sto
     report = audit(run.path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.events["bridge_died"] == 1
+    trusted = audit(run.path, trust=run.path.with_name("lab.pub"))
+    assert (trusted.verdict, trusted.exit_code) == ("unverified", 1)
+    assert trusted.signature == "the file is not signed (the bridge died during the run)"
+    assert (report.is_cut, report.cut) == (True, "the bridge died during the run")
 
 
 def test_killed_bridge_and_recorder_leave_a_cut_recording_that_repair_mends(
@@ -147,6 +154,7 @@ def test_killed_bridge_and_recorder_leave_a_cut_recording_that_repair_mends(
         repair(cut, cut)
     repair(cut, mended)
     after = audit(mended)
-    assert (after.verdict, after.is_cut, after.ticks) == ("passive", False, report.ticks)
+    assert (after.verdict, after.is_cut, after.ticks) == ("passive", True, report.ticks)
+    assert after.cut == "the file had lost its end and was repaired"
     before, now = read_recording(cut).ticks, read_recording(mended).ticks
     assert np.array_equal(before, now)

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.errors import DeviceError, DeviceLost, HapticBridgeError, SafetyTrip
+from hapticbridge.errors import (
+    DeviceError,
+    DeviceLost,
+    HapticBridgeError,
+    RecordingError,
+    SafetyTrip,
+)
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as stream_module
@@ -226,3 +232,39 @@ def test_a_stop_ends_a_run_whose_recorder_stalls(tmp_path: Path) -> None:
             os.kill(pid, signal.SIGCONT)
     assert summary.stopped_by == "caller"
     assert summary.ticks < 100_000
+
+
+def test_the_device_is_closed_before_the_recorder_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    usual = Recorder.close
+
+    def noted(recorder: Recorder) -> None:
+        order.append("recorder")
+        usual(recorder)
+
+    monkeypatch.setattr(Recorder, "close", noted)
+    device = ScriptedDevice(sway, on_close=lambda: order.append("device"))
+    recorded(tmp_path / "run.mcap", "point_mass", device, duration=0.01)
+    assert order[:2] == ["device", "recorder"]
+    assert not device.writes[-1].any()
+
+
+def test_a_recorder_that_takes_no_record_ends_a_simulated_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (("RING_PATIENCE", 0.2), ("RING_SECONDS", 0.05), ("STANDSTILL", 0.2)):
+        monkeypatch.setattr(stream_module, name, value)
+    device, path = ScriptedDevice(sway), tmp_path / "run.mcap"
+    with (
+        pytest.raises(RecordingError, match="is left to finish"),
+        fast("point_mass", device, recording=path) as bridge,
+    ):
+        recorder = bridge.session.stream.recorder
+        assert isinstance(recorder, Recorder)
+        os.kill(recorder.pid, signal.SIGSTOP)
+        with pytest.raises(RecordingError, match=r"has taken no record for 0\.2 s"):
+            bridge.run(1000.0)
+        assert not device.writes[-1].any()
+    os.kill(recorder.pid, signal.SIGKILL)

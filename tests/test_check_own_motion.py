@@ -8,7 +8,7 @@ from cli_cases import Called
 
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, OwnMotion, own_motion, own_substeps
-from hapticbridge.scene import SceneSource, read_scene
+from hapticbridge.scene import SceneSource, compile_scene, read_scene
 
 PERIOD = 1e-3
 SWING = """<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 0"/><worldbody>
@@ -38,7 +38,7 @@ def scene(folder: Path, text: str) -> SceneSource:
 
 
 def moved(source: SceneSource, substeps: int = 1) -> OwnMotion:
-    found = own_motion(source, "grip", Setting(NO_HAND, PERIOD, substeps))
+    found = own_motion(source, compile_scene(source), Setting(NO_HAND, PERIOD, substeps))
     assert found is not None
     return found
 
@@ -52,7 +52,9 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
     found = moved(scene(tmp_path, SWING.format(step=0.01, integrator="implicitfast")))
     assert found.jnd > 5.0
     assert found.body == "swing"
-    assert "--rate 100" in found.remedy(PERIOD)
+    assert "--rate 100" in found.remedy(Setting(NO_HAND, PERIOD))
+    assert "--contact scene" in found.remedy(Setting(NO_HAND, 0.01))
+    assert "--substeps" in found.remedy(Setting(NO_HAND, 0.01, contact="scene"))
     for step in (0.0002, 0.001):
         assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
 
@@ -60,17 +62,18 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
 def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
     needs = scene(tmp_path, FILTER)
     assert moved(needs).jnd > 1.0
-    substeps, found = own_substeps(needs, "grip", PERIOD)
+    substeps, found = own_substeps(needs, compile_scene(needs), Setting(NO_HAND, PERIOD))
     assert substeps == 10
     assert found is not None
     assert found.jnd < 1.0
     does_not = scene(tmp_path, SWING.format(step=0.0002, integrator="RK4"))
-    assert own_substeps(does_not, "grip", PERIOD)[0] == 1
+    assert own_substeps(does_not, compile_scene(does_not), Setting(NO_HAND, PERIOD))[0] == 1
 
 
 def test_a_scene_that_diverges_by_itself_has_nothing_to_respect(tmp_path: Path) -> None:
     text = FILTER.replace('"0.0001"', '"0.002"')
-    assert own_motion(scene(tmp_path, text), "grip", Setting(NO_HAND, PERIOD)) is None
+    diverges = scene(tmp_path, text)
+    assert own_motion(diverges, compile_scene(diverges), Setting(NO_HAND, PERIOD)) is None
 
 
 def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
@@ -80,3 +83,24 @@ def test_run_keeps_the_short_step(call: Called, tmp_path: Path) -> None:
     assert (code, "10 MuJoCo steps per tick" in err) == (0, True)
     code, _, err = call(*command, "--substeps", 1)
     assert (code, "stretch limit" in err) == (3, True)
+
+
+SPINNING = """<mujoco><option gravity="0 0 0"/><worldbody>
+<body><joint axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass="1"/>
+<body pos=".3 0 0"><joint axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .2 0 .1" size=".02" mass=".5"/></body></body>
+<body name="t" pos="0 1 0"><freejoint/><geom size=".02" mass=".1"/><site name="grip"/></body>
+</worldbody><keyframe><key name="home" qpos="0 0 0 1 0 1 0 0 0" qvel="{0} {1} 0 0 0 0 0 0"/>
+</keyframe></mujoco>"""
+"""An arm of two joints without friction beside the tool."""
+
+
+def test_energy_that_fast_joints_create_is_told_with_its_size(tmp_path: Path) -> None:
+    created = []
+    for substeps in (1, 2, 4):
+        found = moved(scene(tmp_path, SPINNING.format(8, 20)), substeps)
+        assert "fast joints" in found.creation
+        created.append(found.created)
+    assert 1.8 < created[0] / created[1] < 2.2  # in proportion to the step
+    assert 1.8 < created[1] / created[2] < 2.2
+    assert not moved(scene(tmp_path, SPINNING.format(0, 0.5))).creation

@@ -37,7 +37,7 @@ def test_active_and_invalid_recordings_are_exit_code_1(
 def test_strict_is_passed_on(call: Called, run_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def judged(path: Path, *, strict: bool, **options: bool) -> Any:
+    def judged(path: Path, *, strict: bool, **options: Any) -> Any:
         seen.append(strict)
         return audit(path, strict=strict, **options)
 
@@ -207,7 +207,7 @@ def test_a_run_that_was_not_simulated_again_is_unverified_everywhere(
     assert "recorded with mujoco 3.0" in out
     assert call("audit", path, "--accept-unverified")[0] == 0
     text = page.read_text()
-    assert '<span class="word">unverified</span>' in text
+    assert '<span class="word">unverified</span> (strict)' in text
     assert "recorded with mujoco 3.0" in text
     code, out, _ = call("audit", path, "--json")
     assert (code, json.loads(out)[0]["verdict"]) == (1, "unverified")

@@ -11,6 +11,7 @@ import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import pytest
@@ -18,7 +19,7 @@ from cli_cases import Called, one_sentence
 
 from hapticbridge.cli import main
 from hapticbridge.cli.main import COMMANDS, command_class
-from hapticbridge.signals import leaving_on_interrupt
+from hapticbridge.signals import leaving_on_signals
 
 HEAVY = frozenset(
     {"numpy", "mujoco", "numba", "llvmlite", "scipy", "matplotlib", "tyro", "rich", "mcap"}
@@ -88,14 +89,14 @@ usual = builtins.__import__
 
 def interrupting(name, *rest):
     if name == "mujoco":
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), int(sys.argv[1]))
     return usual(name, *rest)
 
 
 builtins.__import__ = interrupting
 sys.exit(main(["scenes"]))
 """
-"""Ctrl-C in the middle of the imports."""
+"""A signal in the middle of the imports."""
 
 
 def loaded_by(*arguments: str) -> set[str]:
@@ -169,25 +170,37 @@ def test_a_renderer_that_mujoco_does_not_know_is_one_sentence(value: str) -> Non
     assert "'disable'" in line
 
 
-def test_ctrl_c_while_it_imports_is_silence_and_exit_code_130() -> None:
-    command = [sys.executable, "-c", INTERRUPTED]
+WORDS = {
+    "SIGINT": (130, "interrupted\n"),
+    "SIGTERM": (143, "stopped by SIGTERM\n"),
+    "SIGHUP": (129, "stopped by SIGHUP\n"),
+}
+
+
+@pytest.mark.parametrize("name", WORDS)
+def test_a_signal_while_it_imports_is_one_sentence_and_its_exit_code(name: str) -> None:
+    command = [sys.executable, "-c", INTERRUPTED, str(int(signal.Signals[name]))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (WORDS[name][0], "", WORDS[name][1])
 
 
-def test_a_handler_of_sigint_that_is_not_pythons_own_is_kept() -> None:
+@pytest.mark.parametrize(
+    ("number", "usual"),
+    [(signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)],
+)
+def test_a_handler_that_is_not_pythons_own_is_kept(number: int, usual: Any) -> None:
     def kept(_number: int, _frame: object) -> None: ...
 
-    before = signal.signal(signal.SIGINT, kept)
+    before = signal.signal(number, kept)
     try:
-        with leaving_on_interrupt(130):
-            assert signal.getsignal(signal.SIGINT) is kept
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        with leaving_on_interrupt(130):
-            assert signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        with leaving_on_signals():
+            assert signal.getsignal(number) is kept
+        signal.signal(number, usual)
+        with leaving_on_signals():
+            assert signal.getsignal(number) is not usual
+        assert signal.getsignal(number) is usual
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
 
 
 @pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])

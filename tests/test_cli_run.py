@@ -6,6 +6,8 @@ import json
 import os
 import pkgutil
 import signal
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ import pytest
 from audit_cases import ScriptedDevice
 from bridge_runs import still, sway
 from cli_cases import Called, one_sentence
+from faults.catalogue import SPECTATOR
+from faults.processes import PATIENCE, STOPS, children
 
 from hapticbridge.audit import audit
 from hapticbridge.cli import main
@@ -91,14 +95,14 @@ def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
     assert not list(tmp_path.glob("*LOG*"))
 
 
-SIGNALS = pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+SIGNALS = pytest.mark.parametrize("name", STOPS)
 
 
 @pytest.fixture
 def unheeded() -> Iterator[list[int]]:
     """What Python's own handler would have got; that would end the tests with this one."""
     got: list[int] = []
-    numbers = signal.SIGINT, signal.SIGTERM
+    numbers = [signal.Signals[name] for name in STOPS]
     before = {each: signal.signal(each, lambda number, _: got.append(number)) for each in numbers}
     yield got
     for each, handler in before.items():
@@ -128,15 +132,62 @@ def test_a_signal_before_and_after_the_loop_ends_the_run_cleanly(
     monkeypatch.setattr(f"hapticbridge.{moment}", signalled)
     code, out, err = call("run", "point_mass", "--fast", "--duration", 0.01, "--record", path)
     assert device.is_closed and not np.any(device.writes) and not unheeded
-    if moment == "session.prepare":
-        assert (code, out, err.splitlines()[-1]) == (130, "", "interrupted")
+    if moment in {"session.prepare", "bridge.Bridge.run"}:  # before the first tick
+        ending = *STOPS[name], ""
+        assert (code, err.splitlines()[-1], out) == ending
+        assert not path.exists()
         return
-    ticks, words = (0, "signal") if moment.endswith("run") else (10, "duration")
-    assert (code, f"{ticks} ticks ({words})" in out) == (0, True)
+    assert (code, "10 ticks (duration)" in out) == (0, True)
     recording = read_recording(path)
-    assert not recording.is_cut and len(recording.ticks) == ticks and device.writes
-    assert recording.events[-1]["reason"] == words
-    assert recording.events[-1].get("signal", name) == name
+    assert not recording.is_cut and len(recording.ticks) == 10 and device.writes
+    assert recording.events[-1]["reason"] == "duration"
+
+
+MOMENTS = 8
+
+
+def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
+    call: Called, unheeded: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.view.window.check_view", lambda: None)
+    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", SPECTATOR)
+    run = ("run", "point_mass", "--fast", "--overwrite", "--view", "--port", 0)
+    began = time.monotonic()
+    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: ScriptedDevice(still))
+    assert call(*run, "--record", tmp_path / "first.mcap", "--duration", 0.01)[0] == 0
+    usual, generator = time.monotonic() - began, np.random.default_rng(8)
+    early, before = 0, children(os.getpid())
+    for number, moment in enumerate(generator.uniform(0.0, 1.1 * usual, MOMENTS)):
+        path, device = tmp_path / f"{number}.mcap", ScriptedDevice(still)
+        opened: list[ScriptedDevice] = []
+
+        def open_it(*_: Any, opened: Any = opened, device: Any = device) -> Any:
+            opened.append(device)
+            return device
+
+        monkeypatch.setattr("hapticbridge.cli.run.device_for", open_it)
+        name, is_over = list(STOPS)[number % 3], threading.Event()
+
+        def strike(seconds: float, name: str = name, is_over: Any = is_over) -> None:
+            while not is_over.wait(seconds):  # again, should it come before the command listens
+                os.kill(os.getpid(), signal.Signals[name])
+                seconds = 5.0
+
+        thread = threading.Thread(target=strike, args=(moment,))
+        thread.start()
+        code, _, err = call(*run, "--record", path)
+        is_over.set()
+        thread.join(PATIENCE)
+        assert children(os.getpid()) == before
+        assert not any(map(np.any, device.writes))
+        if code in {0, 1}:  # it ran
+            assert len(read_recording(path).ticks) > 0 and device.is_closed
+            continue
+        early += 1
+        assert (code, err.splitlines()[-1]) == STOPS[name]
+        assert not path.exists() and "Traceback" not in err
+        assert device.is_closed == bool(opened)
+    assert early
 
 
 @SIGNALS
@@ -163,7 +214,7 @@ def test_a_signal_while_a_device_is_measured_leaves_no_force(
     device = ScriptedDevice(sway, on_write=strike)
     monkeypatch.setattr(f"hapticbridge.cli.{module}.open_device", lambda *_, **__: device)
     code, _, err = call(*arguments)
-    assert (code, err.splitlines()[-1]) == (130, "interrupted")
+    assert (code, err.splitlines()[-1]) == STOPS[name]
     assert struck
     assert not device.writes[-1].any() and device.is_closed
     assert not unheeded

@@ -35,6 +35,19 @@ def test_what_was_finished_stands_alone_and_where_a_link_leads(tmp_path: Path) -
     assert path.read_text() == "new"
 
 
+def test_a_link_planted_beside_a_file_leads_nothing_elsewhere(tmp_path: Path) -> None:
+    path, other, names = tmp_path / "page.html", tmp_path / "other", set[str]()
+    other.write_text("mine")
+    for _ in range(2):
+        with atomic_write(path) as draft:
+            names.add(draft.name)
+            draft.write_text("new")
+        (tmp_path / min(names)).unlink(missing_ok=True)
+        (tmp_path / min(names)).symlink_to(other)  # under the name that the first draft had
+    assert (len(names), path.read_text(), other.read_text()) == (2, "new", "mine")
+    assert {Path(name).suffix for name in names} == {".html"}  # tells matplotlib the format
+
+
 def test_a_pipe_is_written_to_and_stays_one(tmp_path: Path) -> None:
     path = tmp_path / "pipe.csv"
     os.mkfifo(path)

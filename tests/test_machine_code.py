@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
+import os
+import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -75,7 +79,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A cache of its own."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     jit.cache_folder.cache_clear()
-    yield Path(jit.cache_folder())
+    found = jit.cache_folder()
+    assert found is not None
+    yield found
     jit.cache_folder.cache_clear()
 
 
@@ -132,20 +138,175 @@ def test_a_file_that_others_can_write_is_not_loaded(folder: Path) -> None:
     assert machine_code.read(folder / "a.o") is None
 
 
+@pytest.fixture
+def no_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], str]]:
+    """Moves the cache to where none may be; returns the reason that is told."""
+
+    def move(place: Path) -> str:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(place))
+        jit.cache_folder.cache_clear()
+        with pytest.warns(UserWarning, match="machine code is not kept") as told:
+            assert jit.cache_folder() is None
+        return str(told[0].message)
+
+    yield move
+    monkeypatch.undo()
+    jit.cache_folder.cache_clear()
+
+
 def test_a_folder_that_cannot_be_written_costs_only_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, no_folder: Callable[[Path], str]
 ) -> None:
     (tmp_path / "file").touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    jit.cache_folder.cache_clear()
-    try:
-        table = np.zeros((3, 4))
-        assert direct(compiled(rows_of), table)(table) == 43
-        assert direct(compiled(allocating), table)(table) == 0.0
-        assert compiled(rows_of)(table) == 43
-    finally:
-        jit.cache_folder.cache_clear()
+    assert "cannot be written: Not a directory" in no_folder(tmp_path / "file" / "cache")
+    table = np.zeros((3, 4))
+    assert direct(compiled(rows_of), table)(table) == 43
+    assert direct(compiled(allocating), table)(table) == 0.0
+    assert compiled(rows_of)(table) == 43
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
+    # where numba turns when it cannot write
+    assert not list((Path(__file__).parent / "__pycache__").glob("test_machine_code*.nb?"))
+
+
+def test_code_that_numba_cannot_write_goes_nowhere_else(folder: Path) -> None:
+    table = np.zeros((3, 4))
+    assert compiled(rows_of)(table) == 43
+    (own,) = folder.glob("rows_of-*")
+    shutil.rmtree(own)
+    own.touch()  # a file where numba wants a folder
+    assert compiled(rows_of)(table) == 43
+    assert not list((Path(__file__).parent / "__pycache__").glob("test_machine_code*.nb?"))
+
+
+OPEN: dict[str, tuple[str, int]] = {
+    "writable by all": ("cache/machine_code", 0o777),
+    "writable by its group": ("cache/machine_code", 0o770),
+    "readable, with files that numba may leave open": ("cache/machine_code", 0o755),
+    "in a folder of all": ("cache", 0o777),
+    "in a folder of a folder of all": (".", 0o777),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX permissions")
+@pytest.mark.parametrize("name", OPEN)
+def test_no_code_is_taken_from_a_folder_that_others_can_write(
+    name: str, tmp_path: Path, no_folder: Callable[[Path], str]
+) -> None:
+    (tmp_path / "cache" / "machine_code").mkdir(mode=0o700, parents=True)
+    place, mode = OPEN[name]
+    (tmp_path / place).chmod(mode)
+    assert str(tmp_path / place) in no_folder(tmp_path / "cache")
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="needs root's chown")
+@pytest.mark.parametrize("place", ["cache/machine_code", "cache", "."])
+def test_no_code_is_taken_from_a_folder_of_another_user(
+    place: str, tmp_path: Path, no_folder: Callable[[Path], str]
+) -> None:
+    (tmp_path / "cache" / "machine_code").mkdir(mode=0o700, parents=True)
+    os.chown(tmp_path / place, 65534, 65534)
+    assert str(tmp_path / place) in no_folder(tmp_path / "cache")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX permissions")
+def test_a_folder_below_one_like_tmp_is_safe_and_made_for_this_user_alone(tmp_path: Path) -> None:
+    (tmp_path / "tmp").mkdir()
+    (tmp_path / "tmp").chmod(0o1777)
+    before = os.umask(0)
+    try:
+        assert machine_code.fault_of(tmp_path / "tmp" / "cache" / "machine_code") == ""
+    finally:
+        os.umask(before)
+    found = (tmp_path / "tmp" / "cache" / "machine_code").stat()
+    assert stat.S_IMODE(found.st_mode) == 0o700
+
+
+SOURCES = {
+    "limits": "RAMP = 0.25\nTABLE = (1.0, 2.0)\n",
+    "flags": "import enum\nclass Flag(enum.IntEnum):\n    OPEN = 3\n",
+    "inner": """
+from hapticbridge.jit import compiled
+import numpy as np
+TURN = np.array([5.0, 6.0])
+@compiled
+def risen(time):
+    return 2.0 * time + TURN[1]
+""",
+    "outer": """
+from hapticbridge.jit import compiled
+from limits import RAMP, TABLE
+from flags import Flag
+from inner import risen
+@compiled
+def share(time):
+    return risen(time) / RAMP + TABLE[1] + (9.0 if Flag.OPEN == 3 else time)  # of the force
+""",
+}
+"""Modules of which the last is called: constants and functions come from the others."""
+
+CHANGES: dict[str, tuple[str, str, str]] = {
+    "a constant of another file": ("limits", "0.25", "0.5"),
+    "an item of a tuple": ("limits", "2.0", "3.0"),
+    "a member of an enumeration": ("flags", "3", "4"),
+    "a function that is called": ("inner", "2.0 *", "4.0 *"),
+    "an array of a function that is called": ("inner", "6.0", "7.0"),
+    "its own code": ("outer", "TABLE[1]", "TABLE[0]"),
+}
+
+
+def imported(sources: dict[str, str], folder: Path) -> Any:
+    """Writes modules and imports them anew; returns the function ``share``."""
+    folder.mkdir(exist_ok=True)
+    for name, text in sources.items():
+        (folder / f"{name}.py").write_text(text)
+        sys.modules.pop(name, None)
+    importlib.invalidate_caches()
+    return importlib.import_module("outer").share
+
+
+@pytest.fixture
+def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # two versions in a second look alike
+    yield tmp_path / "modules"
+    for name in SOURCES:
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("called", ["directly", "by numba"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_source_never_runs_its_old_code(
+    name: str, called: str, folder: Path, modules: Path
+) -> None:
+    def result(function: Any) -> Any:
+        return direct(function, 1.0)(1.0) if called == "directly" else function(1.0)
+
+    file, old, new = CHANGES[name]
+    changed = SOURCES | {file: SOURCES[file].replace(old, new)}
+    before = imported(SOURCES, modules)
+    # compiled after its file has changed: the old code is then the newest on disk
+    (modules / f"{file}.py").write_text(changed[file])
+    assert result(before) == expected(SOURCES)
+    assert result(imported(changed, modules)) == expected(changed) != expected(SOURCES)
+    assert any(folder.iterdir())
+
+
+def expected(sources: dict[str, str]) -> float:
+    """Computes ``share(1.0)`` in Python."""
+    names: dict[str, Any] = {}
+    for text in sources.values():
+        lines = [line for line in text.splitlines() if "import compiled" not in line]
+        plain = [line for line in lines if not line.startswith(("@compiled", "from "))]
+        exec("\n".join(plain), names)
+    return float(names["share"](1.0))
+
+
+def test_a_comment_or_another_folder_compiles_nothing_anew(folder: Path, modules: Path) -> None:
+    assert direct(imported(SOURCES, modules), 1.0)(1.0) == expected(SOURCES)
+    kept = sorted(folder.glob("*.o"))
+    commented = {name: f"# said\n{text}" for name, text in SOURCES.items()}
+    assert direct(imported(commented, modules), 1.0)(1.0) == expected(SOURCES)
+    assert sorted(folder.glob("*.o")) == kept != []
 
 
 def test_types_of_one_size_have_code_of_their_own(folder: Path) -> None:

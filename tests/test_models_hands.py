@@ -144,6 +144,7 @@ def test_both_ends_of_a_parameter_are_strict_in_any_hand(
             assert not any(warning.number for warning in loop.scene.data.warning)
             touching = outcome.records["contacts"] > (3 if name == "lock" else 0)
             used += int(np.count_nonzero(touching))
+        assert default_run(name, **{parameter.name: value}).summary.environment == "strict"
     assert used > (300 if name in {*FIRST, *TOWARDS} else -1)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
 import math
 import re
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import pytest
 from hapticbridge.cli.run import Run
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import AXES, DeviceInfo
+from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters
@@ -128,3 +130,30 @@ def test_a_coupling_without_rotational_gains_is_one_around_the_grip() -> None:
     for missing in (None, float("nan")):
         with pytest.raises(CouplingError, match="must be a finite number"):
             Coupling(2400.0, 0.5, missing, 0.0)  # type: ignore[arg-type] # on purpose
+
+
+WRONG = ["x", b"x", None, math.nan, [1.0], {}, object(), 10**320, 1 + 2j, -1.0, 0]
+"""Values of other kinds and sizes than a public constructor takes for most of its arguments."""
+
+PUBLIC: list[tuple[type[Any], dict[str, Any]]] = [
+    (Limits, {"force": 5.0, "torque": 0.5}),
+    (Workspace, {}),
+    (Coupling, {"stiffness": 1000.0, "damping": 1.0}),
+    (BridgeOptions, {}),
+    (DeviceInfo, {"name": "d", "axes": ("x", "y", "z"), "force_limit": 5.0}),
+    (Hand, {}),
+    (Motion, {"times": [0.0, 1.0], "positions": [[0.0, 0.0, 0.0]] * 2}),
+    (SimulatedDevice, {}),
+]
+
+
+@pytest.mark.parametrize(("made", "valid"), PUBLIC, ids=lambda item: getattr(item, "__name__", ""))
+def test_a_wrong_value_is_refused_in_a_sentence(made: type[Any], valid: dict[str, Any]) -> None:
+    refused = 0
+    for name, value in itertools.product(inspect.signature(made).parameters, WRONG):
+        try:
+            made(**valid | {name: value})
+        except HapticBridgeError as error:
+            refused += 1
+            assert len(str(error)) < 480 and "\n" not in str(error)
+    assert refused > 0.5 * len(WRONG) * len(inspect.signature(made).parameters)

@@ -6,6 +6,8 @@ import io
 import os
 import resource
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recorder, Ring, read_recording
+from hapticbridge.recording import recorder as recorder_module
 from hapticbridge.recording.recorder_process import LiveLine, RunState
 
 META = {"method": "implicit", "device": "{}"}
@@ -213,3 +216,70 @@ def test_live_line_on_a_terminal_is_redrawn_and_may_break() -> None:
     text = stream.getvalue()
     assert "2.0 s  0 N on the hand  environment 0 J  device 0 J  0 overruns" in text
     assert text.count("\n") <= 2
+
+
+def gone(pid: int) -> None:
+    """Waits until a child process has ended."""
+    limit = time.monotonic() + PATIENCE
+    while os.waitpid(pid, os.WNOHANG) == (0, 0):
+        assert time.monotonic() < limit
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("has_full_pipe", [False, True])
+def test_a_recorder_that_stands_still_is_left_to_finish(
+    ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_full_pipe: bool
+) -> None:
+    monkeypatch.setattr(recorder_module, "STANDSTILL", 0.2)
+    path = tmp_path / "run.mcap"
+    recorder = Recorder(ring, path, META, ())
+    recorder.wait_until_ready()
+    produce(ring, recorder, numbered(0, 600))
+    os.kill(recorder.pid, signal.SIGSTOP)
+    for number in range(3000 * has_full_pipe):
+        recorder.event({"event": "mark", "text": "x" * 100, "number": number}, number)
+    with pytest.raises(RecordingError, match="is left to finish"):
+        recorder.close()
+    recorder.close()
+    assert recorder.is_left
+    os.kill(recorder.pid, signal.SIGCONT)
+    gone(recorder.pid)
+    recording = read_recording(path)
+    assert recording.ticks["tick"].tolist() == list(range(600))
+    assert not recording.is_cut
+
+
+def test_a_recorder_without_a_file_that_stands_still_is_ended(
+    ring: Ring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "STANDSTILL", 0.2)
+    recorder = Recorder(ring, None, META, (), live=True)
+    recorder.wait_until_ready()
+    os.kill(recorder.pid, signal.SIGSTOP)
+    recorder.close()
+    assert not Path(f"/proc/{recorder.pid}").exists()
+
+
+def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    script = (
+        "import os, sys; from hapticbridge.recording import Recorder, Ring\n"
+        "ring = Ring.shared(512); recorder = Recorder(ring, sys.argv[1], {}, ())\n"
+        "recorder.wait_until_ready(); print(recorder.pid, flush=True); os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=PATIENCE,
+    )
+    limit = time.monotonic() + PATIENCE
+    while Path(f"/proc/{int(done.stdout)}/cmdline").exists():
+        if not Path(f"/proc/{int(done.stdout)}/cmdline").read_bytes():
+            break  # ended, and not yet waited for
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+    assert not path.exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 import subprocess
 import sys
 import threading
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import HEAD, TAIL, Ring
+from hapticbridge.recording import ring as ring_module
 
 
 def numbered(start: int, stop: int) -> NDArray[np.void]:
@@ -203,3 +206,108 @@ def test_what_is_no_ring_is_refused(tmp_path: Path, content: bytes) -> None:
         for capacity in (0, -1):
             with pytest.raises(RecordingError, match=f"at least 1 record, not {capacity}"):
                 make(capacity)
+
+
+FORMS: dict[str, Callable[[Path, Path], object]] = {
+    "pipe": lambda path, _: os.mkfifo(path),
+    "link": lambda path, other: path.symlink_to(other),
+    "link to nothing": lambda path, other: path.symlink_to(other.with_name("none")),
+    "folder": lambda path, _: path.mkdir(),
+    "file": lambda path, other: path.write_bytes(other.read_bytes()),
+}
+"""What may stand where a ring is looked for, beside a ring that nothing is wrong with."""
+
+
+@pytest.fixture
+def planted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Iterator[Path]:
+    """Something planted in the folder of shared memory, under a name like a ring's."""
+    monkeypatch.setattr("hapticbridge.recording.ring.memory_folder", lambda: tmp_path)
+    good = Ring.shared(3)
+    path = tmp_path / "hapticbridge-ring-1-planted"
+    FORMS[request.param](path, Path(str(good.name)))
+    if request.param == "file":  # a file of another user
+        path.chmod(0o666)
+        monkeypatch.setattr("os.getuid", lambda: path.stat().st_uid + 1)
+    yield path
+    good.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX files")
+@pytest.mark.parametrize("planted", FORMS, indirect=True)
+def test_what_another_user_planted_stops_no_ring_and_is_taken_for_none(
+    planted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers: list[object] = []
+
+    def attach() -> None:
+        try:
+            answers.append(Ring.attach(str(planted)))
+        except RecordingError as error:
+            answers.append(error)
+
+    def make() -> None:  # sweeps the folder before
+        monkeypatch.undo()
+        monkeypatch.setattr("hapticbridge.recording.ring.memory_folder", lambda: planted.parent)
+        with_time = Ring.shared(3)
+        answers.append(with_time.append(numbered(0, 3)))
+        with_time.close()
+
+    for act in (attach, make):
+        thread = threading.Thread(target=act, daemon=True)  # it would wait for the pipe's writer
+        thread.start()
+        thread.join(10.0)
+        assert not thread.is_alive()
+    assert isinstance(answers[0], RecordingError)
+    assert answers[1] == 3
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX files")
+@pytest.mark.parametrize("planted", ["file"], indirect=True)
+def test_a_sweep_leaves_what_belongs_to_another_user(planted: Path) -> None:
+    planted.chmod(0o600)
+    Ring.shared(3).close()
+    assert planted.exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX files")
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o777])
+def test_a_ring_is_its_owners_alone_under_any_umask(umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        ring = Ring.shared(3)
+        found = Path(str(ring.name)).stat()
+        other = Ring.attach(str(ring.name))
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(found.st_mode) == 0o600
+    assert ring.append(numbered(0, 3)) == len(other.take(9))
+    ring.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX files")
+@pytest.mark.parametrize("mode", [0o620, 0o602])
+def test_a_segment_that_others_can_write_is_not_mapped(shared: Ring, mode: int) -> None:
+    Path(str(shared.name)).chmod(mode)
+    with pytest.raises(RecordingError, match="this user alone"):
+        Ring.attach(str(shared.name))
+
+
+def test_a_fence_releases_a_lock_before_it_acquires_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On ARMv8 this order alone is a full barrier: acquiring, then releasing, lets both sides in.
+
+    The machines of these tests are x86, where each of them is one.
+    """
+    steps: list[str] = []
+
+    class Noting:
+        def __enter__(self) -> None:
+            steps.append("acquire")
+
+        def __exit__(self, *_: object) -> None:
+            steps.append("release")
+
+    monkeypatch.setattr(ring_module, "ORDER", Noting())
+    ring_module.fence()
+    assert "acquire" in steps[steps.index("release") :]

@@ -419,6 +419,29 @@ def test_an_oblique_blow_neither_sinks_in_where_it_sticks_nor_floats_where_it_sl
     assert np.abs(sliding[-10:]).max() < 1e-5
 
 
+@pytest.mark.parametrize("sideways", [-0.6, -0.3, 0.3, 0.6])
+@pytest.mark.parametrize("tilt", [0.3, 0.8, 1.2])
+def test_a_corner_that_stops_sliding_in_a_blow_does_not_sink_in(
+    sideways: float, tilt: float
+) -> None:
+    loaded, turn = scene(BLOCK), Rotation.from_euler("y", tilt)
+    corners = np.array(list(product((-1, 1), repeat=3))) * [0.015, 0.015, 0.01]
+    loaded.data.qpos[2] = -0.01 - turn.apply(corners)[:, 2].min() + 8e-4
+    loaded.data.qpos[3:] = turn.as_quat(scalar_first=True)
+    loaded.data.qvel[:3] = sideways, 0.0, -0.3
+    speed = loaded.data.qvel.copy()
+    run = prepared(loaded)
+    loaded.data.qvel[:] = speed
+    depths: list[float] = []
+
+    def note(_: int, data: mujoco.MjData) -> None:
+        lowest = data.geom_xpos[1] + corners @ data.geom_xmat[1].reshape(3, 3).T
+        depths.append(-0.01 - lowest[:, 2].min())
+
+    go_on(run, pressed(25, 0.0), after_tick=note)
+    assert -1e-5 < max(depths) < 2.5e-5
+
+
 @pytest.mark.parametrize("mu", [0.1, 0.4])
 def test_friction_breaks_away_at_coulombs_limit_and_slides_at_it(mu: float) -> None:
     samples = pressed(6000, 3.0)

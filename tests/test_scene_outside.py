@@ -134,7 +134,7 @@ def test_pin_gives_way_by_what_its_spring_says_and_comes_back(pin: Outcome) -> N
     # pushed beyond its stop it holds the hand: contact, spring and stop carry 3 mm · K
     assert travel[-1] == pytest.approx(-outside.PIN_DEPTH, abs=0.2e-3)
     last = pin.ticks[-1]
-    assert -last["wrench_on_tool"][2] == pytest.approx(0.003 * K, rel=0.1)
+    assert -last["wrench_on_tool"][2] == pytest.approx(0.003 * K, rel=0.15)
 
 
 def test_pin_run_stays_within_slack_and_meters_the_springs_energy(pin: Outcome) -> None:
@@ -293,6 +293,31 @@ def test_force_of_a_motor_is_not_taken_for_weight(tmp_path: Path) -> None:
         assert not bridge.scene.is_carried  # 15 N at an arm of 0.1 m, with or without gravity
 
 
+@pytest.mark.parametrize(
+    ("mass", "end", "is_carried"), [(5.0, 0.6, True), (0.5, 0.6, False), (5.0, -0.6, False)]
+)
+def test_heavy_pole_that_topples_in_the_hand_is_carried(
+    tmp_path: Path, mass: float, end: float, *, is_carried: bool
+) -> None:
+    """A rod of 0.6 m on a hinge, held at its middle, and its pull 0.1 m beside."""
+    text = f"""<mujoco><worldbody><body><joint axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 {end}" size="0.02" mass="{mass}"/>
+      <site name="grip" pos="0 0 {end / 2}"/></body></worldbody></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        said = [change for change in bridge.scene.changes if "weight" in change]
+        bridge.run(duration=2.0)
+    assert bool(said) == is_carried
+    if is_carried:
+        reason = re.search(
+            r"stands upright and topples: 0\.1 m beside, .* ([\d.]+) N, and", said[0]
+        )
+        assert reason
+        pull = mass * WEIGHT * np.tan(np.arcsin(0.1 / 0.3))
+        assert float(reason[1]) == pytest.approx(pull, rel=0.15)
+        with pytest.raises(hb.SceneError, match="topples"), started(tmp_path, text, as_is=True):
+            pass
+
+
 FLOPPY = """<mujoco>
   <worldbody>
     <body name="trunk" pos="0 0 1">
@@ -425,3 +450,22 @@ def test_body_welded_to_a_moved_mocap_body_follows_and_its_mover_pays(tmp_path: 
         assert bridge.scene.data.body("x").xpos[2] == pytest.approx(0.1999, abs=6e-4)
         weight = 0.2 * 9.81 * 0.0999
         assert bridge.ledger.external_work == pytest.approx(weight, rel=0.02)
+
+
+@pytest.mark.parametrize(("solref", "solimp", "hertz"), [("0.01 1", 0.25, 9.2), ("0.02 1", 0.9, 0)])
+def test_equality_meant_as_a_spring_is_announced_where_it_becomes_rigid(
+    tmp_path: Path, solref: str, solimp: float, hertz: float
+) -> None:
+    """ω² = d/(1 − d)/(timeconst dampratio)²; MuJoCo's default is stiffer."""
+    text = f"""<mujoco><worldbody><body name="m" mocap="true" pos="0 .1 .1"/>{_BALL}</worldbody>
+      <equality><weld name="spring" body1="m" body2="t" relpose="0 -.1 0 1 0 0 0"
+        solref="{solref}" solimp="{solimp} {solimp} 0.001"/></equality></mujoco>"""
+    with started(tmp_path, text) as bridge:
+        said = [change for change in bridge.scene.changes if "equality" in change]
+        bridge.run(duration=0.1)
+    assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
+    assert len(said) == bool(hertz)
+    if hertz:
+        assert f"'spring': a spring of {hertz:g} Hz → rigid (--contact scene keeps it" in said[0]
+        with started(tmp_path, text, contact="scene") as bridge:
+            assert not any("equality" in change for change in bridge.scene.changes)

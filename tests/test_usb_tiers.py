@@ -128,7 +128,7 @@ def test_snapshot_holds_what_is_ours(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for name in ("kernel/step.nbi", "kernel/step.1.nbc", "kernel/step.nbi.tmp.77", "../4567/x.nbi"):
         (cache / name).parent.mkdir(parents=True, exist_ok=True)
         (cache / name).write_text(name)
-    monkeypatch.setattr("emulated.compile_ahead.cache_folder", lambda: str(cache))
+    monkeypatch.setattr("emulated.compile_ahead.cache_folder", lambda: cache)
     folder = snapshot_of_compiled_code(tmp_path / "mine")
     found = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     assert found == ["0123/kernel/step.1.nbc", "0123/kernel/step.nbi"]

@@ -6,6 +6,8 @@ import contextlib
 import http.client
 import socket
 import time
+from collections.abc import Iterator
+from email.message import Message
 from typing import Any
 
 import pytest
@@ -27,13 +29,13 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
 
 def answer(
     host: str, port: int, path: str = "/", method: str = "GET", **headers: str
-) -> tuple[int, str, str]:
-    """Returns status, cookie and body of a request."""
+) -> tuple[int, Message, str]:
+    """Returns status, headers and body of a request."""
     client = http.client.HTTPConnection(host, port, timeout=20)
     with contextlib.closing(client):
         client.request(method, path, headers=headers)
         got = client.getresponse()
-        return got.status, got.getheader("Set-Cookie") or "", got.read().decode("utf-8", "ignore")
+        return got.status, got.headers, got.read().decode("utf-8", "ignore")
 
 
 def is_let_in(host: str, port: int, path: str = "/", **options: Any) -> bool:
@@ -47,40 +49,88 @@ def is_let_in(host: str, port: int, path: str = "/", **options: Any) -> bool:
         return False
 
 
-def test_the_server_answers_its_own_page_alone_and_a_browser_keeps_its_token(
-    request: pytest.FixtureRequest,
-) -> None:
-    address, host = Address(0), "127.0.0.1"
+@pytest.fixture
+def served() -> Iterator[tuple[Address, int]]:
+    address = Address(0)
     server = serve(address)
-    request.addfinalizer(lambda: stop(server))
-    port = server.get_port()
-    secret, evil = f"/?token={address.token}", "http://evil.example"
+    yield address, server.get_port()
+    stop(server)
+
+
+def test_the_server_answers_its_own_page_alone(served: tuple[Address, int]) -> None:
+    (address, port), host = served, "127.0.0.1"
     kept, wrong = f"hapticbridge_{port}={address.token}", f"hapticbridge_{port}=wrong"
-    assert address.url(port) == f"http://{host}:{port}{secret}"
-    # path, headers, whether it is answered
-    requests: list[tuple[str, dict[str, str], bool]] = [
-        (secret, {}, True),
-        (secret, {"Host": "evil.example"}, False),
-        (secret, {"Origin": evil}, False),
-        ("/", {}, False),
-        ("/?token=wrong", {}, False),
-        ("/", {"Cookie": kept}, True),
-        ("/", {"Cookie": wrong}, False),
+    # path, headers, status of a page; a socket is answered where the page is
+    requests: list[tuple[str, dict[str, str], int]] = [
+        ("/", {}, 403),
+        ("/", {"Cookie": kept}, 200),
+        ("/", {"Cookie": wrong}, 403),
+        ("/", {"Cookie": kept, "Host": "evil.example"}, 403),
+        ("/", {"Cookie": kept, "Origin": "http://evil.example"}, 403),
+        ("/?token=wrong", {}, 403),
+        (f"/?token={address.token}", {}, 303),
+        (f"/?token={address.token}", {"Host": "evil.example"}, 403),
+        (f"/?token={address.token}", {"Origin": "http://evil.example"}, 403),
     ]
-    for path, headers, is_answered in requests:
-        assert (answer(host, port, path, **headers)[0] == 200) is is_answered
+    for path, headers, status in requests:
+        assert answer(host, port, path, **headers)[0] == status
         # a second Host beside the right one, as a careless proxy might read it
-        options = {"additional_headers": headers}
-        assert is_let_in(host, port, path, **options) is is_answered
-    assert is_let_in(host, port, secret, origin=f"http://{host}:{port}")
-    assert answer(host, port)[1] == ""
-    _, cookie, _ = answer(host, port, secret)
-    assert cookie == f"{kept}; Path=/; HttpOnly; SameSite=Strict"
-    # through a tunnel from another port, which gets a cookie of its own
-    _, cookie, _ = answer(host, port, secret, Host="localhost:9000")
-    assert f"hapticbridge_9000={address.token}" in cookie
+        assert is_let_in(host, port, path, additional_headers=headers) is (status == 200)
+    cookie = {"Cookie": kept}
+    assert is_let_in(host, port, origin=f"http://{host}:{port}", additional_headers=cookie)
     with socket.socket() as probe, pytest.raises(OSError, match="refused"):
         probe.connect(("127.0.0.2", port))  # served on loopback's first address alone
+
+
+def test_the_address_carries_the_token_once_and_a_cookie_keeps_it(
+    served: tuple[Address, int],
+) -> None:
+    (address, port), host = served, "127.0.0.1"
+    secret = f"/?token={address.token}"
+    assert address.url(port) == f"http://{host}:{port}{secret}"
+    for asked in (
+        secret,
+        f"//evil.example/{secret}",
+        f"/x?websocket=ws://evil.example&{secret[2:]}",
+    ):
+        _, headers, body = answer(host, port, asked)
+        assert (headers["Location"], body) == ("/", "")
+        assert headers["Set-Cookie"] == (
+            f"hapticbridge_{port}={address.token}; Path=/; HttpOnly; SameSite=Strict"
+        )
+    assert answer(host, port)[1]["Set-Cookie"] is None
+    # through a tunnel from another port, which gets a cookie of its own
+    _, headers, _ = answer(host, port, secret, Host="localhost:9000")
+    assert f"hapticbridge_9000={address.token}" in headers["Set-Cookie"]
+
+
+def test_every_answer_forbids_frames_foreign_scripts_and_addresses(
+    served: tuple[Address, int],
+) -> None:
+    address, port = served
+    cookie = address.cookie(f"127.0.0.1:{port}").partition(";")[0]
+    nonces = set()
+    for path, headers in (
+        ("/", {}),
+        (f"/?token={address.token}", {}),
+        ("/", {"Cookie": cookie}),
+        ("/", {"Cookie": cookie, "Accept-Encoding": "gzip"}),
+        ("/none", {"Cookie": cookie}),
+    ):
+        status, told, body = answer("127.0.0.1", port, path, **headers)
+        assert told["X-Frame-Options"] == "DENY"
+        assert told["Referrer-Policy"] == "no-referrer"
+        assert told["Cache-Control"] == "no-store"
+        policy = dict(part.split(" ", 1) for part in told["Content-Security-Policy"].split("; "))
+        assert policy["default-src"] == "'none'"
+        if status == 200:
+            nonce = policy["script-src"].split("'")[1].removeprefix("nonce-")
+            nonces.add(nonce)
+            assert body.count(nonce) == 2
+            assert policy["script-src"] == f"'nonce-{nonce}' 'wasm-unsafe-eval'"
+            assert policy["connect-src"] == f"'self' ws://127.0.0.1:{port} data: blob:"
+            assert policy["frame-ancestors"] == policy["base-uri"] == "'none'"
+    assert len(nonces) == 2
 
 
 def test_visers_way_out_to_the_internet_and_its_store_of_files_are_gone(

@@ -32,6 +32,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptio
         ("127.0.0.1.evil.example", None, "not the host"),
         ("", None, "not the host"),
         ("[::1", None, "not the host"),
+        ("x; script-src * @localhost", None, "not the host"),
         ("127.0.0.1:8080", "http://evil.example", "another page"),
         ("127.0.0.1:8080", "http://127.0.0.1:9999", "another page"),
         ("127.0.0.1:8080", "https://127.0.0.1:8080", "another page"),
@@ -61,6 +62,8 @@ def test_token_opens_and_nothing_else_does(way: str) -> None:
         return address.refusal(f"/x?a=b&token={token}", headers)
 
     assert refusal(address.token) == ""
+    shown = f"/?token={address.token}", {"host": "127.0.0.1:80", "Upgrade": "websocket"}
+    assert "token" in address.refusal(*shown)
     for wrong in ("", address.token[:-1], address.token + "x", "ü", address.token.swapcase()):
         assert "token" in refusal(wrong)
     assert "token" in address.refusal("/", {"host": "localhost"})

@@ -22,7 +22,7 @@ class AuditReport:
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
-            passive, but the run was not simulated again.
+            passive, but the run was not simulated again or no trusted key signed the file.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
         certified: True if the recorded device bears the coupling and the run kept its time; None if
             its damping is unknown or its motion is prescribed.
@@ -33,7 +33,13 @@ class AuditReport:
         slack_share: Largest share of the slack that was used; 0 if strict.
         resimulation: ``bit for bit``, ``within 1e-9 (other processor)``, ``disagrees`` or ``not
             re-simulated: …``.
-        is_cut: True if the file lacks its end; the verdict is on the rest.
+        is_cut: True if the file lacks the end of its run, or did before a repair; the verdict is on
+            the rest.
+        cut: Reasons for that, as a sentence; else empty.
+        signature: Result of the signature's check, as a sentence; without a key, what only a key
+            would prove.
+        is_trusted: True if a trusted key signed exactly this file, False if not; such a run is
+            never passive. None if no trusted key was named.
         ticks: Number of records.
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
@@ -65,6 +71,9 @@ class AuditReport:
     slack_share: float = 0.0
     resimulation: str = ""
     is_cut: bool = False
+    cut: str = ""
+    signature: str = ""
+    is_trusted: bool | None = None
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
@@ -90,7 +99,8 @@ class AuditReport:
     @property
     def exit_code(self) -> int:
         """0 if passive (or unverified, if accepted) and not known to lack damping, else 1."""
-        accepted = ("passive", "unverified")[: 1 + self.accepts_unverified]
+        is_accepted = self.accepts_unverified and self.is_trusted is not False
+        accepted = ("passive", "unverified")[: 1 + is_accepted]
         return 0 if self.verdict in accepted and self.certified is not False else 1
 
     @property

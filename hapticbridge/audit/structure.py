@@ -97,11 +97,8 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     """Returns a fault of the file as a whole, or None."""
     if recording.problems:
         return Fault("the file is damaged: " + "; ".join(recording.problems))
-    if not recording.is_cut:
-        if recording.digest is None:
-            return Fault("the file has no digest although it is not cut")
-        if recording.digest != recording.computed_digest:
-            return Fault("the file's content does not match its digest: it was changed")
+    if recording.seal_fault:
+        return Fault(recording.seal_fault)
     if not recording.count:
         return Fault("the recording holds no tick")
     last = recording.last_tick

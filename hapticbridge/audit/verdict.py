@@ -39,6 +39,7 @@ from hapticbridge.certificate import (
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
 from hapticbridge.summary import Environment, was_never_lossless
@@ -157,14 +158,14 @@ def decide(
     Args:
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
-        gap: Reason why the run was not simulated again; then it is not called passive. Empty if it
-            was.
+        gap: Clause with the reason why the run is not called passive: it was not simulated again,
+            or no trusted key signed the file. Empty without such a reason.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
     found = _decide_on_records(fault, energies, strict=strict)
     if found.verdict != "passive" or not gap:
         return found
-    reason = f"the run was {gap}; in its records alone {found.reason}"
+    reason = f"{gap} {found.reason}"
     return replace(found, verdict="unverified", reason=reason)
 
 
@@ -208,18 +209,29 @@ def _decide_on_records(
 
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
 def verdict_on(
-    path: str | Path, *, strict: bool, accepts_unverified: bool, in_process: bool
+    path: str | Path,
+    trusted: Mapping[str, str] | None,
+    *,
+    strict: bool,
+    accepts_unverified: bool,
+    in_process: bool,
 ) -> AuditReport:
     """Judges a recording; implements ``audit.audit``.
+
+    ``trusted`` holds the comments of trusted public keys; None checks no signature.
 
     Raises:
         RecordingError: The file is not a recording.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     recording = open_recording(path)
+    signature = check_signature(recording.seal, _unsignable(recording), trusted)
     facts: dict[str, Any] = {
         "path": recording.path,
-        "is_cut": recording.is_cut,
+        "is_cut": bool(recording.cut_sentence),
+        "cut": recording.cut_sentence,
+        "signature": signature.sentence,
+        "is_trusted": signature.is_trusted,
         "ticks": recording.count,
         "events": _event_counts(recording),
         "certified": None,
@@ -257,7 +269,7 @@ def verdict_on(
             requested_of(recording.meta)
     except RecordingError as error:
         fault = Fault(str(error))
-    gap = "" if outcome.has_run else outcome.agreement
+    gap = _gap(signature, outcome)
     found = asdict(decide(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
@@ -269,6 +281,19 @@ def verdict_on(
         notes = (found["reason"], doubt, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
+
+
+def _unsignable(recording: RecordingFile) -> str:
+    """Returns why a file cannot be what was signed; empty if it can."""
+    return recording.cut_sentence or recording.seal_fault or "; ".join(recording.problems)
+
+
+def _gap(signature: SignatureCheck, outcome: ReplayOutcome) -> str:
+    """Returns why the run is not called passive, as the beginning of a sentence, or nothing."""
+    reasons = [signature.sentence] if signature.is_trusted is False else []
+    if not outcome.has_run:
+        return "; ".join([*reasons, f"the run was {outcome.agreement}; in its records alone"])
+    return f"{reasons[0]}; apart from that" if reasons else ""
 
 
 def _check_records(

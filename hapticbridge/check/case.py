@@ -22,7 +22,7 @@ from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
-from hapticbridge.rendering import default_method
+from hapticbridge.rendering import RIGID, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
@@ -141,6 +141,16 @@ class SceneUnderCheck:
         return self.scene.model
 
     @property
+    def is_rigid(self) -> bool:
+        """True if contacts, limits and equality constraints are rigid in the run."""
+        return self.contact == RIGID
+
+    @property
+    def setting(self) -> Setting:
+        """Coupling, period and contact of the run."""
+        return Setting(self.coupling, self.period, contact=self.contact)
+
+    @property
     def law(self) -> Coupling:
         """Coupling that the default method's law uses."""
         return default_method().law_coupling(self.coupling, self.period)
@@ -196,6 +206,9 @@ def open_case(
             observation = observe(
                 scene, samples, Setting(coupling, period, contact=contact), progress
             )
+        if observation.force.size < samples.size:
+            samples = samples[: observation.force.size]
+            name += f"; of this heavy scene the first {samples.size * period:.2g} s alone"
     except (SceneError, mujoco.FatalError) as error:
         fault = " ".join(str(error).split())
     finally:

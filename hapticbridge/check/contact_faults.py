@@ -39,7 +39,12 @@ _TYPICAL_INERTIA = 0.1  # kg; for pairs of which neither side moves by itself
 
 
 def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields faults of the tool's possible contacts and of every contact in the motion."""
+    """Yields faults of the tool's possible contacts and of every contact in the motion.
+
+    Rigid contact replaces these settings, so that it has none.
+    """
+    if case.is_rigid:
+        return
     model, option = case.model, case.model.opt
     meetings = case.observation.meetings if case.observation else {}
     is_tool = tool_geoms(model, case.scene.grip)
@@ -67,9 +72,8 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         ):
             clause, _, change = concern.partition("; write ")
             is_cone = "pyramidal" in clause
-            # one option changes it for all contacts, and rigid ones have an elliptic cone anyway
-            if is_cone and (is_cone_reported or case.contact == "rigid"):
-                continue
+            if is_cone and is_cone_reported:
+                continue  # one option changes it for all contacts
             is_cone_reported |= is_cone
             yield Fault(
                 "pyramidal cone" if is_cone else "not passive",
@@ -86,15 +90,14 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields pairs of flat shapes whose contact points MuJoCo drops or tilts (``colliders``)."""
     model = case.model
     is_tool = tool_geoms(model, case.scene.grip)
-    is_exact = case.contact == "rigid"
     boxes, meshes = list[tuple[int, int]](), list[tuple[int, int]]()
     for first, second, _ in meeting_pairs(model, is_tool):
         kinds = {int(model.geom_type[first]), int(model.geom_type[second])}
-        if kinds == {_FLAT[0]} and not is_exact:
+        if kinds == {_FLAT[0]} and not case.is_rigid:
             boxes.append((first, second))
         is_flat = kinds <= {*_FLAT} and _FLAT[1] in kinds
         corners = max(_corners(model, first), _corners(model, second))
-        if is_flat and (not is_exact or corners > MOST_VERTICES):
+        if is_flat and (not case.is_rigid or corners > MOST_VERTICES):
             meshes.append((first, second))
     if boxes:
         yield Fault(
@@ -102,7 +105,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             case.places.geom(_tool_geom(boxes[0], is_tool)),
             f"{pair_names(case, boxes)} are boxes, of whose contact MuJoCo drops points from step "
             "to step where an edge is touched; a peg of 30 g sank 5 mm in that way",
-            'contact="rigid" for the run, whose boxes keep all points',
+            "--contact rigid for the run, whose boxes keep all points",
         )
     if meshes:
         count = max(_corners(model, geom) for pair in meshes for geom in pair)
@@ -112,7 +115,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"{pair_names(case, meshes)} meet with the normal of either face, up to 84 mrad off "
             "the one that is touched; a tilted tool without friction sank 2.5 mm in that way",
             f"boxes, spheres and capsules instead, or meshes of at most {MOST_VERTICES} corners "
-            f'(now {count}) and contact="rigid" for the run',
+            f"(now {count}) and --contact rigid for the run",
         )
 
 
@@ -265,7 +268,9 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 
 def margin_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields geoms and pairs whose contacts push before they touch."""
+    """Yields geoms and pairs whose contacts push before they touch; rigid ones do not."""
+    if case.is_rigid:
+        return
     model, places = case.model, case.places
     meeting = {geom for first, second, _ in settings_among(model) for geom in (first, second)}
     found = [(places.geom(geom), float(model.geom_margin[geom])) for geom in sorted(meeting)]
@@ -312,7 +317,7 @@ def start_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         body = int(model.geom_bodyid[mover])
         out = -contact.dist * contact.frame[:3] * (1 if mover == second else -1)
         effect = "they are held there, and eased out with energy that the scene has dissipated"
-        if case.contact == "scene":
+        if not case.is_rigid:
             effect = (
                 f"more than {length(MAXIMUM_START_PENETRATION)} release energy that is not metered"
             )

@@ -21,6 +21,7 @@ from hapticbridge.check.physics import (
     mesh_of,
 )
 from hapticbridge.check.source_map import Place
+from hapticbridge.kernel.rigid_contact import LAST_RIGID
 from hapticbridge.scene.contacts import (
     REFERENCE_STEPS,
     ROUNDING,
@@ -46,9 +47,13 @@ mm, on the axis or 0.1 m off it. The limit of a heavy arm is stiff even with MuJ
 
 
 def constraint_faults(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default."""
+    """Yields limits, equality constraints and dry friction that are as soft as MuJoCo's default.
+
+    Rigid contact replaces the settings of limits, and of equality constraints but those of a flex.
+    """
     case.scene.reset()
-    yield from _limits(case)
+    if not case.is_rigid:
+        yield from _limits(case)
     yield from _equalities(case)
     yield from _frictions(case)
 
@@ -106,6 +111,8 @@ def _limits(case: SceneUnderCheck) -> Iterator[Fault]:
 def _equalities(case: SceneUnderCheck) -> Iterator[Fault]:
     model = case.model
     for equality in np.flatnonzero(model.eq_active0).tolist():
+        if case.is_rigid and model.eq_type[equality] <= LAST_RIGID:
+            continue
         solref, solimp = model.eq_solref[equality], model.eq_solimp[equality]
         if _is_soft(case, solref, solimp):
             place = case.places.equality(equality)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.check.observe import Setting, quiet, rehearsal_parameters
 from hapticbridge.coupling import Coupling
@@ -16,15 +18,25 @@ from hapticbridge.kernel.parameters import MAX_SUBSTEPS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.scene import Scene, SceneSource, compile_scene, plain_model
+from hapticbridge.rendering import RIGID
+from hapticbridge.scene import Scene, SceneSource, plain_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.units import format_si
 
 SECONDS = 0.5
 """Time in s that is compared. Later, contacts and chains amplify any difference."""
 
+MAX_WORK = 3e5
+"""Largest work of a comparison in degrees of freedom and constraint rows, summed over the steps of
+the file's own motion. Heavier scenes are compared over less than ``SECONDS``: 60 degrees of freedom
+at 0.1 ms take 1 s."""
+
 LEAST, SHARE = 1e-3, 0.07
 """Just noticeable difference of a place: 1 mm, or 7 % of the distance moved if that is more."""
+
+NOTABLE_ENERGY = 1e-4
+"""Energy in J that a scene may create without a hand and without a word: a tenth of what a hand
+puts in when it taps."""
 
 ROUNDING = 1e-9
 """Relative error of a time step as it is written."""
@@ -42,12 +54,16 @@ class OwnMotion:
         apart: Distance in m between its two places at the end; inf if it diverges in the bridge.
         moved: Distance in m that it moves under the file's own options.
         step: The file's own time step in s.
+        seconds: Time in s that was compared.
+        created: Energy in J that the scene created meanwhile in the bridge.
     """
 
     body: str
     apart: float
     moved: float
     step: float
+    seconds: float = SECONDS
+    created: float = 0.0
 
     @property
     def jnd(self) -> float:
@@ -58,26 +74,44 @@ class OwnMotion:
         """The difference as a sentence."""
         if math.isinf(self.apart):
             return (
-                f"without a hand, the scene diverges here within {SECONDS:g} s, and not under the "
-                f"file's own options (time step {format_si(self.step, 's')})"
+                f"without a hand, the scene diverges here within {self.seconds:.2g} s, and not "
+                f"under the file's own options (time step {format_si(self.step, 's')})"
             )
         return (
-            f"without a hand, '{self.body}' is after {SECONDS:g} s {format_si(self.apart, 'm')} "
-            f"from where the file's own options take it ({format_si(self.moved, 'm')} from its "
-            f"start, time step {format_si(self.step, 's')}): {self.jnd:.2g} just noticeable "
-            "differences"
+            f"without a hand, '{self.body}' is after {self.seconds:.2g} s "
+            f"{format_si(self.apart, 'm')} from where the file's own options take it "
+            f"({format_si(self.moved, 'm')} from its start, time step "
+            f"{format_si(self.step, 's')}): {self.jnd:.2g} just noticeable differences"
         )
 
-    def remedy(self, period: float) -> str:
-        """Returns advice for a run with period T in s."""
+    @property
+    def creation(self) -> str:
+        """Sentence on energy that fast joints create; empty if there is hardly any.
+
+        MuJoCo takes Coriolis and gyroscopic forces at the start of a step, so that chains and
+        bodies that spin gain energy in proportion to the step.
+        """
+        if not NOTABLE_ENERGY < self.created < math.inf:
+            return ""
+        return (
+            f"without a hand, the scene creates {format_si(self.created, 'J')} within "
+            f"{self.seconds:.2g} s, as fast joints do in MuJoCo's steps, and the audit may call it "
+            "active; more --substeps create less, twice as many half of it"
+        )
+
+    def remedy(self, setting: Setting) -> str:
+        """Returns advice for a run with a setting."""
+        period = setting.period
         if self.step > (1.0 + ROUNDING) * period:
             return f"--rate {1.0 / self.step:g} takes the file's own time step"
         if self.step < (1.0 - ROUNDING) * period:
             return f"--substeps {_substeps(self.step, period)} keeps the file's own time step"
-        return "--contact scene keeps the file's own contacts"
+        if setting.contact == RIGID:
+            return "--contact scene keeps the file's own contacts"
+        return "a shorter time step (--rate or --substeps) brings the two closer"
 
 
-def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | None:
+def own_motion(source: SceneSource, scene: Scene, setting: Setting) -> OwnMotion | None:
     """Compares the first half second without a hand with that of the file's own options.
 
         JND = ‖p − q‖ / max(1 mm, 0.07 ‖p − p_0‖)
@@ -87,7 +121,7 @@ def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | 
 
     Args:
         source: The scene; it is not changed.
-        grip: Site, ``BODY`` or ``BODY@x,y,z``.
+        scene: Result of ``compile_scene`` from it; prepared here, and not at its start afterwards.
         setting: Rate and substeps; the coupling is not used.
 
     Returns:
@@ -100,36 +134,66 @@ def own_motion(source: SceneSource, grip: str, setting: Setting) -> OwnMotion | 
         Durlach, Delhorne, Wong, Ko, Rabinowitz & Hollerbach, Perception & Psychophysics 46, 1989:
         1 mm for lengths of 10 to 20 mm between the fingers, 2.2 mm for 80 mm.
     """
-    model = plain_model(source)
-    data = mujoco.MjData(model)
-    home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
-    if home >= 0:
-        mujoco.mj_resetDataKeyframe(model, data, home)
-    mujoco.mj_forward(model, data)
-    start = data.xipos.copy()
-    step = float(model.opt.timestep)
     with quiet():
-        mujoco.mj_step(model, data, max(round(SECONDS / step), 1))
+        alone = _FileMotion.of(source)
+        return None if alone is None else alone.against(scene, setting)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FileMotion:
+    """Motion of a scene's bodies under the file's own options: centres of mass (nbody, 3) in m."""
+
+    data: mujoco.MjData
+    start: NDArray[np.float64]
+    end: NDArray[np.float64]
+    seconds: float
+
+    @classmethod
+    def of(cls, source: SceneSource) -> Self | None:
+        """Moves the scene; returns None if it diverges."""
+        model = plain_model(source)
+        data = mujoco.MjData(model)
+        home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
+        if home >= 0:
+            mujoco.mj_resetDataKeyframe(model, data, home)
+        mujoco.mj_forward(model, data)
+        start, step = data.xipos.copy(), float(model.opt.timestep)
+        most = MAX_WORK / max(model.nv + data.nefc, 1)
+        count = max(int(min(round(SECONDS / step), most)), 1)
+        mujoco.mj_step(model, data, count)
         if any(warning.number for warning in data.warning):
             return None
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        alone = data.xipos.copy()
-        scene = compile_scene(source, grip, warns=False, checks_start=False)
-        if not _has_moved_alone(scene, replace(setting, coupling=NO_HAND)):
-            return OwnMotion("", math.inf, 0.0, step)
-    data.qpos[:] = scene.data.qpos
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    apart = np.linalg.norm(data.xipos - alone, axis=1)
-    moved = np.linalg.norm(alone - start, axis=1)
-    most = int(np.argmax(apart / np.maximum(LEAST, SHARE * moved)))
-    name = str(model.body(most).name) or str(most)
-    return OwnMotion(name, float(apart[most]), float(moved[most]), step)
+        _place_bodies(data)
+        return cls(data, start, data.xipos.copy(), min(count * step, SECONDS))
+
+    def against(self, scene: Scene, setting: Setting) -> OwnMotion:
+        """Compares with the motion in the bridge."""
+        data, step = self.data, float(self.data.model.opt.timestep)
+        setting = replace(setting, coupling=NO_HAND)
+        created = _energy_of_motion_alone(scene, setting, self.seconds)
+        if math.isinf(created):
+            return OwnMotion("", math.inf, 0.0, step, self.seconds)
+        data.qpos[:] = scene.data.qpos
+        _place_bodies(data)
+        apart = np.linalg.norm(data.xipos - self.end, axis=1)
+        moved = np.linalg.norm(self.end - self.start, axis=1)
+        most = int(np.argmax(apart / np.maximum(LEAST, SHARE * moved)))
+        name = str(data.model.body(most).name) or str(most)
+        motion = float(apart[most]), float(moved[most])
+        return OwnMotion(name, *motion, step, self.seconds, created)
 
 
-def _has_moved_alone(scene: Scene, setting: Setting) -> bool:
-    """Moves a scene by its ticks in the bridge; returns False if it diverges."""
+def _place_bodies(data: mujoco.MjData) -> None:
+    mujoco.mj_kinematics(data.model, data)
+    mujoco.mj_comPos(data.model, data)
+
+
+def _energy_of_motion_alone(scene: Scene, setting: Setting, seconds: float) -> float:
+    """Moves a scene by its ticks in the bridge.
+
+    Returns:
+        The energy in J that it created; inf if it diverges.
+    """
     binding = BoundKernel(scene.model, scene.data, rehearsal_parameters(scene, setting))
     state, row, step = binding.state, binding.row, binding.step
     still, period = np.zeros(1, SAMPLE_DTYPE), setting.period
@@ -137,19 +201,21 @@ def _has_moved_alone(scene: Scene, setting: Setting) -> bool:
     before = direct(before_step, state, still, row, 0, period)
     after = direct(after_step, state, row, 0)
     try:
-        for _ in range(max(round(SECONDS / period), 1)):
+        for _ in range(max(round(seconds / period), 1)):
             for substep in range(setting.substeps):
                 if before(state, still, row, substep, period) != OK:
-                    return False
+                    return math.inf
                 step(scene.model, scene.data)
                 if after(state, row, substep) != OK:
-                    return False
+                    return math.inf
+        return float(state[0]["energy"]["environment_energy"])
     finally:
         binding.release()
-    return True
 
 
-def own_substeps(source: SceneSource, grip: str, period: float) -> tuple[int, OwnMotion | None]:
+def own_substeps(
+    source: SceneSource, scene: Scene, setting: Setting
+) -> tuple[int, OwnMotion | None]:
     """Returns the substeps that keep the file's own time step, and the motion with them.
 
     There is one if the file's step is not shorter than T, or if its motion does not differ
@@ -157,18 +223,22 @@ def own_substeps(source: SceneSource, grip: str, period: float) -> tuple[int, Ow
 
     Args:
         source: The scene; it is not changed.
-        grip: Site, ``BODY`` or ``BODY@x,y,z``.
-        period: T in s.
+        scene: As for ``own_motion``.
+        setting: Period and contact; coupling and substeps are not used.
 
     Raises:
         SceneError: The scene does not compile.
     """
-    one = own_motion(source, grip, Setting(NO_HAND, period))
-    count = _substeps(source.spec.option.timestep, period)
-    if one is None or one.jnd <= 1.0 or count <= 1:
-        return 1, one
-    more = own_motion(source, grip, Setting(NO_HAND, period, count))
-    return (count, more) if more is not None and more.jnd < one.jnd else (1, one)
+    with quiet():
+        alone = _FileMotion.of(source)
+        if alone is None:
+            return 1, None
+        one = alone.against(scene, replace(setting, substeps=1))
+        count = _substeps(source.spec.option.timestep, setting.period)
+        if one.jnd <= 1.0 or count <= 1:
+            return 1, one
+        more = alone.against(scene, replace(setting, substeps=count))
+    return (count, more) if more.jnd < one.jnd else (1, one)
 
 
 def _substeps(step: float, period: float) -> int:

@@ -16,10 +16,10 @@ from hapticbridge.check.contact_faults import (
 )
 from hapticbridge.check.fault import Fault, number
 from hapticbridge.check.model_faults import constraint_faults, geometry_faults, mass_faults
-from hapticbridge.check.observe import Observation, Setting
+from hapticbridge.check.observe import Observation
 from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
-from hapticbridge.rendering import RIGID
+from hapticbridge.scene import compile_scene
 from hapticbridge.scene.checks import check_model
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import suggested_solref
@@ -68,11 +68,13 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields a fault if the scene alone moves noticeably differently than its file says."""
     if case.refused:
         return  # the file's own scene does not compile
-    found = own_motion(case.source, case.scene.grip, Setting(case.coupling, case.period))
+    scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
+    found = own_motion(case.source, scene, case.setting)
+    place = case.places.option("timestep")
     if found is not None and found.jnd > 1.0:
-        yield Fault(
-            "own motion", case.places.option("timestep"), str(found), found.remedy(case.period)
-        )
+        yield Fault("own motion", place, str(found), found.remedy(case.setting))
+    if found is not None and found.creation:
+        yield Fault("own motion", place, found.creation, "--substeps, or slower joints")
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -111,7 +113,7 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         return
     if seen.full_ticks:
         limit = int(case.model.opt.iterations)
-        if case.contact == RIGID:  # which raises a lower limit to MuJoCo's
+        if case.is_rigid:  # which raises a lower limit to MuJoCo's
             limit = max(limit, ITERATIONS)
         yield Fault(
             "solver iterations",
@@ -137,7 +139,7 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     if seen.environment == "active":
         used = "more than the coupling's slack covers"
     sentence = f"contacts or joints created energy in the motion: {used}"
-    if not seen.meetings or case.contact == RIGID:
+    if not seen.meetings or case.is_rigid:
         return _created_without_contact(case, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)
     one, other = (case.places.geom(geom) for geom in pair)

@@ -9,7 +9,7 @@ import textwrap
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 import tyro
@@ -36,7 +36,7 @@ from hapticbridge.check.lean_output import (
     write_lean,
     write_table,
 )
-from hapticbridge.check.observe import Setting, quiet
+from hapticbridge.check.observe import quiet
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
@@ -156,7 +156,7 @@ def print_case(case: SceneUnderCheck) -> None:
     out.print(f"[bold]{plain(case.scene.name)}[/]  {plain(str(case.source.path))}")
     out.print(
         f"  motion: {plain(case.motion_name)}, {case.motion.duration:.3g} s, {size} mm; "
-        f"coupling: {sentence}, {1 / case.period:.4g} Hz"
+        f"coupling: {sentence}, {1 / case.period:.4g} Hz, {case.contact} contacts"
     )
 
 
@@ -307,6 +307,9 @@ class Check:
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the simulated device."""
     damping: float | None = None
     """Coupling damping B in N s/m at the hand."""
+    contact: Literal["rigid", "scene"] = "rigid"
+    """Contacts of the run that the scene is checked for. 'rigid', the default of 'run': settings of
+    contacts, limits and equality constraints do not matter. 'scene': those of the MJCF."""
     scale: float = 1.0
     """Handle motion per device motion."""
     workspace: float = LARGEST_WORKSPACE
@@ -356,14 +359,14 @@ class Check:
                 scale=self.scale,
                 workspace=self.workspace,
                 motion=self.motion,
+                contact=self.contact,
                 progress=show,
             )
         inventory = take_inventory(case.model, self.grip, case.places, case.observation)
         faults, cost = find_faults(case), None
         if case.observation is not None:
             with progress("timing it") as show, quiet():
-                setting = Setting(case.coupling, case.period)
-                cost = measure_cost(case.scene, case.samples, setting, progress=show)
+                cost = measure_cost(case.scene, case.samples, case.setting, progress=show)
             slow = cost.fault(case)
             faults = faults if slow is None else (*faults, slow)
         if not self.as_json:
@@ -393,7 +396,7 @@ class Check:
                     case.source,
                     case.scene.grip,
                     case.motion,
-                    Setting(case.coupling, case.period),
+                    case.setting,
                     budget=budget,
                     device_damping=(case.info.damping or 0.0) / case.scale**2,
                     progress=show,
@@ -440,6 +443,7 @@ def _facts(
         "motion": {"name": case.motion_name, "seconds": case.motion.duration},
         "coupling": asdict(case.coupling),
         "period_s": case.period,
+        "contact": case.contact,
         "inventory": asdict(inventory),
         "faults": [asdict(fault) for fault in faults],
         "cost": None if cost is None else asdict(cost),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
@@ -9,8 +10,9 @@ import tyro
 
 from hapticbridge.cli.terminal import out, plain, print_json
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
-from hapticbridge.device.driver import RULES_COMMAND, FoundDevice
+from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
 from hapticbridge.device.registry import all_drivers
+from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
 
 
@@ -44,8 +46,8 @@ class Devices:
         for driver in all_drivers():
             out.print(f"{driver.name}: {plain(driver.about)}")
             out.print(f"  axes {driver.axes}; force on the hand {driver.force}; rate {driver.rate}")
-            if driver.on_stall:
-                out.print(f"  if this machine stands still: {plain(driver.on_stall)}")
+            for sentence in _standstill(driver):
+                out.print(f"  {plain(sentence)}")
             if driver.medium is not None:
                 out.print(f"  {plain(driver.medium())}")
         out.print("[bold]plugged in[/bold]")
@@ -77,7 +79,18 @@ def _specification(first: FoundDevice, plugged: list[FoundDevice]) -> str:
     return first.driver if is_only else f"{first.driver}:serial={first.serial or first.path}"
 
 
-_FACTS = ("name", "about", "transport", "axes", "force", "rate", "on_stall")
+def _standstill(driver: Driver) -> Iterator[str]:
+    """Yields what becomes of the force of a program or a machine that stands still."""
+    if driver.has_guardian:
+        yield f"if the program stands still: on Linux a second process ends the force after {_HANG}"
+        yield f"if this machine stands still: {driver.on_stall}"
+    elif driver.on_stall:
+        yield f"if the program or this machine stands still: {driver.on_stall}"
+
+
+_HANG = f"{1e3 * HANG:g} ms"
+
+_FACTS = ("name", "about", "transport", "axes", "force", "rate", "on_stall", "has_guardian")
 
 
 def _facts(plugged: list[FoundDevice], unseen: list[str]) -> dict[str, Any]:

@@ -10,14 +10,20 @@ import errno
 import importlib
 import math
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
-from hapticbridge.signals import leaving_on_interrupt
+from hapticbridge.signals import (
+    ENDING_SIGNALS,
+    interrupting_on_signals,
+    leaving_on_signals,
+    stop_words,
+)
 
-DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP = 0, 1, 2, 3
 
 
 COMMANDS = {
@@ -54,7 +60,8 @@ _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs ``hapticbridge``; returns the exit code.
 
-    0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip, 130 interrupted.
+    0 done, 1 done with a negative verdict, 2 bad input or usage, 3 safety trip, 130 interrupted,
+    143 and 129 stopped by SIGTERM and SIGHUP.
 
     Args:
         arguments: Words after the program's name; None takes those of the process.
@@ -70,9 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             code = _refuse(words[0])
         else:
             code = _execute(words[0], words[1:])
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
+    except KeyboardInterrupt as interrupt:
+        sentence, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
+        print(sentence, file=sys.stderr)
     except SafetyTrip as trip:
         from hapticbridge.guard import with_remedy  # noqa: PLC0415 - imports numba
 
@@ -110,17 +117,19 @@ def _is_memory_limited() -> bool:
 
 
 def _execute(name: str, words: list[str]) -> int:
-    command = _parsed(command_class(name), name, words)
-    from hapticbridge.cli.terminal import warnings_in_a_sentence  # noqa: PLC0415 - imports rich
+    kind = command_class(name)
+    with interrupting_on_signals(ENDING_SIGNALS):
+        command = _parsed(kind, name, words)
+        from hapticbridge.cli.terminal import warnings_in_a_sentence  # noqa: PLC0415 - rich
 
-    with warnings_in_a_sentence():
-        return int(command.execute())
+        with warnings_in_a_sentence():
+            return int(command.execute())
 
 
 def command_class(name: str) -> type[Any]:
     """Imports the command's module and returns its class."""
     try:
-        with leaving_on_interrupt(INTERRUPTED):
+        with leaving_on_signals():
             module = importlib.import_module(f"hapticbridge.cli.{_MODULES.get(name, name)}")
     except RuntimeError as error:
         if "MUJOCO_GL" not in str(error):

@@ -52,15 +52,16 @@ class Export:
         marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
         if self.as_json:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
-            facts |= {"marks": marks, "is_cut": found.is_cut, "damage": done.damage}
+            facts |= {"marks": marks, "is_cut": bool(found.cut_sentence)}
+            facts |= {"cut": found.cut_sentence, "damage": done.damage}
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
             out.print(f"wrote {names}: {done.ticks} ticks, {len(done.events)} events")
             if marks:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
-        if found.is_cut:
-            err.print("[yellow]warning:[/yellow] the recording is cut; this is what it holds")
+        if found.cut_sentence:
+            err.print(f"[yellow]warning:[/yellow] {found.cut_sentence}; this is what it holds")
         if done.damage:
             damage = plain("; ".join(done.damage))
             err.print(f"[yellow]warning:[/yellow] the recording is damaged: {damage}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from signal import Signals
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
@@ -17,7 +18,8 @@ from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
-from hapticbridge.check.own_motion import own_substeps
+from hapticbridge.check.observe import Setting
+from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -32,9 +34,10 @@ from hapticbridge.guard import (
 )
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
-from hapticbridge.signals import interrupting_on_signals
+from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_energy, format_si, format_wrenches
 
@@ -277,6 +280,9 @@ class Run:
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
+    sign: Annotated[Path | None, tyro.conf.arg(metavar="KEY")] = None
+    """Sign the recording with this private ed25519 key; needs the extra 'sign'. To make KEY and
+    KEY.pub: ssh-keygen -t ed25519 -N '' -f KEY. 'hapticbridge audit --trust KEY.pub' checks it."""
     method: str | None = None
     """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
     carried over; second order away from contact. 'implicit', the default with substeps: all of the
@@ -367,6 +373,10 @@ class Run:
             raise HapticBridgeError(
                 "--overwrite goes with --record FILE; nothing would be recorded"
             )
+        if self.sign is not None:
+            if self.record is None:
+                raise HapticBridgeError("--sign goes with --record FILE; nothing would be signed")
+            Signer.load(self.sign)  # refused before anything is opened
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
@@ -374,33 +384,36 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        with compiling(self.scene):
-            source = read_scene(self.scene, **settings_from(self.settings))
-            scene = compile_scene(source, self.grip, as_is=self.as_is)
-        chosen = (
-            self
-            if self.substeps is not None
-            else replace(self, substeps=self._own_substeps(source))
-        )
+        with err.status("reading and trying the scene …"):
+            with compiling(self.scene):
+                source = read_scene(self.scene, **settings_from(self.settings))
+                scene = compile_scene(source, self.grip, as_is=self.as_is)
+            chosen = (
+                self
+                if self.substeps is not None
+                else replace(self, substeps=self._own_substeps(source, scene))
+            )
         with ExitStack() as stack:
-            callbacks = stack.enter_context(interrupting_on_signals())
+            interrupts = stack.enter_context(interrupting_on_signals())
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
-            return chosen._feel(scene, device, clock, stack, window, callbacks)
+            return chosen._feel(scene, device, clock, stack, window, interrupts)
 
-    def _own_substeps(self, source: SceneSource) -> int:
+    def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.method is not None:
             return 1
-        period = period_of(self.rate)
-        count, moved = own_substeps(source, self.grip, period)
+        setting = Setting(NO_HAND, period_of(self.rate), contact=self.contact or "rigid")
+        count, moved = own_substeps(source, scene, setting)
         if count > 1:
             notify(
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
                 "scene alone would move noticeably differently (--substeps 1 takes one)"
             )
         elif moved is not None and moved.jnd > 1.0:
-            notify(f"{moved}; {moved.remedy(period)}")
+            notify(f"{moved}; {moved.remedy(setting)}")
+        if moved is not None and moved.creation:
+            notify(moved.creation)
         return count
 
     def _feel(
@@ -410,7 +423,7 @@ class Run:
         clock: Clock,
         stack: ExitStack,
         window: Window | None,
-        callbacks: list[Callable[[str], None]],
+        interrupts: Interrupts,
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         options = self._options(device.info)
@@ -424,13 +437,15 @@ class Run:
             announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
             stack.enter_context(bridge)
-        callbacks.append(bridge.stop_on_signal)  # also while it closes, which must not be cut short
+        interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
             notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
         summary = bridge.run(self.duration)
         stack.close()
+        if not summary.ticks and (name := bridge.session.signal):
+            raise StopSignal(Signals[name])
         if self.as_json:
             values = asdict(summary) | {"verdict": summary.verdict}
             print_json(values | {"recording": str(self.record or "") or None})
@@ -469,6 +484,7 @@ class Run:
             tool_weight=self.tool_weight,
             live=not self.as_json and (err.is_terminal or not self.fast),
             realtime=self.realtime or None,
+            sign=self.sign,
         )
 
     def _window(self) -> Window:

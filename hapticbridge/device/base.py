@@ -8,12 +8,12 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from numbers import Real
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
 
@@ -38,10 +38,10 @@ def checked_number(name: str, value: object, unit: str, *, is_positive: bool = F
         DeviceError: The value is not a number, not finite, or out of range.
     """
     bound = "> 0" if is_positive else ">= 0"
-    message = f"{name} = {value!r}: must be a finite number {bound}" + (f" {unit}" if unit else "")
-    if isinstance(value, bool) or not isinstance(value, Real):
-        raise DeviceError(message)
-    number = float(value)
+    message = f"{name} = {shown(value)}: must be a finite number {bound}" + (
+        f" {unit}" if unit else ""
+    )
+    number = float(value) if is_number(value) else math.nan
     if not math.isfinite(number) or number < 0.0 or (is_positive and number == 0.0):
         raise DeviceError(message)
     return number
@@ -168,11 +168,11 @@ class DeviceInfo:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise DeviceError(f"device name = {self.name!r}: must be a text that is not empty")
+            raise DeviceError(f"device name = {shown(self.name)}: must be a text that is not empty")
         if not isinstance(self.serial, str):
-            raise DeviceError(f"serial = {self.serial!r}: must be a text")
+            raise DeviceError(f"serial = {shown(self.serial)}: must be a text")
         if not isinstance(self.axes, tuple | list) or not self.axes:
-            raise DeviceError(f"axes = {self.axes!r}: must be one or more of {choices(AXES)}")
+            raise DeviceError(f"axes = {shown(self.axes)}: must be one or more of {choices(AXES)}")
         if tuple(self.axes) != tuple(axis for axis in AXES if axis in self.axes):
             raise DeviceError(
                 f"axes = {tuple(self.axes)!r}: must be of {', '.join(AXES)}, each once, in this "
@@ -181,10 +181,10 @@ class DeviceInfo:
         object.__setattr__(self, "axes", tuple(self.axes))
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
-                raise DeviceError(f"{name} = {getattr(self, name)!r}: must be true or false")
+                raise DeviceError(f"{name} = {shown(getattr(self, name))}: must be true or false")
         is_count = isinstance(self.buttons, int) and not isinstance(self.buttons, bool)
         if self.buttons is not None and not (is_count and self.buttons >= 0):
-            raise DeviceError(f"buttons = {self.buttons!r}: must be a whole number >= 0")
+            raise DeviceError(f"buttons = {shown(self.buttons)}: must be a whole number >= 0")
         for name in DATA_SHEET_UNITS:
             value = getattr(self, name)
             if value is not None or name in _NEVER_UNKNOWN:

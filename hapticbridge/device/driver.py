@@ -60,6 +60,8 @@ class Driver:
         rate: Rate of reports, in words.
         on_stall: Fate of the force while the host is stalled, in words; empty without force. The
             host cannot act then, only the device itself.
+        has_guardian: True if on Linux a second process ends the force of a bridge that dies or
+            hangs (``watchdog.ForceOffGuardian``); the device must allow two owners.
         options: Options of ``open``, with their types.
         open: Finds and opens the device; its arguments are the options and a receiver of messages.
         usage: Usage page and usage of the HID collection with the protocol, if a product has
@@ -81,6 +83,7 @@ class Driver:
     options: Options
     open: Callable[[Mapping[str, object], Notify], Device]
     on_stall: str = ""
+    has_guardian: bool = False
     usage: tuple[int, int] | None = None
     find: Callable[[], list[FoundDevice]] | None = None
     medium: Callable[[], str] | None = None

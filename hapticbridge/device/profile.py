@@ -29,6 +29,7 @@ from typing import Any
 import platformdirs
 import tomli_w
 
+from hapticbridge.arguments import is_number
 from hapticbridge.device.base import AXES, DATA_SHEET_UNITS, DeviceInfo, checked_number
 from hapticbridge.errors import DeviceError, choices
 
@@ -204,14 +205,10 @@ def _quantity(name: str, table: object) -> Quantity:
         raise DeviceError(
             f"[{name}] interval = {interval!r}: must be two numbers around a single value"
         )
-    least, most = (float(end) if _is_number(end) else math.nan for end in interval)
+    least, most = (float(end) if is_number(end) else math.nan for end in interval)
     if not least <= value <= most:
         raise DeviceError(f"[{name}] interval = {interval!r}: must contain the value {value:g}")
     return Quantity(value, source, (least, most))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 # Search of profiles: the user's own take precedence over shipped ones

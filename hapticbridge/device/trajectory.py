@@ -69,12 +69,16 @@ class Motion:
         Raises:
             DeviceError: A shape or value is not valid; the message names the row, from 0.
         """
-        columns = [np.asarray(times, dtype=np.float64), np.asarray(positions, dtype=np.float64)]
-        count = columns[0].size
+        count = np.size(np.asarray(times))
         if quaternions is None:
-            columns.append(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
-        else:
-            columns.append(np.asarray(quaternions, dtype=np.float64))
+            quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        given = times, positions, quaternions
+        try:
+            columns = [np.asarray(values, dtype=np.float64) for values in given]
+        except (TypeError, ValueError, OverflowError):  # text, or rows of different lengths
+            raise DeviceError(
+                "a motion's times, positions and quaternions must be numbers"
+            ) from None
         shapes = [column.shape for column in columns]
         if shapes != [(count,), (count, 3), (count, 4)] or count < 2:
             raise DeviceError(

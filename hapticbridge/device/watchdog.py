@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import mmap
 import os
+import select
 import subprocess
 import sys
 from typing import IO, cast
 
-# Guardian process that writes a zero-force report if the bridge process dies
+from hapticbridge.errors import DeviceError
+
+# Guardian process that writes a zero-force report if the bridge process dies or hangs
 
 _CHILD = """
-import os, select, signal, sys, time
+import mmap, os, select, signal, sys, time
 for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGTSTP", "SIGQUIT"):
     signal.signal(getattr(signal, name), signal.SIG_IGN)
-device, bridge, pause = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-reports = [bytes.fromhex(text) for text in sys.argv[4:]]
-os.write(1, b"r")
-while not (is_told := select.select([0], [], [], pause)[0]) and os.getppid() == bridge:
-    pass
-if not is_told or not os.read(0, 1):
+device, page, bridge, pause = *map(int, sys.argv[1:4]), float(sys.argv[4])
+reports = [bytes.fromhex(text) for text in sys.argv[5:]]
+words = memoryview(mmap.mmap(page, 0)).cast("q")
+seen = looks = 0
+def end_force():
     for _ in range(3):
         for report in reports:
             try:
@@ -27,6 +31,16 @@ if not is_told or not os.read(0, 1):
             except OSError:
                 pass
         time.sleep(0.002)
+os.write(1, b"r")
+while not (is_told := select.select([0], [], [], pause)[0]) and os.getppid() == bridge:
+    beat = words[0]
+    looks = looks + 1 if beat == seen and beat else 0
+    seen = beat
+    if looks == words[1]:
+        words[2] = beat
+        end_force()
+if not is_told or not os.read(0, 1):
+    end_force()
 """
 # three times, because a report of the dead bridge may still follow the first one
 
@@ -35,17 +49,33 @@ POLL = 0.01
 at once, unless a process forked by the bridge holds it open; the force then lasts for this time.
 Each check takes some microseconds on another core."""
 
-PATIENCE = 5.0
-"""Longest time in s for the child to end; it needs about a millisecond."""
+START_PATIENCE, PATIENCE = 10.0, 2.0
+"""Longest time in s for the child to start, which takes 50 ms, and to end, which takes 1 ms. It
+ends later only while the device does not accept a report."""
+
+HANG = 0.1
+"""Time in s without a new command after which a loop counts as hung while force is on. Longer than
+``SILENCE``, so that the device's own watchdog and its silence come first. At a shorter time, stalls
+of an ordinary kernel would end runs; at a longer one the last force would stay on for longer."""
+
+HANG_PERIODS = 3
+"""Fewest periods of the loop in ``HANG``: at 10 Hz a command every 100 ms is in time."""
 
 
 class ForceOffGuardian:
-    """Child process that writes reports to a device node if this process ends without ``close``.
+    """Child process that writes reports to a device node if this process dies or hangs.
 
-    A bridge that is killed (SIGKILL) or crashes runs no code of its own any more. The child holds a
-    second handle to the device node. It detects the closed pipe or a new parent, and then writes
-    the reports. This requires a node that two processes can hold, such as hidraw. A USB interface
-    belongs to one process; there the device's own watchdog is the only protection.
+    A bridge that is killed (SIGKILL), crashes, is stopped (SIGSTOP, a breakpoint) or never returns
+    from a call runs no code of its own any more. The child holds a second handle to the device
+    node. It writes the reports once it detects the closed pipe or a new parent, and if ``beat`` was
+    not called for ``HANG`` while force was on. This requires a node that two processes can hold,
+    such as hidraw. A USB interface belongs to one process; there the device's own watchdog is the
+    only protection.
+
+    Beats are counted in checks of the child, not in time. A machine that is suspended, or frozen
+    with all its processes, stops the checks too, and no force is ended by mistake. A loop that
+    wakes up after the child ended its force must not switch it on again: ``beat`` then raises, and
+    the run trips. A loop without force is never hung, however long it waits.
 
     Args:
         path: The device node; opened once more, for writing.
@@ -56,20 +86,56 @@ class ForceOffGuardian:
     """
 
     def __init__(self, path: str, *reports: bytes) -> None:
-        node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
-        arguments = str(node), str(os.getpid()), str(POLL)
+        # number of the last command with force (0: none), checks until a hang, number at a hang
+        page = os.memfd_create("hapticbridge-beat", os.MFD_CLOEXEC)
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", "-c", _CHILD, *arguments, *(r.hex() for r in reports)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                pass_fds=(node,),
-                start_new_session=True,  # Ctrl-C ends the bridge, which then calls close
-                bufsize=0,
-            )
+            os.ftruncate(page, mmap.PAGESIZE)
+            self._words = memoryview(mmap.mmap(page, 0)).cast("q")
+            self._number = 0
+            self.expect(0.0)
+            node = os.open(path, os.O_WRONLY | os.O_NOCTTY)
+            arguments = str(node), str(page), str(os.getpid()), str(POLL)
+            command = [sys.executable, "-I", "-S", "-c", _CHILD, *arguments]
+            try:
+                self._process = subprocess.Popen(
+                    [*command, *(report.hex() for report in reports)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    pass_fds=(node, page),
+                    start_new_session=True,  # Ctrl-C ends the bridge, which then calls close
+                    bufsize=0,
+                )
+            finally:
+                os.close(node)
         finally:
-            os.close(node)
-        cast(IO[bytes], self._process.stdout).read(1)  # the child now watches the pipe
+            os.close(page)
+        ready = cast(IO[bytes], self._process.stdout)
+        if not select.select([ready], [], [], START_PATIENCE)[0] or not ready.read(1):
+            self._process.kill()
+            self.close()
+            raise OSError("the guardian process does not start")
+
+    def expect(self, period: float) -> None:
+        """Starts a run with the loop's period in s; a hang before it is forgotten."""
+        self._words[1] = math.ceil(max(HANG, HANG_PERIODS * period) / POLL)
+        self._words[0] = self._words[2] = 0
+
+    def beat(self, *, has_force: bool) -> None:
+        """Notes a command before it is sent; a single store.
+
+        Raises:
+            DeviceError: The command has force, and the child ended the force since ``expect``.
+        """
+        if not has_force:
+            self._words[0] = 0
+            return
+        self._words[0] = self._number = self._number + 1
+        if self._words[2]:
+            raise DeviceError(
+                f"the loop sent nothing for {1e3 * POLL * self._words[1]:.0f} ms while force was "
+                "on, and the guardian process has ended the force; 'hapticbridge doctor' finds "
+                "what stalls a machine"
+            )
 
     def close(self) -> None:
         """Ends the child without writing the reports; may be called more than once."""
@@ -87,6 +153,8 @@ class ForceOffGuardian:
 
 def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
     """Starts a guardian with these reports, or returns None if only one process may hold the node.
+
+    It covers a bridge that dies and one that hangs.
 
     Without it, the device's own watchdog or the limited duration of its effects ends the force.
     """

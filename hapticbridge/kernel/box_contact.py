@@ -28,28 +28,34 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, stack_floats
 from hapticbridge.kernel.mujoco_c import floats
+from hapticbridge.kernel.rigid_contact import MARGIN
 
 CONE = 0.02
 """Angle in rad by which a normal may lie outside a feature's normal cone. Faces that lie on each
 other within this angle keep all their points, so a point is known before the faces are parallel. A
-larger angle adds points that do not touch soon, each a row of the solver. Bodies with a margin m
-that follows their speed (``rigid_contact.follow_speed``) turn by up to m/r in a step, r being the
-radius of the smaller one, and count within that angle."""
+larger angle adds points that do not touch soon, each a row of the solver. Bodies with a margin
+that their speed widens by m (``rigid_contact.follow_speed``) turn by up to m/r in a step, r being
+the radius of the smaller one, and count within that angle, up to ``WIDEST``."""
 
-LATERAL = 1e-5
-"""Length in m by which a vertex may lie beside a face and still rest on it. It bridges edges that
-are parallel within ``PARALLEL``, whose crossing is not used."""
+WIDEST = 0.5
+"""Largest angle in rad of a normal beside its feature's cone. Beyond it every face would count. A
+box that turns by more in a step may be first seen in penetration."""
 
 PARALLEL = 1e-4
-"""Sine of the angle of two edges below which their crossing is not used, without unit. Corners of
-boxes up to 0.1 m then lie at most ``LATERAL`` beside each other's faces."""
+"""Sine of the angle of two edges below which their crossing is not used, without unit. Along the
+shorter of the boxes' longest edges, of length l, such edges part by l ``PARALLEL``. That is how far
+a vertex may lie beside a face and still rest on it: 10 µm for boxes of 0.1 m."""
 
 TIE = 1e-6
-"""Depth in m that a point may have beyond twice the boxes' own depth. It keeps all points of faces
-that rest on each other."""
+"""Largest depth in m that a point may have beyond twice the boxes' own depth. It keeps all points
+of faces that rest on each other. Small boxes have l ``PARALLEL`` instead."""
 
 NEAR = 5e-5
-"""Distance in m below which two points with about equal normals count as one; the deeper stays."""
+"""Largest distance in m below which two points with about equal normals count as one; the deeper
+stays. Boxes thinner than 1 mm have ``NEARNESS`` of their smallest half-size instead."""
+
+NEARNESS = 0.1
+"""Share of a box's smallest half-size below which its points count as one, without unit."""
 
 ALIKE = 0.9999
 """Cosine of the angle of two normals above which they count as equal, without unit."""
@@ -69,16 +75,22 @@ _scratch = stack_floats(_SCRATCH)
 _normals = stack_floats(9 * 6)
 
 Numbers = NDArray[np.float64]
+Limits = tuple[float, float, float, float, float]
+"""Smallest and largest gap in m, angle of the normal cones in rad, length in m by which a vertex
+may lie beside a face, and distance in m below which points count as one."""
 
 
 @compiled
-def _add(points: Numbers, count: int, gap: float, p: Any, n: Any) -> int:
-    """Adds a point with position p and normal n in the world; returns the number of points."""
+def _add(points: Numbers, count: int, gap: float, p: Any, n: Any, near: float) -> int:
+    """Adds a point with position p and normal n in the world; returns the number of points.
+
+    Points within a distance ``near`` in m of it, with about its normal, count as one.
+    """
     at, worst = -1, gap
     for k in range(count):
         one = POINT * k
         x, y, z = points[one + 1] - p[0], points[one + 2] - p[1], points[one + 3] - p[2]
-        if x * x + y * y + z * z < NEAR * NEAR:
+        if x * x + y * y + z * z < near * near:
             alike = points[one + 4] * n[0] + points[one + 5] * n[1] + points[one + 6] * n[2]
             if alike > ALIKE:
                 if gap >= points[one]:
@@ -105,7 +117,8 @@ def _write(points: Numbers, at: int, gap: float, p: Any, n: Any) -> None:
 
 
 @compiled
-def _turned(turn: Numbers, x: float, y: float, z: float) -> tuple[float, float, float]:
+def turned(turn: Numbers, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Returns a vector of a frame with the given axes (by rows of the world's) in the world."""
     return (
         turn[0] * x + turn[1] * y + turn[2] * z,
         turn[3] * x + turn[4] * y + turn[5] * z,
@@ -114,8 +127,19 @@ def _turned(turn: Numbers, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 @compiled
-def _placed(place: Numbers, turn: Numbers, x: float, y: float, z: float) -> Any:
-    p = _turned(turn, x, y, z)
+def turned_back(turn: Numbers, v: Any) -> tuple[float, float, float]:
+    """Returns a vector of the world in the frame with the given axes, the inverse of ``turned``."""
+    return (
+        turn[0] * v[0] + turn[3] * v[1] + turn[6] * v[2],
+        turn[1] * v[0] + turn[4] * v[1] + turn[7] * v[2],
+        turn[2] * v[0] + turn[5] * v[1] + turn[8] * v[2],
+    )
+
+
+@compiled
+def placed(place: Numbers, turn: Numbers, x: float, y: float, z: float) -> Any:
+    """Returns a point of a frame in the world."""
+    p = turned(turn, x, y, z)
     return place[0] + p[0], place[1] + p[1], place[2] + p[2]
 
 
@@ -125,7 +149,7 @@ def _vertices(
     count: int,
     boxes: tuple[Numbers, Numbers, Numbers, Numbers],
     frame: tuple[Numbers, Numbers, float],
-    limits: tuple[float, float, float],
+    limits: Limits,
 ) -> int:
     """Adds the vertices of a box that are near another one.
 
@@ -135,12 +159,12 @@ def _vertices(
         boxes: Axes of the vertices' box in the other's frame by rows, its centre there in m, and
             the half-sizes of the other box and of the vertices' box in m.
         frame: Position and axes of the other box in the world, and the sign of the normal.
-        limits: Smallest and largest gap in m, and the angle of the normal cones in rad.
+        limits: As ``Limits``.
 
     Returns:
         The new number of points.
     """
-    (r, t, s, o), (place, turn, sign), (least, margin, cone) = boxes, frame, limits
+    (r, t, s, o), (place, turn, sign), (least, margin, cone, beside, near) = boxes, frame, limits
     for corner in range(8):
         c0 = 1.0 if corner & 1 else -1.0
         c1 = 1.0 if corner & 2 else -1.0
@@ -166,15 +190,15 @@ def _vertices(
             if _inward(r, (c0, c1, c2), (ex, ey, ez)) <= 0.0:
                 gap = np.sqrt(ex * ex + ey * ey + ez * ez)
                 if gap < margin:
-                    p = _placed(place, turn, px - 0.5 * ex, py - 0.5 * ey, pz - 0.5 * ez)
+                    p = placed(place, turn, px - 0.5 * ex, py - 0.5 * ey, pz - 0.5 * ez)
                     up = sign / gap
-                    n = _turned(turn, up * ex, up * ey, up * ez)
-                    count = _add(points, count, gap, p, n)
+                    n = turned(turn, up * ex, up * ey, up * ez)
+                    count = _add(points, count, gap, p, n, near)
                 continue
-        face, side, gap = _face(r, (c0, c1, c2), (px, py, pz), (fx, fy, fz), (least, cone))
+        face, side, gap = _face(r, (c0, c1, c2), (px, py, pz), (fx, fy, fz), (least, cone, beside))
         if gap >= least and gap < margin:
             half = 0.5 * gap * side
-            p = _placed(
+            p = placed(
                 place,
                 turn,
                 px - (half if face == 0 else 0.0),
@@ -183,7 +207,7 @@ def _vertices(
             )
             up = sign * side
             n = (up * turn[face], up * turn[3 + face], up * turn[6 + face])
-            count = _add(points, count, gap, p, n)
+            count = _add(points, count, gap, p, n, near)
     return count
 
 
@@ -213,9 +237,10 @@ def _face(r: Numbers, corner: Any, p: Any, f: Any, limits: Any) -> tuple[int, fl
         corner: Signs of the vertex.
         p: The vertex.
         f: Its gaps to the nearer face along each axis, in m.
-        limits: Smallest gap in m at which a far face counts, and the angle of the cone in rad.
+        limits: Smallest gap in m at which a far face counts, the angle of the cone in rad, and the
+            length in m by which the vertex may lie beside a face.
     """
-    least, cone = limits
+    least, cone, lateral = limits
     gap, face, side = -np.inf, 0, 1.0
     for i in range(3):
         if i == 0:
@@ -224,7 +249,7 @@ def _face(r: Numbers, corner: Any, p: Any, f: Any, limits: Any) -> tuple[int, fl
             q, near, beside = p[1], f[1], max(f[0], f[2])
         else:
             q, near, beside = p[2], f[2], max(f[0], f[1])
-        if beside > LATERAL:
+        if beside > lateral:
             continue
         up = 1.0 if q >= 0.0 else -1.0
         c0, c1, c2 = corner[0] * r[3 * i], corner[1] * r[3 * i + 1], corner[2] * r[3 * i + 2]
@@ -286,7 +311,7 @@ def _edges(
     s: Numbers,
     normals: Numbers,
     frame: tuple[Numbers, Numbers],
-    limits: tuple[float, float, float],
+    limits: Limits,
 ) -> int:
     """Adds the crossings of edges of two boxes.
 
@@ -295,12 +320,12 @@ def _edges(
         s: Scratch memory of the pair.
         normals: Normals of the pairs of axes, from ``_separation``.
         frame: Position and axes of the first box in the world.
-        limits: Smallest and largest gap in m, and the angle of the normal cones in rad.
+        limits: As ``Limits``.
 
     Returns:
         The number of points.
     """
-    (place, turn), (least, margin, cone) = frame, limits
+    (place, turn), (least, margin, cone, _, near) = frame, limits
     r, t, a, b = s[_R : _R + 9], s[_T : _T + 3], s[_A : _A + 3], s[_B : _B + 3]
     count = 0
     for pair in range(9):
@@ -334,12 +359,12 @@ def _edges(
                 continue
             pk, pm = ak + 0.5 * gap * nk, am + 0.5 * gap * nm
             if i == 0:
-                p, n = _placed(place, turn, u, pk, pm), _turned(turn, 0.0, nk, nm)
+                p, n = placed(place, turn, u, pk, pm), turned(turn, 0.0, nk, nm)
             elif i == 1:
-                p, n = _placed(place, turn, pm, u, pk), _turned(turn, nm, 0.0, nk)
+                p, n = placed(place, turn, pm, u, pk), turned(turn, nm, 0.0, nk)
             else:
-                p, n = _placed(place, turn, pk, pm, u), _turned(turn, nk, nm, 0.0)
-            count = _add(points, count, gap, p, n)
+                p, n = placed(place, turn, pk, pm, u), turned(turn, nk, nm, 0.0)
+            count = _add(points, count, gap, p, n, near)
     return count
 
 
@@ -374,8 +399,10 @@ def box_points(
     if largest >= margin:
         return 0
     square = min(a[0] ** 2 + a[1] ** 2 + a[2] ** 2, b[0] ** 2 + b[1] ** 2 + b[2] ** 2)
-    cone = max(CONE, margin / np.sqrt(square))
-    limits = (min(2.0 * largest, 0.0) - TIE, margin, cone)
+    cone = min(max(CONE, (margin - 2.0 * MARGIN) / np.sqrt(square)), WIDEST)
+    beside = 2.0 * PARALLEL * min(max(a[0], a[1], a[2]), max(b[0], b[1], b[2]))
+    near = min(NEAR, NEARNESS * min(a[0], a[1], a[2], b[0], b[1], b[2]))
+    limits = (min(2.0 * largest, 0.0) - min(TIE, beside), margin, cone, beside, near)
     count = _edges(points, s, normals, (place1, turn1), limits)
     first = (s[_R : _R + 9], s[_T : _T + 3], a, b)
     second = (s[_BACK : _BACK + 9], s[_U : _U + 3], b, a)

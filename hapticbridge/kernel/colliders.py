@@ -41,7 +41,15 @@ import numpy as np
 
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import callback, compiled, external
-from hapticbridge.kernel.box_contact import MOST_POINTS, POINT, Numbers, box_points
+from hapticbridge.kernel.box_contact import (
+    MOST_POINTS,
+    POINT,
+    Numbers,
+    box_points,
+    placed,
+    turned,
+    turned_back,
+)
 from hapticbridge.kernel.mujoco_c import floats, ints, library_path, pointer_at, singles, struct_of
 
 EXACT_POINTS = 1 << 30
@@ -87,7 +95,7 @@ _C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
 
 
 @compiled
-def _placed(model: int, data: int, geom: int) -> tuple[Numbers, Numbers, Numbers]:
+def _shape(model: int, data: int, geom: int) -> tuple[Numbers, Numbers, Numbers]:
     """Returns position, axes by rows and sizes of a geom."""
     return (
         floats(pointer_at(data + _PLACES) + 24 * geom, 3),
@@ -106,7 +114,7 @@ def box_box(model: int, data: int, contacts: int, first: int, second: int, margi
     if not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return int(_mjc_box_box(model, data, contacts, first, second, margin))
     points = floats(contacts, POINT * MOST_POINTS)
-    return box_points(points, _placed(model, data, first), _placed(model, data, second), margin)
+    return box_points(points, _shape(model, data, first), _shape(model, data, second), margin)
 
 
 @compiled
@@ -124,7 +132,7 @@ def round_flat(model: int, data: int, contacts: int, first: int, second: int, ma
     x, y, z = points[at + 4], points[at + 5], points[at + 6]
     # the face's plane: n·q of the point that was found, on the face
     plane = x * points[at + 1] + y * points[at + 2] + z * points[at + 3] + 0.5 * points[at]
-    place, turn, size = _placed(model, data, first)
+    place, turn, size = _shape(model, data, first)
     ux, uy, uz = turn[2], turn[5], turn[8]
     along = x * ux + y * uy + z * uz
     half = np.copysign(size[1], along)
@@ -141,8 +149,8 @@ def round_flat(model: int, data: int, contacts: int, first: int, second: int, ma
     gap = plane - (x * px + y * py + z * pz)
     if gap < points[at] - ROUNDING:
         # a round shape that lies along the face may have its lowest point beside it
-        flat, placed = _flat(model, second), _placed(model, data, second)
-        if _is_inside(model, second, flat, placed, (px + gap * x, py + gap * y, pz + gap * z)):
+        flat, shape = _flat(model, second), _shape(model, data, second)
+        if _is_inside(model, second, flat, shape, (px + gap * x, py + gap * y, pz + gap * z)):
             _move_nearest(points, count, gap, (px, py, pz), (x, y, z))
     return count
 
@@ -185,36 +193,36 @@ def _flat(model: int, geom: int) -> tuple[int, int, int, int]:
 
 
 @compiled
-def _support(flat: Any, placed: Any, n: Any) -> tuple[float, float, float, float]:
+def _farthest(numbers: Any, count: int, n: Any) -> int:
+    """Returns the address of the vector with the largest component along n."""
+    best, far = 0, -np.inf
+    for k in range(0, 3 * count, 3):
+        one = n[0] * numbers[k] + n[1] * numbers[k + 1] + n[2] * numbers[k + 2]
+        if one > far:
+            best, far = k, one
+    return best
+
+
+@compiled
+def _support(flat: Any, shape: Any, n: Any) -> tuple[float, float, float, float]:
     """Returns the largest n·v of a box's or mesh's vertices v, and v, in the world."""
-    (vertices, count, _, _), (place, turn, size) = flat, placed
-    u = turn[0] * n[0] + turn[3] * n[1] + turn[6] * n[2]
-    v = turn[1] * n[0] + turn[4] * n[1] + turn[7] * n[2]
-    w = turn[2] * n[0] + turn[5] * n[1] + turn[8] * n[2]
+    (vertices, count, _, _), (place, turn, size) = flat, shape
+    u, v, w = turned_back(turn, n)
     if vertices == 0:
         x, y, z = np.copysign(size[0], u), np.copysign(size[1], v), np.copysign(size[2], w)
     else:
-        numbers, best, far = singles(vertices, 3 * count), 0, -np.inf
-        for k in range(count):
-            one = u * numbers[3 * k] + v * numbers[3 * k + 1] + w * numbers[3 * k + 2]
-            if one > far:
-                best, far = 3 * k, one
-        x = float(numbers[best])
-        y = float(numbers[best + 1])
-        z = float(numbers[best + 2])
-    px = place[0] + turn[0] * x + turn[1] * y + turn[2] * z
-    py = place[1] + turn[3] * x + turn[4] * y + turn[5] * z
-    pz = place[2] + turn[6] * x + turn[7] * y + turn[8] * z
+        numbers = singles(vertices, 3 * count)
+        k = _farthest(numbers, count, (u, v, w))
+        x, y, z = float(numbers[k]), float(numbers[k + 1]), float(numbers[k + 2])
+    px, py, pz = placed(place, turn, x, y, z)
     return n[0] * px + n[1] * py + n[2] * pz, px, py, pz
 
 
 @compiled
-def _face_along(flat: Any, placed: Any, n: Any) -> tuple[float, float, float]:
+def _face_along(flat: Any, shape: Any, n: Any) -> tuple[float, float, float]:
     """Returns the normal, in the world, of the face of a box or mesh that is closest to n."""
-    (_, _, faces, count), (_, turn, _) = flat, placed
-    u = turn[0] * n[0] + turn[3] * n[1] + turn[6] * n[2]
-    v = turn[1] * n[0] + turn[4] * n[1] + turn[7] * n[2]
-    w = turn[2] * n[0] + turn[5] * n[1] + turn[8] * n[2]
+    (_, _, faces, count), (_, turn, _) = flat, shape
+    u, v, w = turned_back(turn, n)
     x, y, z = 0.0, 0.0, 0.0
     if faces == 0:
         if abs(u) >= abs(v) and abs(u) >= abs(w):
@@ -224,17 +232,10 @@ def _face_along(flat: Any, placed: Any, n: Any) -> tuple[float, float, float]:
         else:
             z = np.copysign(1.0, w)
     else:
-        numbers, best, far = floats(faces, 3 * count), 0, -np.inf
-        for k in range(count):
-            one = u * numbers[3 * k] + v * numbers[3 * k + 1] + w * numbers[3 * k + 2]
-            if one > far:
-                best, far = 3 * k, one
-        x, y, z = numbers[best], numbers[best + 1], numbers[best + 2]
-    return (
-        turn[0] * x + turn[1] * y + turn[2] * z,
-        turn[3] * x + turn[4] * y + turn[5] * z,
-        turn[6] * x + turn[7] * y + turn[8] * z,
-    )
+        numbers = floats(faces, 3 * count)
+        k = _farthest(numbers, count, (u, v, w))
+        x, y, z = numbers[k], numbers[k + 1], numbers[k + 2]
+    return turned(turn, x, y, z)
 
 
 @compiled
@@ -246,7 +247,7 @@ def flat_flat(model: int, data: int, contacts: int, first: int, second: int, mar
     one, other = _flat(model, first), _flat(model, second)
     if max(one[1], other[1], one[3], other[3]) > MOST_VERTICES:
         return count
-    a, b = _placed(model, data, first), _placed(model, data, second)
+    a, b = _shape(model, data, first), _shape(model, data, second)
     points = floats(contacts, POINT * count)
     found = points[4], points[5], points[6]
     # the normal with the largest gap of the two bodies: as found, or of either body's face
@@ -292,13 +293,10 @@ def flat_flat(model: int, data: int, contacts: int, first: int, second: int, mar
 
 
 @compiled
-def _is_inside(model: int, geom: int, flat: Any, placed: Any, p: Any) -> bool:
+def _is_inside(model: int, geom: int, flat: Any, shape: Any, p: Any) -> bool:
     """Returns True if a point in the world is in a box or mesh, or beside it by rounding."""
-    (vertices, _, faces, count), (place, turn, size) = flat, placed
-    x, y, z = p[0] - place[0], p[1] - place[1], p[2] - place[2]
-    u = turn[0] * x + turn[3] * y + turn[6] * z
-    v = turn[1] * x + turn[4] * y + turn[7] * z
-    w = turn[2] * x + turn[5] * y + turn[8] * z
+    (vertices, _, faces, count), (place, turn, size) = flat, shape
+    u, v, w = turned_back(turn, (p[0] - place[0], p[1] - place[1], p[2] - place[2]))
     if faces == 0:
         return bool(max(abs(u) - size[0], abs(v) - size[1], abs(w) - size[2]) < BESIDE)
     mesh = ints(pointer_at(model + _MESHES) + 4 * geom, 1)[0]

@@ -32,7 +32,7 @@ from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_ste
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.ledger import meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
-from hapticbridge.kernel.rigid_contact import lower_share
+from hapticbridge.kernel.rigid_contact import aim_again
 from hapticbridge.pose import Vector, norm, scaled
 
 TOLERANCE = 1e-6
@@ -117,7 +117,7 @@ def _repeat_step(s: State) -> None:
 @compiled
 def spend_within_tank(s: State) -> None:
     """Repeats the step that just ended until its contacts spend no more than the tank allows."""
-    while lower_share(s):
+    while aim_again(s):
         _repeat_step(s)
 
 

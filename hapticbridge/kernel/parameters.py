@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hapticbridge.arguments import Arguments
+from hapticbridge.arguments import Arguments, is_number, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import read_json
@@ -125,13 +125,13 @@ class GuardParameters:
             raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 3")
         for name in _NOT_NEGATIVE:
             value = getattr(self, name)
-            if not _is_number(value) or not 0 <= value < math.inf:
+            if not is_number(value) or not 0 <= value < math.inf:
                 raise HapticBridgeError(
                     f"guard: {_words(name)} is {value!r}; it must be finite and >= 0"
                 )
         for name in (*_POSITIVE, *_TRIPS):
             value = getattr(self, name)
-            if not _is_number(value) or not value > 0:
+            if not is_number(value) or not value > 0:
                 raise HapticBridgeError(f"guard: {_words(name)} is {value!r}; it must be > 0")
         smallest = {
             "stale_ticks": 0,
@@ -175,10 +175,6 @@ class GuardParameters:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 UNGUARDED = GuardParameters()
@@ -355,7 +351,7 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
     """
     try:
         numbers = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.size == 9 and np.all(np.isfinite(numbers)):
         square = numbers.reshape(3, 3)
@@ -370,5 +366,6 @@ def rotation_numbers(matrix: ArrayLike) -> tuple[float, ...]:
 
 def _no_rotation(axes: object) -> HapticBridgeError:
     return HapticBridgeError(
-        f"axes is {axes!r}; it must be the 9 numbers of a right-handed rotation matrix, row by row"
+        f"axes is {shown(axes)}; it must be the 9 numbers of a right-handed rotation "
+        "matrix, row by row"
     )

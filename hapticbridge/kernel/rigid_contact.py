@@ -8,7 +8,9 @@ Each contact has a wanted normal velocity at the end of the step, in m/s,
 h is the time step in s, v the relative velocity at the start, μ|v_t| = sqrt(Σ (μ_j v_j)²) over the
 rows of friction and σ the share of the depenetration. The convex cone lifts a contact by μ times
 its sliding, which is subtracted; the impulse that stops the normal velocity v_n slows the sliding
-first. The wanted velocities of the friction rows are 0. MuJoCo's convex problem, with the
+first. A point that still sinks by more than ``SUNK``, as the corner of a box does that stops more
+than slides, is aimed again with the sliding that is left at the end of the step. The wanted
+velocities of the friction rows are 0. MuJoCo's convex problem, with the
 regularisation R of each row, then gives impulses h λ with
 
     C = h λᵀ J v⁺ = h λᵀ ŵ − h² λᵀ R λ   <=   Σ_{p>0} (σ β p/h)² / (4 R)
@@ -54,7 +56,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
-from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
@@ -81,6 +83,16 @@ LARGEST_MARGIN = 5e-3
 """Largest margin in m that a geom's speed adds, that of 5 m/s at 1 ms. A faster geom may be first
 seen in penetration, which the tank then pays for."""
 
+SUNK = 5e-6
+"""Depth in m by which a sliding contact may sink in a step before the step is repeated. A smaller
+value repeats more steps, and looks for sinks at slower sliding: from 12 mm/s on at μ = 0.4."""
+
+MOST_CORRECTIONS = 3
+"""Largest number of such repetitions of a step."""
+
+MOST_ROWS = 1024
+"""Largest number of constraint rows with which sinks are looked for; 340 contacts with friction."""
+
 SPENDABLE = 0.9
 """Largest share of the tank that one tick spends, without unit. The rest covers the remainder of
 the integration."""
@@ -95,7 +107,7 @@ the velocity that is left in the rows of friction."""
 
 _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 
-_LAST_ROWS = int(mujoco.mjtEq.mjEQ_TENDON)
+LAST_RIGID = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
 
 _PARAMETERS = (
@@ -111,7 +123,7 @@ _OF_MODEL = (
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
-    *("eq_type", "row_positions", "moving_geoms", "body_velocity"),
+    *("eq_type", "row_positions", "end_velocity", "moving_geoms", "body_velocity"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -120,6 +132,7 @@ RIGID_DTYPE = np.dtype(
         ("repetitions", "<i8"),
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
+        ("corrections", "<i8"),
         ("row_capacity", "<i8"),
         *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
@@ -128,15 +141,17 @@ RIGID_DTYPE = np.dtype(
         ("tank", "<f8"),
         ("cap", "<f8"),
         ("last_energy", "<f8"),
+        ("lift", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
-last tick. ``is_aimed`` is 1 from the edit to the end of the step. Of limits and equality
-constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
-of copies, and of the rows' own positions. Of margins: addresses and counts of the geoms that move,
-of pairs, and of the bodies' velocities."""
+last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
+repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it. Of limits
+and equality constraints: largest count of rows (0 if there are none), and addresses of the model's
+parameters, of copies, of the rows' own positions and of J v⁺. Of margins: addresses and counts of
+the geoms that move, of pairs, and of the bodies' velocities."""
 
 
 def bind_contact(
@@ -145,7 +160,7 @@ def bind_contact(
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
-    is_rigid = model.eq_type <= _LAST_ROWS
+    is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
         contact["row_capacity"] = (
@@ -156,6 +171,7 @@ def bind_contact(
     }
     owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     owned["row_positions"] = np.zeros(max(int(contact["row_capacity"]), 1))
+    owned["end_velocity"] = np.zeros(MOST_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
@@ -188,23 +204,31 @@ def _aim(s: State) -> None:
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
+    ends = floats(s.contact.end_velocity, MOST_ROWS)
     contacts = pointer_at(mj.contact)
+    s.contact.lift = 0.0
     for c in range(ints(mj.ncon, 1)[0]):
         contact = contacts + c * mj.contact_size
         row = ints(contact + mj.contact_row, 1)[0]
         if row < 0:
             continue
         friction = floats(contact + mj.contact_friction, 5)
-        slide = 0.0
+        slide, rest = 0.0, 0.0
         for j in range(1, ints(contact + mj.contact_dim, 1)[0]):
             slide += (friction[j - 1] * velocities[row + j]) ** 2
+            if s.contact.corrections > 0:
+                rest += (friction[j - 1] * ends[row + j]) ** 2
         distance = floats(contact + mj.contact_distance, 1)[0]
         wanted = (-push if distance < 0.0 else -1.0) * distance / h
         if s.energy.mocap_has_moved:
             opened = max(opened_by_mocap(s, contact), 0.0)
             wanted -= max(opened - max(distance, 0.0), 0.0) / h
         stop = max(wanted - velocities[row], 0.0)
-        wanted -= max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
+        lift = max(math.sqrt(slide) - friction[0] ** 2 * stop, 0.0)
+        if s.contact.corrections > 0:
+            lift = min(lift, math.sqrt(rest))
+        s.contact.lift = max(s.contact.lift, lift)
+        wanted -= lift
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         solref = floats(contact + mj.contact_solref, 2)
@@ -232,7 +256,7 @@ def _parameters_of(s: State, kind: int) -> tuple[int, int, int, int]:
 def _is_held(s: State, kind: int, i: int) -> bool:
     """Returns True for a row of a limit or of an equality constraint that is rigid."""
     if kind == EQUALITY:
-        return bool(ints(s.contact.eq_type, i + 1)[i] <= _LAST_ROWS)
+        return bool(ints(s.contact.eq_type, i + 1)[i] <= LAST_RIGID)
     return bool(kind in (LIMIT_JOINT, LIMIT_TENDON))
 
 
@@ -300,6 +324,7 @@ def aim_contacts(s: State) -> None:
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.share = 1.0 if has_energy else 0.0
+        contact.corrections = 0
         _aim(s)
         contact.is_aimed = 1
 
@@ -328,14 +353,43 @@ def returned_energy(s: State) -> float:
 
 
 @compiled
-def lower_share(s: State) -> bool:
-    """Aims at less depenetration if the step that just ended spent more than the tank allows.
+def _has_sunk(s: State) -> bool:
+    """Returns True if a contact sank in the step because it slid less than at the start."""
+    mj, h, contact = s.mj, s.run.timestep, s.contact
+    count = ints(mj.nefc, 1)[0]
+    if h * contact.lift <= SUNK or count > MOST_ROWS:
+        return False
+    mj_mul_jac(mj.model, mj.data, contact.end_velocity, mj.qvel)
+    ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
+    for c in range(ints(mj.ncon, 1)[0]):
+        one = contacts + c * mj.contact_size
+        row = ints(one + mj.contact_row, 1)[0]
+        if row < 0 or ints(one + mj.contact_dim, 1)[0] == 1:
+            continue
+        gap = max(floats(one + mj.contact_distance, 1)[0], 0.0)
+        if gap + h * ends[row] < -SUNK:
+            return True
+    return False
+
+
+@compiled
+def aim_again(s: State) -> bool:
+    """Corrects what the step that just ended aimed at: less sinking, or less depenetration.
+
+    Contacts that sank aim higher. If the step spent more than the tank allows, the share is lower.
 
     Returns:
         True if it did; the step must then be repeated.
     """
     contact = s.contact
-    if not contact.is_aimed or contact.share <= 0.0:
+    if not contact.is_aimed:
+        return False
+    if contact.corrections < MOST_CORRECTIONS and _has_sunk(s):
+        contact.corrections += 1
+        contact.repetitions += 1
+        _aim(s)
+        return True
+    if contact.share <= 0.0:
         return False
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:

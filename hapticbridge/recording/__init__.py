@@ -3,8 +3,8 @@
 Read ``format`` first, the definition of a recording. Records leave the loop through ``ring``,
 events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;
 ``snapshot`` holds the scene's positions for a viewer. ``writer`` writes a file. ``reader`` reads
-one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut.
-``timeline`` computes due times.
+one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut. ``seal``
+holds the digest of the contents, the hash chain over the file, and the signature.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment

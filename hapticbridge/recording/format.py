@@ -1,4 +1,4 @@
-"""Recording format: names, schemas, payloads and digest.
+"""Recording format: names, schemas and payloads.
 
 A recording is an MCAP file (https://mcap.dev/spec), zstd, chunks of 128 kB:
 
@@ -9,7 +9,7 @@ and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds n
 earlier versions may lack ``LATER_FIELDS``.
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
 ``time_ns`` (since the start of the run).
-- The metadata record ``hapticbridge.digest`` comes last, with ``sha256`` (see ``Digest``).
+- The metadata record ``hapticbridge.digest`` comes last (see ``seal``).
 
 The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
 tick's ``deadline_ns`` or the event's ``time_ns``.
@@ -17,14 +17,12 @@ tick's ``deadline_ns`` or the event's ``time_ns``.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.record import LATER_FIELDS, TICK_DTYPE
 
@@ -43,7 +41,6 @@ EVENT_SCHEMA = (
 
 METADATA_NAME = "hapticbridge"
 DIGEST_NAME = "hapticbridge.digest"
-DIGEST_KEY = "sha256"
 EPOCH_KEY = "epoch_ns"
 
 CHUNK_SIZE = 128 * 1024
@@ -119,57 +116,3 @@ def _plain(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_plain(entry) for entry in value]
     return str(value)
-
-
-class Digest:
-    """SHA-256 of a recording's contents, independent of the container's layout.
-
-    It is the SHA-256 of ``hapticbridge digest 1``, a newline, and four SHA-256 of 32 bytes each:
-
-    1. metadata: for each key in sorted order, key and value;
-    2. attachments: for each name in sorted order, name, media type and data;
-    3. ticks: all records in order, packed, without CDR headers or separators;
-    4. events: each JSON payload in order.
-
-    In 1, 2 and 4 every piece (text as UTF-8) follows its length as 8 bytes, little-endian.
-    Different contents therefore never give equal bytes.
-    """
-
-    def __init__(
-        self, metadata: Mapping[str, str] | None = None, attachments: Iterable[Attachment] = ()
-    ) -> None:
-        self._ticks = hashlib.sha256()
-        self._events = hashlib.sha256()
-        self.describe(metadata or {}, attachments)
-
-    def describe(self, metadata: Mapping[str, str], attachments: Iterable[Attachment]) -> None:
-        """Sets metadata and attachments, which are known only at the end of a damaged file."""
-        self._metadata = hashlib.sha256()
-        for key in sorted(metadata):
-            _add(self._metadata, key.encode())
-            _add(self._metadata, metadata[key].encode())
-        self._attachments = hashlib.sha256()
-        for attachment in sorted(attachments, key=lambda attachment: attachment.name):
-            _add(self._attachments, attachment.name.encode())
-            _add(self._attachments, attachment.media_type.encode())
-            _add(self._attachments, attachment.data)
-
-    def add_ticks(self, rows: NDArray[np.void]) -> None:
-        """Adds records, shape (n,), ``TICK_DTYPE``."""
-        self._ticks.update(np.ascontiguousarray(rows).view(np.uint8).data)
-
-    def add_event(self, payload: bytes) -> None:
-        """Adds one event's JSON."""
-        _add(self._events, payload)
-
-    def hexdigest(self) -> str:
-        """Returns the digest of the contents so far, as 64 hexadecimal digits."""
-        whole = hashlib.sha256(b"hapticbridge digest 1\n")
-        for part in (self._metadata, self._attachments, self._ticks, self._events):
-            whole.update(part.digest())
-        return whole.hexdigest()
-
-
-def _add(digest: hashlib._Hash, piece: bytes) -> None:
-    digest.update(len(piece).to_bytes(8, "little"))
-    digest.update(piece)

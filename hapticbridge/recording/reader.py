@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.seal import DIGEST, Digest, seal_fault
 
 # Metadata, attachments, events and ticks of a container
 
@@ -48,7 +51,7 @@ class Contents:
         events: Payload and JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
-        digest: Digest stored in the file.
+        seal: Entries of the seal; None before it is read.
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events.
     """
@@ -59,7 +62,7 @@ class Contents:
     events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
-    digest: str | None = None
+    seal: dict[str, str] | None = None
     refusal: str | None = None
     keeps_events: bool = True
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
@@ -83,9 +86,9 @@ class Contents:
                 raise DamageError(f"there is a second metadata record '{name}'")
             self.meta = entries
         elif name == layout.DIGEST_NAME:
-            if self.digest is not None:
+            if self.seal is not None:
                 raise DamageError(f"there is a second metadata record '{name}'")
-            self.digest = entries.get(layout.DIGEST_KEY, "")
+            self.seal = entries
 
     def add_attachment(self, fields: Fields) -> None:
         """Adds an attachment.
@@ -160,9 +163,7 @@ class Contents:
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
         """Adds the run of records that starts here; returns its end."""
-        message = np.dtype(
-            [*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(self.record))]  # packed
-        )
+        message = _message_dtype(self.record)
         size, count = message.itemsize, 16
         start = position
         while True:
@@ -194,9 +195,30 @@ class Contents:
         self.events.append((payload, event))
 
 
+CUT = "the file is cut: its end is missing"
+"""Meaning of a file without its end."""
+
+CUTTING_EVENTS = {
+    "bridge_died": "the bridge died during the run",
+    "recorder_died": "the recorder died during the run; the bridge wrote the file anew",
+    "repaired": "the file had lost its end and was repaired",
+}
+"""Events of a file that lacks the end of its run, with their meaning. No export leaves them out."""
+
+
+@cache
+def _message_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype([*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(record))])  # packed
+
+
 BLOCK = 1 << 14
 """Number of records per block: 16 s at 1 kHz, 6.5 MB. Larger blocks take more memory, smaller ones
 more time."""
+
+
+MAX_KEPT = 1 << 17
+"""Largest number of records that an open recording keeps in memory: two minutes at 1 kHz, 53 MB.
+The files of longer runs are read once per use."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,10 +236,10 @@ class RecordingFile:
         attachments: Attached files by name.
         is_cut: True if the end of the file is missing because recorder or machine died; everything
             up to the last whole chunk is available.
-        digest: SHA-256 stored at the end, or None.
-        computed_digest: SHA-256 of the contents that were read.
-        problems: Damage, one sentence each; empty for an undamaged file, even a cut one. The caller
-            compares the two digests.
+        seal: Entries of the seal (``recording.seal``) at the end of the file; empty without one.
+        computed_seal: Digest, chain and index hash of what was read.
+        problems: Damage, one sentence each; empty for an undamaged file, even a cut one.
+        kept: All records if there are at most ``MAX_KEPT``, so that they are read once; else None.
     """
 
     path: Path
@@ -229,20 +251,47 @@ class RecordingFile:
     meta: dict[str, str]
     attachments: dict[str, bytes] = field(repr=False)  # megabytes
     is_cut: bool
-    digest: str | None
-    computed_digest: str
-    problems: tuple[str, ...]
+    seal: Mapping[str, str] = field(default_factory=dict)
+    computed_seal: Mapping[str, str] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    kept: NDArray[np.void] | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def digest(self) -> str | None:
+        """SHA-256 stored at the end, or None."""
+        return self.seal.get(DIGEST)
+
+    @property
+    def computed_digest(self) -> str:
+        """SHA-256 of the contents that were read."""
+        return self.computed_seal[DIGEST]
+
+    @property
+    def seal_fault(self) -> str:
+        """Sentence if a whole file is not as it was sealed, else empty."""
+        return "" if self.is_cut else seal_fault(self.seal, self.computed_seal)
+
+    @property
+    def cut_sentence(self) -> str:
+        """Sentence if the run's end is or was missing in the file, else empty."""
+        found = [CUT] if self.is_cut else []
+        names = {event.get("event") for event in self.events}
+        found += [words for name, words in CUTTING_EVENTS.items() if name in names]
+        return "; ".join(found)
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yields the records in order, in blocks of equal size (the last: shorter).
 
-        The caller may keep a block. ``size`` is the number of records per block, ``BLOCK`` by
-        default.
+        The caller may keep a block, but not write to it. ``size`` is the number of records per
+        block, ``BLOCK`` by default.
 
         Raises:
             RecordingError: The file cannot be read, or has changed since it was opened.
         """
         size = size or BLOCK
+        if self.kept is not None:
+            yield from (self.kept[start : start + size] for start in range(0, self.count, size))
+            return
         runs: list[NDArray[np.void]] = []
         found = held = 0
 
@@ -289,33 +338,39 @@ def read_recording(path: str | Path) -> Recording:
 
 
 def open_recording(path: str | Path) -> RecordingFile:
-    """Opens a recording without loading its ticks, in memory independent of its length.
+    """Opens a recording; its ticks are loaded only if there are few (``MAX_KEPT``).
 
-    The file is read once for its digest, events and damage. Events are kept in memory; a run with
+    The file is read once for its digest, events and damage. Memory has a limit for any length of
+    the run, except for events. Events are kept in memory; a run with
     an input in every tick has one per tick.
 
     Raises:
         RecordingError: As for ``read_recording``.
     """
-    facts, _ = _read_through(Path(path), [])
-    return RecordingFile(**facts)
+    runs: list[NDArray[np.void]] = []
+    facts, _ = _read_through(Path(path), runs, max_kept=MAX_KEPT)
+    if facts["count"] > MAX_KEPT:
+        return RecordingFile(**facts)
+    kept = _join(runs, facts["record"])
+    kept.flags.writeable = False
+    return RecordingFile(**facts, kept=kept)
 
 
 def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
-    facts, attachments = _read_through(path, runs, keeps=True)
+    facts, attachments = _read_through(path, runs)
     return Recording(**facts, ticks=_join(runs, facts["record"])), attachments
 
 
 def _read_through(
-    path: Path, runs: list[NDArray[np.void]], *, keeps: bool = False
+    path: Path, runs: list[NDArray[np.void]], *, max_kept: float = math.inf
 ) -> tuple[dict[str, Any], list[Attachment]]:
     """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
 
-    ``runs`` receives the records if ``keeps``.
+    ``runs`` receives the records unless there are more than ``max_kept``.
     """
-    digest = layout.Digest()
+    digest = Digest()
     count, last, flags = 0, -1, 0
 
     def take(run: NDArray[np.void]) -> None:
@@ -324,8 +379,10 @@ def _read_through(
         count += run.size
         last = int(run["tick"][-1]) if run.size else last
         flags |= int(np.bitwise_or.reduce(run["flags"]))
-        if keeps:
+        if count <= max_kept:
             runs.append(run)
+        else:
+            runs.clear()
 
     *_, (container, contents) = _read_parts(path, take)
     if not contents.has_ticks:
@@ -349,8 +406,8 @@ def _read_through(
         "meta": meta,
         "attachments": {item.name: item.data for item in contents.attachments},
         "is_cut": container.is_cut,
-        "digest": contents.digest,
-        "computed_digest": digest.hexdigest(),
+        "seal": contents.seal or {},
+        "computed_seal": {DIGEST: digest.hexdigest(), **container.hashes},
         "problems": tuple(dict.fromkeys(contents.problems)),
     }
     return facts, contents.attachments
@@ -364,7 +421,8 @@ def _read_parts(
         if data[: len(MAGIC)] != MAGIC:
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
-        container = Container(data)
+        # only the first reading keeps events, and compares the seal
+        container = Container(data, is_hashed=keeps_events)
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
         for item in container.records():

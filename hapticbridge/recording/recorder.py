@@ -30,7 +30,9 @@ from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import check_contents
+from hapticbridge.signals import deferring_stops
 
 # Second reader of a run
 
@@ -59,6 +61,22 @@ class RingObserver(Protocol):
 
     def close(self) -> None:
         """Stops reading; must not raise."""
+
+
+# Waits for the recorder's process
+
+STANDSTILL = 2.0
+"""Longest wait in s for a recorder that takes no record and answers nothing. Force is zero and the
+device closed by then. A shorter wait would give up a slow disk's recorder."""
+
+LONGEST_CLOSE = 30.0
+"""Longest wait in s for a recorder that still takes records: a full ring on a slow disk."""
+
+_LOOK = 0.01
+"""Time in s between checks of a recorder that is waited for."""
+
+_LEFT: list[subprocess.Popen[bytes]] = []
+"""Recorders left to finish by themselves; Python warns of a process that it forgets."""
 
 
 # Completion of a recording whose recorder died
@@ -127,6 +145,7 @@ class Recorder:
 
     Attributes:
         is_disk_full: True if the disk is full; the file then has space only for the end of the run.
+        is_left: True if the process stood still at ``close`` and was left to finish by itself.
 
     Raises:
         RecordingError: The ring is not shared, metadata or attachments cannot be written, or the
@@ -146,6 +165,7 @@ class Recorder:
         if ring.name is None:
             raise RecordingError("the recorder needs a shared ring, not a local one")
         check_contents(metadata, attachments)
+        self._path, self._cursors = path, ring.cursors
         configuration = {
             "ring": ring.name,
             "parent": os.getpid(),
@@ -160,8 +180,9 @@ class Recorder:
         self._is_configured = False
         self._is_closed = False
         self.is_disk_full = False
-        self._has_failed = False
-        self._process = _start()
+        self.is_left = self._has_failed = False
+        with deferring_stops():  # an interrupted caller would not have the process to end it
+            self._process = _start()
         self._input = cast(IO[bytes], self._process.stdin)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -182,9 +203,7 @@ class Recorder:
         try:
             answer = self._answers.get(timeout=timeout)
         except Empty:
-            self._has_failed = True
-            self._process.kill()
-            self._reap()
+            self.abort()
             raise RecordingError(f"the recorder did not start within {timeout} s") from None
         if "ready" not in answer:
             raise self._failure(answer)
@@ -207,31 +226,71 @@ class Recorder:
         self._send()
         return not self._is_closed and self._process.poll() is None
 
-    def close(self) -> None:
+    def close(self, signer: Signer | None = None) -> None:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing.
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs the file;
+        the process gets the key only here, so that a bridge that dies leaves an unsigned one.
 
         Raises:
-            RecordingError: The process died, or could not write the file.
+            RecordingError: The process died, could not write the file, or stands still and is left
+                to finish it.
         """
         if self._is_closed or self._has_failed:
             self._reap()
             return
-        self._sender.join()
-        try:
-            _set_blocking(self._input, True)
-            _write(self._input, bytes(self._outbox) + b'{"close": true}\n')
-        except OSError:
-            pass  # the process died; its last answer or exit status holds the reason
-        self._outbox.clear()
-        answer: dict[str, Any] = {}
-        while "closed" not in answer and "error" not in answer and "exited" not in answer:
-            answer = self._answers.get()
-        if "closed" not in answer:
+        end = {"close": True, "seed": "" if signer is None else signer.seed.hex()}
+        self._outbox += json.dumps(end).encode() + b"\n"
+        answer = self._last_answer()
+        if answer is None:
+            self._leave()
+        elif "closed" in answer:
+            self._reap()
+        else:
             raise self._failure(answer)
+
+    def abort(self) -> None:
+        """Ends the process at once, for a run that never began; the file stays as it is."""
+        self._has_failed = True
+        self._process.kill()
         self._reap()
+
+    def _last_answer(self) -> dict[str, Any] | None:
+        """Returns the answer with which the process ends; None if it stands still."""
+        began = heard = time.monotonic()
+        before = -1, -1
+        while True:
+            self._send()
+            with contextlib.suppress(Empty):
+                answer = self._answers.get(timeout=_LOOK)
+                if not answer.keys().isdisjoint(("closed", "error", "exited")):
+                    return answer
+            now, state = time.monotonic(), (int(self._cursors[TAIL]), len(self._outbox))
+            if state != before:
+                before, heard = state, now
+            if now > min(heard + STANDSTILL, began + LONGEST_CLOSE):
+                return None
+
+    def _leave(self) -> None:
+        """Leaves a process that stands still to finish its file, or ends one without a file.
+
+        Raises:
+            RecordingError: There is a file.
+        """
+        if self._path is None:
+            self.abort()
+            return
+        self._is_closed = self._has_failed = self.is_left = True
+        _LEFT.append(self._process)
+        with contextlib.suppress(OSError):
+            self._input.close()  # it ends its input, and so the recording, where the close waited
+        pid = self._process.pid
+        raise RecordingError(
+            f"the recorder (process {pid}) has stood still for {STANDSTILL:g} s and is left to "
+            f"finish '{self._path}', which is whole once that process has ended; "
+            f"'kill -CONT {pid}' wakes it if it was stopped"
+        )
 
     def _failure(self, answer: Mapping[str, Any]) -> RecordingError:
         self._has_failed = True
@@ -247,11 +306,20 @@ class Recorder:
 
     def _reap(self) -> None:
         self._is_closed = True
-        self._process.wait()
-        self._sender.join()
+        if self.is_left:
+            return
+        for _ in range(2):
+            try:
+                self._process.wait(STANDSTILL)
+                break
+            except subprocess.TimeoutExpired:  # it gave its last answer, or was killed
+                self._process.kill()
+        else:  # inside a disk that does not answer; the system ends it after that
+            _LEFT.append(self._process)
+        self._sender.join(STANDSTILL)
         with contextlib.suppress(OSError):  # what is unsent has no receiver
             self._input.close()
-        self._listener.join()
+        self._listener.join(STANDSTILL)
 
     def _configure(self, pieces: list[bytes]) -> None:
         try:
@@ -327,6 +395,9 @@ RING_POLL = 1e-3
 KEPT_EVENTS = 4096
 """Number of events kept to be written again if the recorder dies; more would only cost memory."""
 
+RING_PATIENCE = 30.0
+"""Longest wait in s for space in the ring while the recorder takes no record, in simulated time."""
+
 _ENDED = "the recorder ended during the run; the recording stops there"
 _FULL = "the disk is full; the recording ends here and is whole"
 
@@ -379,6 +450,7 @@ class RecordStream:
             self.cursors[TAIL] = NOBODY_READS
         self.recorder: Recorder | None = None
         self.lost = self.dropped = 0
+        self._taken, self._taken_at = -1, 0.0
         self._events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
 
     @property
@@ -418,11 +490,16 @@ class RecordStream:
             lost.
 
         Raises:
-            RecordingError: The recorder's process ended.
+            RecordingError: The recorder's process ended, or stood still for ``RING_PATIENCE``.
         """
         if self.recorder is None or not self.recorder.is_alive():
             raise RecordingError(_ENDED)
         if self._may_wait and not is_stopping:
+            taken, now = int(self.cursors[TAIL]), time.monotonic()
+            if taken != self._taken:
+                self._taken, self._taken_at = taken, now
+            elif now - self._taken_at > RING_PATIENCE:
+                raise RecordingError(f"the recorder has taken no record for {RING_PATIENCE:g} s")
             time.sleep(RING_POLL)
             return True
         self.dropped += 1
@@ -456,24 +533,37 @@ class RecordStream:
         """Returns copies of the newest records, oldest first."""
         return self._ring.latest(count)
 
-    def close(self) -> None:
+    def close(self, signer: Signer | None = None, *, is_discarded: bool = False) -> None:
         """Waits until the recorder has finished the file, and removes the shared memory.
 
+        ``signer`` signs the file. A run that never began has no recording (``is_discarded``): its
+        file is removed.
+
         Raises:
-            RecordingError: The recorder's process died, or could not write the file.
+            RecordingError: The recorder's process died, could not write the file, or stands still.
         """
         try:
-            if self.recorder is not None:
-                self._close_recorder(self.recorder)
+            if self.recorder is not None and is_discarded:
+                self._discard(self.recorder)
+            elif self.recorder is not None:
+                self._close_recorder(self.recorder, signer)
         finally:
             if self._observer is not None:
                 self._observer.close()
             self._ring.close()
 
-    def _close_recorder(self, recorder: Recorder) -> None:
+    def _discard(self, recorder: Recorder) -> None:
+        recorder.abort()
+        if self._path is not None and self._path.is_file():
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+
+    def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:
-            recorder.close()
+            recorder.close(signer)
         except RecordingError as error:
+            if recorder.is_left:
+                raise  # it may still write the file
             if self._path is None or not self._path.exists() or not self._ring.rows.size:
                 raise
             last = self._events[-1]["time_ns"] if self._events else 0

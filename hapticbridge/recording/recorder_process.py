@@ -1,8 +1,9 @@
 """Recorder's process: drains the ring into the file, and outlives the bridge.
 
 ``hapticbridge.recording.recorder`` starts it. Its standard input carries one line of JSON, the
-attachments' bytes, one line per event, and ``{"close": true}``. Its answers on standard output are
-``ready``, ``full``, ``closed`` or ``error``. If the input ends before ``close``, the bridge died.
+attachments' bytes, one line per event, and ``close`` with the key that signs the file, if any. Its
+answers on standard output are ``ready``, ``full``, ``closed`` or ``error``. If the input ends
+before ``close``, the bridge died.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.record import TickFlag
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.ring import Ring
+from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import RecordingWriter
 from hapticbridge.units import format_energy, format_forces
 
@@ -166,7 +168,7 @@ class _Session:
     def __init__(self, configuration: dict[str, Any], attachments: list[Attachment]) -> None:
         self.ring = Ring.attach(configuration["ring"])
         self._parent = configuration["parent"]
-        self._writer = None
+        self._writer, self._path = None, Path(configuration["path"] or "")
         if configuration["path"] is not None:
             self._writer = RecordingWriter(
                 configuration["path"],
@@ -182,6 +184,7 @@ class _Session:
         self._last_time = 0
         self._last_tick = -1
         self._has_reported_full = False
+        self._signer: Signer | None = None
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge closes or dies."""
@@ -202,7 +205,9 @@ class _Session:
             self.ring.unlink()
             self._write_event({"event": "bridge_died", "tick": self._last_tick}, self._last_time)
         if self._writer is not None:
-            self._writer.close()
+            self._writer.close(self._signer)
+            if end == "died" and self._last_tick < 0:  # before its first tick
+                _remove_file(self._path)
         if self._live is not None:
             self._live.close()
 
@@ -234,12 +239,20 @@ class _Session:
             if message is None:
                 return "died"
             if "close" in message:
+                seed = bytes.fromhex(message["seed"])
+                self._signer = Signer(seed) if seed else None
                 return "closed"
             self._write_event(message, message["time_ns"])
 
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:
             self._writer.write_event(event, time_ns)
+
+
+def _remove_file(path: Path) -> None:
+    if path.is_file():
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:

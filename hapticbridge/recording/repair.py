@@ -59,6 +59,9 @@ def rewrite(
 ) -> None:
     """Writes a recording's metadata and attachments again, with these records and events.
 
+    Digest, chain and index are computed anew. A signature is not kept, because it is of another
+    file.
+
     Raises:
         RecordingError: The file cannot be written, or exists and the access is ``exclusive``.
     """
@@ -71,11 +74,20 @@ def rewrite(
         exclusive=exclusive,
         record=recording.record,
     )
+    written = 0
+
+    def write_until(stop: int) -> None:
+        nonlocal written
+        for start in range(written, stop, _BATCH):
+            writer.write_ticks(ticks[start : min(start + _BATCH, stop)])
+        written = max(written, stop)
+
     try:
-        for start in range(0, ticks.size, _BATCH):
-            writer.write_ticks(ticks[start : start + _BATCH])
-        for event in events:
-            writer.write_event(event, _time(event))
+        for event in events:  # each where it happened, so that a later cut does not lose them all
+            time = _time(event)
+            write_until(int(np.searchsorted(ticks["deadline_ns"], time, side="right")))
+            writer.write_event(event, time)
+        write_until(ticks.size)
         writer.close()
     except RecordingError:
         output.unlink(missing_ok=True)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import mmap
 import os
 import secrets
+import stat
 import sys
 import tempfile
 import threading
@@ -66,22 +68,27 @@ def removed(name: str | None) -> None:
             Path(name).unlink()
 
 
-_ORDER = threading.Lock()
+ORDER = threading.Lock()
+"""Lock of ``fence``, free between its calls."""
 
 
 def fence() -> None:
-    """Orders the accesses to shared memory before and after it.
+    """Orders all accesses to shared memory before it and all after it (full barrier).
 
-    Python has no memory fence; acquiring and releasing a lock acts as one.
+    Python has no memory fence. On x86 one atomic operation is a full barrier. On ARMv8 acquiring
+    and releasing a lock is none: accesses from both sides may move into it and pass each other
+    there. A release followed by an acquisition is one (ARM's manual, B2.3: barrier-ordered-before),
+    so the lock is used twice. Not tested on ARM hardware.
     """
-    with _ORDER:
-        pass
+    for _ in range(2):
+        with ORDER:
+            pass
 
 
 def _created(folder: Path, size: int) -> tuple[mmap.mmap, Path]:
     path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}"
     while True:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        file = _opened(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
         try:
             _lock(file)
             # another process's sweep may have removed the file before it was locked
@@ -108,7 +115,7 @@ def attached(name: str) -> mmap.mmap:
         RecordingError: It does not exist or cannot be mapped.
     """
     try:
-        file = os.open(name, os.O_RDWR | getattr(os, "O_CLOEXEC", 0))
+        file = _opened(name, os.O_RDWR)
     except OSError as error:
         raise RecordingError(f"no ring at {name}: {error.strerror}") from error
     try:
@@ -118,6 +125,30 @@ def attached(name: str) -> mmap.mmap:
         raise RecordingError(f"{name} cannot be mapped as a ring: {error}") from error
     finally:
         os.close(file)
+
+
+_GUARDED = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
+"""Flags under which neither a planted link leads elsewhere nor a planted pipe blocks."""
+
+
+def _opened(path: str | Path, flags: int) -> int:
+    """Opens or creates a segment of this user alone, whatever the umask.
+
+    Every user may write into the folder of shared memory, and the names there start alike.
+
+    Raises:
+        OSError: It does not exist, or is a link, a pipe, or a file that another user can write.
+    """
+    file = os.open(path, flags | _GUARDED, 0o600)
+    if sys.platform == "win32":
+        return file
+    found = os.fstat(file)
+    if flags & os.O_CREAT:
+        os.fchmod(file, 0o600)
+    elif not stat.S_ISREG(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        os.close(file)
+        raise OSError(errno.EPERM, "it is not a file that this user alone can write")
+    return file
 
 
 def _lock(file: int) -> None:
@@ -131,8 +162,8 @@ def _sweep(folder: Path) -> None:
     if sys.platform == "win32":
         return
     for path in folder.glob(f"{_PREFIX}*"):
-        with contextlib.suppress(OSError):  # in use, of another user, or gone meanwhile
-            file = os.open(path, os.O_RDONLY)
+        with contextlib.suppress(OSError):  # in use, planted by another user, or gone meanwhile
+            file = _opened(path, os.O_RDONLY)
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 path.unlink()

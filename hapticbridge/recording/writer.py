@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import errno
 import os
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
+from hapticbridge.recording import seal
 from hapticbridge.recording.format import Attachment
 
 # Chunk index on disk
@@ -106,6 +108,7 @@ class Output:
     Attributes:
         is_full: True if no more space could be reserved; at most ``RESERVE`` bytes are then left.
             Always False on a file system without reservation.
+        chain: Hash chain over the records written so far; every call writes whole records.
 
     Raises:
         OSError: It cannot be opened, or another bridge is recording to it.
@@ -129,6 +132,7 @@ class Output:
         self._claims = self._is_regular and sys.platform == "linux"
         self._fallocate = _fallocate() if self._claims else None
         self.is_full = False
+        self.chain = seal.Chain()
 
     def write(self, data: bytes) -> int:
         """Writes all data, then extends the reserve; about three calls per second."""
@@ -137,6 +141,7 @@ class Output:
             written = self._file.write(view)
             view = view[written:]
         self._position += len(data)
+        self.chain.add_records(data)
         if self._claims and data:  # a reservation of zero bytes is an error
             self._claim()
         return len(data)
@@ -191,6 +196,24 @@ def _fallocate() -> Callable[..., int] | None:
     return None
 
 
+class _Rehearsal:
+    """Stream at a position of a file that keeps what would be written there."""
+
+    def __init__(self, position: int) -> None:
+        self._position, self.data = position, b""
+
+    def write(self, data: bytes) -> int:
+        self._position += len(data)
+        self.data += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+
+_DATA_END_SIZE = 13  # record head and checksum
+
+
 class RecordingWriter:
     """Writer of one recording, for the recorder's process and for ``repair``.
 
@@ -224,7 +247,7 @@ class RecordingWriter:
         self._epoch = int(epoch_ns)
         meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
         check_contents(meta, attachments)
-        self._digest = layout.Digest(meta, attachments)
+        self._digest = seal.Digest(meta, attachments)
         self._sequence = 0
         self._is_closed = False
         try:
@@ -316,8 +339,10 @@ class RecordingWriter:
         except OSError as error:
             raise self._failed(error) from error
 
-    def close(self) -> None:
-        """Finishes the file with last chunk, digest and index, and syncs it to the disk.
+    def close(self, signer: seal.Signer | None = None) -> None:
+        """Finishes the file with last chunk, seal and index, and syncs it to the disk.
+
+        ``signer`` signs the file; None leaves it without a signature.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -327,14 +352,30 @@ class RecordingWriter:
         self._is_closed = True
         try:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            digest = {layout.DIGEST_KEY: self._digest.hexdigest()}
-            self._mcap.add_metadata(layout.DIGEST_NAME, digest)
+            self._mcap.add_metadata(layout.DIGEST_NAME, self._seal(signer))
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._output.sync()
         except OSError as error:
             raise self._refusal(error) from error
         finally:
             self._release()
+
+    def _seal(self, signer: seal.Signer | None) -> dict[str, str]:
+        """Returns the seal; the index behind it has a known size, so it is rehearsed."""
+        entries = {
+            seal.DIGEST: self._digest.hexdigest(),
+            seal.CHAIN: self._output.chain.hexdigest(),
+            seal.INDEX: seal.new_hash().hexdigest(),
+        }
+        complete = entries if signer is None else signer.signed(entries)
+        stream = _Rehearsal(self._output.tell())
+        known = {id(self._output): stream, id(self._index): self._index}
+        rehearsed = copy.deepcopy(self._mcap, known)
+        rehearsed.add_metadata(layout.DIGEST_NAME, complete)
+        end = len(stream.data) + _DATA_END_SIZE
+        rehearsed.finish()  # type: ignore[no-untyped-call]
+        entries[seal.INDEX] = seal.new_hash(stream.data[end:]).hexdigest()
+        return entries if signer is None else signer.signed(entries)
 
     def _failed(self, error: OSError) -> RecordingError:
         # nothing may follow a half-written chunk; the file then counts as cut there

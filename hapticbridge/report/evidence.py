@@ -20,10 +20,9 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import printable
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
-from hapticbridge.record import force_on_hand
+from hapticbridge.record import due_times, force_on_hand
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
-from hapticbridge.recording.timeline import due_times
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import method_of, parameters_of, requested_of
 from hapticbridge.summary import was_always_implicit

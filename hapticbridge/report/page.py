@@ -13,8 +13,8 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import atomic_write
 from hapticbridge.plotting import inline_svg
+from hapticbridge.record import due_times
 from hapticbridge.recording import Recording
-from hapticbridge.recording.timeline import due_times
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence, draw_recording
 from hapticbridge.report.facts import (

@@ -15,6 +15,7 @@ from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
+from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
 
@@ -151,10 +152,13 @@ class Scene:
         if is_rigid == bool(own):
             self._set_margins()
             return
+        said = announce_soft_equalities(model)
+        self.changes = tuple(change for change in self.changes if change not in said)
         if not is_rigid:
             self._restore_contact(model)
             self._own_contact = {}
             return
+        self.changes = said + self.changes
         needed = _rigid_options(model.opt)
         own = {name: getattr(model.opt, name) for name in needed}
         own |= {name: getattr(model, name).copy() for name in _MARGINS}

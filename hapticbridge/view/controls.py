@@ -7,7 +7,6 @@ are those of the bridge, so a slider ends where a refusal would begin.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import threading
@@ -28,6 +27,7 @@ from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import RunCoupling
 from hapticbridge.run_description import method_of, parameters_of
+from hapticbridge.view.page import quoted
 
 PACE = 2.0 * INTERVAL
 """Smallest time in s between two commands to the bridge. At the bridge's own limit a delayed
@@ -253,7 +253,7 @@ class Controls:
             self._say("answer", f"marked at tick {event.get('tick')}")
         elif kind == "recording":
             path = event.get("path")
-            self._say("recording", f"recording to {path}" if path else "not recording")
+            self._say("recording", f"recording to {quoted(path)}" if path else "not recording")
         elif kind == "refused":
             self._refuse(str(event.get("reason")))
 
@@ -272,7 +272,7 @@ class Controls:
 
     def _refuse(self, reason: str) -> None:
         """Shows the reason of a refusal, and sets the controls back to the state of the run."""
-        self._say("answer", f"**refused:** {json.dumps(reason, ensure_ascii=False)[1:-1]}")
+        self._say("answer", f"**refused:** {quoted(reason)}")
         self._touched = -math.inf
         self._show_switches()
         if self._sliders:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.check.physics import matrix_of
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import printable
 from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import RunCoupling
@@ -316,6 +318,18 @@ def linear(colour: ArrayLike) -> tuple[int, int, int]:
     return red, green, blue
 
 
+def quoted(text: object) -> str:
+    """Writes a text that is not of this program for a page of viser, which reads Markdown.
+
+    Names and reasons may come from a foreign scene. Between more backticks than it holds, a text
+    is shown as it is: no markup, link, image or HTML in it counts.
+    """
+    line = printable(str(text))
+    longest = max(map(len, re.findall("`+", line)), default=0)
+    fence = "`" * (longest + 1)
+    return f"{fence} {line} {fence}"
+
+
 class Page:
     """Draws instants of one run on viser's page.
 
@@ -342,7 +356,7 @@ class Page:
         self._extent, self._strongest = scenery.extent, 0.0
         self._build_scene(scenery)
         self._ghost = Ghost(server.scene, scenery)
-        server.gui.set_panel_label(f"hapticbridge: {facts.get('scene', '')}")
+        server.gui.set_panel_label(printable(f"hapticbridge: {facts.get('scene', '')}"))
         self.status = server.gui.add_markdown("waiting for the first tick")
         self._caption = _caption(scenery, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []

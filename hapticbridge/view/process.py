@@ -29,7 +29,7 @@ from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
-from hapticbridge.view.page import Page, Sight, Trace
+from hapticbridge.view.page import Page, Sight, Trace, quoted
 from hapticbridge.view.server import serve
 from hapticbridge.view.window import Address
 
@@ -118,9 +118,6 @@ def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
         meta=metadata,
         attachments=files,
         is_cut=True,
-        digest=None,
-        computed_digest="",
-        problems=(),
     )
 
 
@@ -161,7 +158,7 @@ def _follow(
     plotted, due, over = 0.0, time.monotonic(), ""
     while True:
         while not inbox.empty():
-            event = inbox.get()
+            event = inbox.get_nowait()
             if event is None:
                 return over
             over = over or _ending(event)
@@ -207,6 +204,6 @@ def run() -> None:
     threading.Thread(target=_listen, args=(stream, inbox), daemon=True).start()
     threading.Thread(target=outlet.run, daemon=True).start()
     reason = _follow(live, page, controls, inbox) or "the bridge is gone"
-    page.status.content = f"**The run is over** ({reason}). This is how it was at the end."
+    page.status.content = f"**The run is over** ({quoted(reason)}). This is how it was at the end."
     time.sleep(FAREWELL)
     os._exit(0)  # viser's threads would delay an ordinary exit

@@ -7,11 +7,13 @@ import contextlib
 import http.client
 import io
 import logging
+import secrets
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
 import viser
+import viser._gui_handles
 import viser._messages
 import websockets.asyncio.server
 from websockets.datastructures import Headers
@@ -40,14 +42,19 @@ def serve(address: Address) -> viser.ViserServer:
     if address.port and server.get_port() != address.port:
         stop(server)
         raise HapticBridgeError(f"port {address.port} is in use; choose another with --port")
-    if not _is_guarded(server.get_port()):
+    if not _is_guarded(server.get_port(), address):
         stop(server)
-        raise HapticBridgeError("this version of viser skips the check of the token")
+        raise HapticBridgeError(
+            f"viser {viser.__version__} skips the check of the token or has unknown scripts: "
+            "pip install 'hapticbridge[view]' has one that does not"
+        )
     # viser would forward the page to its server on the internet at a browser's request, and keep
     # files that a browser sends
     for name in ("ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload"):
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     _take_values_alone(server)
+    # viser would read any file of this user that an image in a text names
+    viser._gui_handles._parse_markdown = lambda text, _: text
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     return server
@@ -76,16 +83,21 @@ def _take_values_alone(server: viser.ViserServer) -> None:
     server._websock_server.register_handler(kind, take_value)
 
 
-def _is_guarded(port: int) -> bool:
-    """Checks that a request with a foreign Host is refused; viser has no hook for the check."""
-    knock = http.client.HTTPConnection(HOST, port, timeout=10.0)
-    try:
-        knock.request("GET", "/", headers={"Host": "stranger.invalid"})
-        return knock.getresponse().status == http.HTTPStatus.FORBIDDEN
-    except OSError:
-        return False
-    finally:
-        knock.close()
+def _is_guarded(port: int, address: Address) -> bool:
+    """Checks that a stranger is refused and a visitor gets the page; viser has no hook for both."""
+    cookie = address.cookie(f"{HOST}:{port}").partition(";")[0]
+    foreign = {"Host": "stranger.invalid", "Cookie": cookie}
+    for headers, status in (({}, 403), (foreign, 403), ({"Cookie": cookie}, 200)):
+        knock = http.client.HTTPConnection(HOST, port, timeout=10.0)
+        try:
+            knock.request("GET", "/", headers=headers)
+            if knock.getresponse().status != status:
+                return False
+        except OSError:
+            return False
+        finally:
+            knock.close()
+    return True
 
 
 @contextlib.contextmanager
@@ -118,21 +130,72 @@ def _door(address: Address, inner: Process | None) -> Process:
         first = {name: values[0] for name, values in headers.items()}
         reason = "a header is repeated" if repeated else address.refusal(request.path, first)
         if reason:
-            return _refused(reason)
+            return _plain(403, "Forbidden", f"hapticbridge: {reason}\n")
+        host = first["host"]
+        if address.is_in_query(request.path):
+            # neither the history nor the address line keeps the token
+            onward = _plain(303, "See Other", "")
+            onward.headers["Location"] = "/"
+            onward.headers["Set-Cookie"] = address.cookie(host)
+            return onward
+        request.headers.pop("Accept-Encoding", None)  # the page is changed below
         answer: Any = None if inner is None else inner(connection, request)
         if asyncio.iscoroutine(answer):
             answer = await answer
-        if isinstance(answer, Response) and address.is_in_query(request.path):
-            answer.headers["Set-Cookie"] = address.cookie(first["host"])
-        return answer if isinstance(answer, Response) else None
+        if not isinstance(answer, Response):
+            return None
+        is_page = answer.headers.get("Content-Type", "").startswith("text/html")
+        return _protected(answer, host) if is_page else _private(answer, "default-src 'none'")
 
     return ask
 
 
-def _refused(reason: str) -> Response:
-    body = f"hapticbridge: {reason}\n".encode()
-    headers = Headers(
-        {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+_POLICY = (
+    "default-src 'none'; script-src 'nonce-{nonce}' 'wasm-unsafe-eval'; worker-src blob:; "
+    "connect-src 'self' ws://{host} data: blob:; img-src data: blob:; font-src data:; "
+    "style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Content security policy of the page: viser's own scripts by a number used once, and no address
+but its own. Viser would otherwise connect to any server that a link names (``?websocket=``). Its
+sorter of Gaussian splats, which the view does not draw, may not evaluate text and stays away."""
+
+_SCRIPTS = (
+    ("<script ", '<script nonce="{nonce}" '),
+    ('e.type="module";', 'e.type="module";e.nonce="{nonce}";'),
+)
+"""Places in viser's page that make a script, and what stands there instead."""
+
+
+def _protected(response: Response, host: str) -> Response:
+    """Lets a page run viser's scripts alone, and connect to its own host alone."""
+    nonce, page = secrets.token_urlsafe(18), response.body.decode()
+    for place, named in _SCRIPTS:
+        if page.count(place) != 1:
+            return _plain(500, "Unknown Page", "hapticbridge: this viser has unknown scripts\n")
+        page = page.replace(place, named.format(nonce=nonce))
+    response.body = page.encode()
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
+    return _private(response, _POLICY.format(nonce=nonce, host=host))
+
+
+def _plain(status: int, phrase: str, text: str) -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Connection": "close"})
+    headers["Content-Length"] = str(len(body))
+    return _private(Response(status, phrase, headers, body), "default-src 'none'")
+
+
+def _private(response: Response, policy: str) -> Response:
+    """Adds the headers against framing, leaking the address, guessing types and keeping copies."""
+    response.headers.update(
+        {
+            "Content-Security-Policy": policy,
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cache-Control": "no-store",
+        }
     )
-    headers["Connection"] = "close"
-    return Response(403, "Forbidden", headers, body)
+    return response

@@ -6,6 +6,7 @@ import contextlib
 import hmac
 import importlib.util
 import json
+import re
 import secrets
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import IO, cast
 from urllib.parse import parse_qs, urlsplit
 
@@ -25,6 +26,7 @@ from hapticbridge.commands.command import LONGEST_LINE
 from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
+from hapticbridge.signals import deferring_stops
 
 HOST = "127.0.0.1"
 """Host name on which pages are served. Other machines reach it through an SSH tunnel alone."""
@@ -32,7 +34,11 @@ HOST = "127.0.0.1"
 PATIENCE = 2.0
 """Longest wait in s for the process to end. The run is over by then, and the force is zero."""
 
-_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+START_PATIENCE = 60.0
+"""Longest wait in s for the page to be served. The process imports for some seconds, and longer on
+a busy machine; a shorter wait would refuse a page there."""
+
+_LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?")
 
 _BOOTSTRAP = """
 import sys
@@ -46,9 +52,10 @@ run()
 class Address:
     """The port of a page on this machine, and the token that admits a visitor.
 
-    Other users of the machine reach the port, too; without the token they are refused. A browser
-    also sends requests that a foreign page made it send. Those carry that page's Origin or, where
-    a name was bound anew to this machine, a foreign Host; both are refused. From another machine,
+    Other users of the machine reach the port, too; without the token they are refused. The address
+    carries it once: the browser is sent on without it, and keeps a cookie. A browser also sends
+    requests that a foreign page made it send. Those carry that page's Origin or, where a name was
+    bound anew to this machine, a foreign Host; both are refused. From another machine,
     ``ssh -L 8080:localhost:8080 MACHINE`` leads to the page.
 
     Attributes:
@@ -78,16 +85,13 @@ class Address:
         """
         lower = {name.lower(): value for name, value in headers.items()}
         host = lower.get("host", "")
-        try:
-            name = urlsplit(f"http://{host}").hostname
-        except ValueError:
-            name = None
-        if name not in _LOOPBACK:
+        if not _LOOPBACK.fullmatch(host):
             return "this is not the host of this page"
         origin = lower.get("origin")
         if origin is not None and origin != f"http://{host}":
             return "a request made by another page is refused"
-        if not (self.is_in_query(path) or self._is_in_cookie(host, lower.get("cookie", ""))):
+        is_shown = self.is_in_query(path) and "upgrade" not in lower  # a socket has the cookie
+        if not (is_shown or self._is_in_cookie(host, lower.get("cookie", ""))):
             return "the token is missing or wrong; open the address that hapticbridge printed"
         return ""
 
@@ -154,6 +158,7 @@ class Window:
         check_view()
         self.address = address
         self._outbox: SimpleQueue[bytes | None] = SimpleQueue()
+        self._answers: SimpleQueue[dict[str, object]] = SimpleQueue()
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
         self.on_command: Callable[[Command], None] | None = None
@@ -165,10 +170,10 @@ class Window:
         metadata: Mapping[str, str],
         attachments: Sequence[Attachment],
     ) -> None:
-        """Starts the process and waits until it serves the page.
+        """Starts the process and waits until it serves the page, at most ``START_PATIENCE``.
 
         Raises:
-            HapticBridgeError: The page cannot be served.
+            HapticBridgeError: The page cannot be served, or the time is over.
         """
         files = {item.name: item.data for item in attachments}
         job = {
@@ -180,38 +185,47 @@ class Window:
             "token": self.address.token,
         }
         package = str(Path(__file__).resolve().parents[2])
-        self._process = subprocess.Popen(
-            # -P: a file in the user's working folder must not replace a module
-            [sys.executable, "-P", "-c", _BOOTSTRAP, package],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C reaches the bridge alone
-        )
+        with deferring_stops():  # an interrupted caller would not have the process to end it
+            self._process = subprocess.Popen(
+                # -P: a file in the user's working folder must not replace a module
+                [sys.executable, "-P", "-c", _BOOTSTRAP, package],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C reaches the bridge alone
+            )
         for piece in (json.dumps(job).encode() + b"\n", *files.values()):
             self._outbox.put(piece)
         threading.Thread(target=self._send, daemon=True).start()
-        answer = json.loads(cast(IO[bytes], self._process.stdout).readline() or b"{}")
+        threading.Thread(target=self._listen, daemon=True).start()
+        try:
+            answer = self._answers.get(timeout=START_PATIENCE)
+        except Empty:
+            answer = {"error": f"its process served nothing within {START_PATIENCE:g} s"}
         if "url" not in answer:
             self.close()
             reason = answer.get("error", "its process ended before it served anything")
             raise HapticBridgeError(f"the view cannot be shown: {reason}")
         self.url = str(answer["url"])
-        threading.Thread(target=self._listen, daemon=True).start()
 
     def event(self, event: Mapping[str, object]) -> None:
         """Sends an event to the process; never waits and never raises."""
         self._outbox.put(json.dumps(event).encode() + b"\n")
 
     def close(self) -> None:
-        """Ends the process."""
+        """Ends the process; one that shows nothing yet at once."""
         self._outbox.put(None)
-        if self._process is not None:
-            try:
+        if self._process is None:
+            return
+        if not self.url:
+            self._process.kill()
+        try:
+            self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:  # it hangs, or was stopped
+            self._process.kill()
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(PATIENCE)
-            except subprocess.TimeoutExpired:  # it hangs, or was stopped
-                self._process.kill()
-                self._process.wait()
+        if self._process.returncode is not None:  # else a thread is inside its stream
             for stream in (self._process.stdin, self._process.stdout):
                 with contextlib.suppress(OSError):
                     cast(IO[bytes], stream).close()
@@ -225,6 +239,7 @@ class Window:
         process = self._process
         stream = cast(IO[bytes], process and process.stdout)
         with contextlib.suppress(OSError, ValueError):
+            self._answers.put(json.loads(stream.readline() or b"{}"))
             while line := stream.readline(LONGEST_LINE + 1):
                 if not line.endswith(b"\n"):
                     return  # longer than any command, so not from the process that was started

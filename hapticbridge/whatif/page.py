@@ -12,7 +12,7 @@ import numpy as np
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
-from hapticbridge.recording.timeline import due_times
+from hapticbridge.record import due_times
 from hapticbridge.report import DRAWABLE, decimated
 from hapticbridge.report.evidence import BINS, Evidence, finish, is_motion_prescribed
 from hapticbridge.report.page import moment_of, write_page

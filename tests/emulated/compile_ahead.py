@@ -44,8 +44,10 @@ def snapshot_of_compiled_code(folder: Path) -> Path:
     Args:
         folder: Made; what a guest takes for its folder of compiled functions.
     """
-    source = Path(cache_folder())
+    source = cache_folder()
+    assert source is not None, "this machine keeps no compiled functions"
     folder.mkdir(parents=True)
+    (folder / source.name).mkdir(mode=0o700)  # else the guest would not trust it
     for path in source.rglob("*.nb[ci]"):
         place = folder / source.name / path.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)

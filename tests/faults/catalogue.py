@@ -53,7 +53,8 @@ class Fault:
         do: Does it to a rig.
         ends: What must come of it: ``trip``, ``fades`` (the force is taken away and comes back),
             ``slips`` (the handle slips for what late samples gave), ``stops`` (the run ends with
-            zero force), ``lowers`` (the watch lowers the force or takes it away) or ``goes on``.
+            zero force), ``lowers`` (the watch lowers the force or takes it away), ``leaves`` (the
+            bridge ends and leaves the recorder to finish) or ``goes on``.
         says: What the audit of its recording must name; empty where the run is an ordinary one.
         without: What of the guard is switched off on the other side.
         cause: The tick at which it can be seen.
@@ -265,6 +266,75 @@ def _quantised(rig: Rig) -> None:
     rig.parameters = {"resolution": 5e-5}
 
 
+def _gone(pid: int) -> None:
+    """Waits until a process of this one has ended."""
+    limit = time.monotonic() + 60.0
+    while os.waitpid(pid, os.WNOHANG) == (0, 0):
+        assert time.monotonic() < limit, "the recorder did not end"
+        time.sleep(1e-3)
+
+
+def _stopped_recorder(rig: Rig) -> None:
+    """The recorder is stopped and told to go on only when the bridge has ended."""
+    recorders: list[int] = []
+
+    def stop(bridge: Bridge) -> None:
+        recorder = bridge.session.stream.recorder
+        assert recorder is not None
+        recorders.append(recorder.pid)
+        os.kill(recorder.pid, signal.SIGSTOP)
+
+    def wake() -> None:
+        os.kill(recorders[0], signal.SIGCONT)
+        _gone(recorders[0])
+
+    acting(stop)(rig)
+    rig.after = wake
+
+
+STALLING = """
+import sys, types, time
+from pathlib import Path
+package = types.ModuleType("hapticbridge")
+package.__path__ = [sys.argv[1]]
+sys.modules["hapticbridge"] = package
+from hapticbridge.recording.recorder_process import run
+from hapticbridge.recording.writer import RecordingWriter
+write = RecordingWriter.write_ticks
+
+def stalled(writer, rows):
+    while rows["tick"][-1] > 1500 and not Path("GO").exists():
+        time.sleep(1e-3)
+    write(writer, rows)
+
+RecordingWriter.write_ticks = stalled
+run()
+"""
+"""A recorder whose writes do not return until the file GO exists."""
+
+
+def _stalled_disk(rig: Rig) -> None:
+    """From the cause on the recorder's writes do not return until the bridge has ended."""
+    go = rig.folder / "go"
+    recorders: list[int] = []
+
+    def around(stack: ExitStack) -> None:
+        bootstrap = STALLING.replace("GO", str(go))
+        stack.enter_context(patch("hapticbridge.recording.recorder._BOOTSTRAP", bootstrap))
+
+    def wake() -> None:
+        go.touch()
+        _gone(recorders[0])
+
+    def note(bridge: Bridge) -> None:
+        recorder = bridge.session.stream.recorder
+        assert recorder is not None
+        recorders.append(recorder.pid)
+
+    acting(note)(rig)
+    rig.around, rig.after = around, wake
+
+
 def _wall_clock(rig: Rig) -> None:
     """Somebody sets the time of day; the loop must not look at it."""
 
@@ -363,7 +433,7 @@ def _suspended(rig: Rig) -> None:
     rig.around, rig.device.corrupt = around, corrupt
 
 
-_SPECTATOR = """
+SPECTATOR = """
 import json, sys, time
 sys.path.insert(0, sys.argv[1])
 from hapticbridge.recording import Ring
@@ -384,7 +454,7 @@ def _watched(how: int) -> Callable[[Rig], None]:
     def do(rig: Rig) -> None:
         def around(stack: ExitStack) -> None:
             stack.enter_context(patch("hapticbridge.view.window.check_view"))
-            stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", _SPECTATOR))
+            stack.enter_context(patch("hapticbridge.view.window._BOOTSTRAP", SPECTATOR))
             rig.options["observer"] = window = Window(Address(0))
 
             def act(bridge: Bridge, tick: int) -> None:
@@ -619,6 +689,8 @@ FAULTS = (
     Fault("recording may not grow", _fill_disk, "stops", "recorder died", within=600),
     *([DISK_FULL] if can_mount() else []),
     RING_FULL,
+    Fault("recorder stopped", _stopped_recorder, "leaves"),
+    Fault("disk stalled", _stalled_disk, "leaves"),
     Fault("viewer killed", _watched(signal.SIGKILL), "goes on"),
     Fault("viewer hangs", _watched(signal.SIGSTOP), "goes on"),
     Fault("machine suspended for 5 s", _suspended, "stops", "suspend of the machine"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -100,6 +101,7 @@ class FaultyDevice:
         self.true = np.zeros(1, SAMPLE_DTYPE)
         self._held = np.zeros(6)
         self.is_closed = False
+        self.closed_at = 0.0
 
     def start(self, period: float) -> NDArray[np.void]:
         self.true = self.inner.start(period)
@@ -138,6 +140,7 @@ class FaultyDevice:
         self.inner.write(wrench)
 
     def close(self) -> None:
+        self.closed_at = self.closed_at or time.monotonic()
         self.is_closed = True
 
 
@@ -155,6 +158,7 @@ class Rig:
         duration: In s.
         guard: Changes to what the guard does, for the other side of a test.
         on_tick: Called before each tick with the bridge.
+        after: Called once the bridge is left, before its recording is judged.
     """
 
     folder: Path
@@ -168,6 +172,7 @@ class Rig:
     guard: dict[str, Any] = field(default_factory=dict)
     on_tick: Callable[[Bridge, int], None] | None = None
     around: Callable[[ExitStack], None] | None = None
+    after: Callable[[], None] | None = None
     clock: FaultClock = field(default_factory=FaultClock)
     recording: Path | None = None
     _device: FaultyDevice | None = None
@@ -208,7 +213,10 @@ class Rig:
                         ticks_done = bridge.session.tick
             except (HapticBridgeError, ZeroDivisionError) as raised:
                 error = f"{type(raised).__name__}: {raised}"
-            return Outcome.of(self, path, cause, error, ticks_done)
+            waited = time.monotonic() - self.device.closed_at
+            if self.after is not None:
+                self.after()
+            return Outcome.of(self, path, cause, error, ticks_done, waited)
 
 
 @dataclass
@@ -229,6 +237,7 @@ class Outcome:
         events: Names of the recording's events.
         dropped: Records that were lost, as the event ``stop`` says.
         flags: Of each record.
+        waited: Time in s from the device's closing to the bridge's end.
     """
 
     largest_force: float
@@ -246,9 +255,10 @@ class Outcome:
     flags: NDArray[np.int64]
     forces: NDArray[np.float64]
     torques: NDArray[np.float64]
+    waited: float
 
     @classmethod
-    def of(cls, rig: Rig, path: Path, cause: int, error: str, ticks: int) -> Outcome:
+    def of(cls, rig: Rig, path: Path, cause: int, error: str, ticks: int, waited: float) -> Outcome:
         device = rig.device
         ticks_of = np.array([tick for tick, _ in device.writes])
         wrenches = np.array([wrench for _, wrench in device.writes])
@@ -275,6 +285,7 @@ class Outcome:
             flags=flags,
             forces=forces,
             torques=np.linalg.norm(wrenches[:, 3:], axis=1),
+            waited=waited,
         )
 
     def has_flag(self, flag: TickFlag) -> bool:

@@ -16,6 +16,7 @@ from bridge_runs import fast, sway
 from numpy.typing import NDArray
 
 from faults.catalogue import FAULTS, PUSHED, PUSHER, RING_FULL, UNSEEN, Fault, passing
+from faults.processes import HANGS, STOPS, Hang, hang, stop_at_start
 from faults.rig import CAUSE, PERIOD, PRESS, Rig
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -63,10 +64,32 @@ def test_a_fault_hurts_nobody_and_its_recording_is_whole(fault: Fault, tmp_path:
         assert not outcome.error
         assert outcome.found_after is not None
         assert outcome.found_after <= fault.within
+    elif fault.ends == "leaves":
+        assert outcome.error.startswith("RecordingError: the recorder (process ")
+        assert "stood still for 2 s and is left to finish" in outcome.error
     elif fault.ends in ("fades", "slips", "goes on"):
         assert not outcome.error
         has_slipped = (outcome.flags[CAUSE:] & int(TickFlag.REANCHORED)).any()
         assert has_slipped == (fault.ends != "goes on")
+
+
+@pytest.mark.parametrize("fault", HANGS, ids=lambda fault: fault.name.replace(" ", "_"))
+def test_the_force_of_a_hung_bridge_is_ended_by_its_guardian(fault: Hang, tmp_path: Path) -> None:
+    outcome = hang(fault, tmp_path)
+    assert outcome.zero_after > 0.09  # not while the loop is only late
+    assert not outcome.has_force_after
+    if fault.wakes:
+        assert "tick 1200: the loop sent nothing for 100 ms while force was on" in outcome.says
+
+
+@pytest.mark.parametrize(("name", "seconds"), [("SIGINT", 0.6), ("SIGTERM", 1.2), ("SIGHUP", 0.0)])
+def test_a_stop_during_start_up_leaves_nothing(name: str, seconds: float, tmp_path: Path) -> None:
+    outcome = stop_at_start(name, seconds, tmp_path)
+    if outcome.status in {0, 1}:  # on a fast machine the run had begun
+        assert outcome.has_file
+    else:
+        assert (outcome.status, outcome.says, outcome.has_file) == (*STOPS[name], False)
+    assert not outcome.orphans
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.without], ids=ids)

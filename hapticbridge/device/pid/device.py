@@ -454,8 +454,8 @@ class PidDevice:
 
     Attributes:
         info: Its data sheet.
-        last_word: Ends the force if this process dies. None if no second process can open the node;
-            then only the effects' duration (``Effects.life``) ends it.
+        last_word: Ends the force if this process dies or hangs. None if no second process can open
+            the node; then only the effects' duration (``Effects.life``) ends it.
         workspace: Travel along x, y and z in m, as stated or assumed (it has no z).
 
     Raises:
@@ -507,6 +507,8 @@ class PidDevice:
         ):
             raise DeviceError(f"{self._name} does not report its position; move it and start again")
         self._has_started = True
+        if self.last_word is not None:
+            self.last_word.expect(period)
         self._fill()
         return self._sample.copy()
 
@@ -526,11 +528,18 @@ class PidDevice:
         return 0 if is_new or not self._streams else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a finite force along x and y, each clipped to full scale."""
+        """Commands a finite force along x and y, each clipped to full scale.
+
+        Raises:
+            DeviceError: It is not finite, or the loop hung and the guardian ended the force.
+        """
         shares = self._shares * wrench[:2]
         if not np.isfinite(shares).all():
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")
-        self._effects.push(shares.tolist())
+        counted = shares.tolist()
+        if self.last_word is not None:
+            self.last_word.beat(has_force=any(counted))
+        self._effects.push(counted)
 
     def close(self) -> None:
         """Stops the effects, switches the motors off and releases the device."""
@@ -588,6 +597,7 @@ DRIVER = Driver(
     axes="2",
     force="percent of a maximum in N, which newtons= sets",
     rate="125 Hz to 1 kHz, one axis at a time",
+    has_guardian=True,
     on_stall="its effects end by themselves after 0.1 s, on a slow bus after up to 0.4 s",
     options={
         "serial": str,

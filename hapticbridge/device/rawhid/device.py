@@ -199,7 +199,8 @@ class RawHidDevice:
 
     Attributes:
         info: Its data sheet.
-        last_word: Commands zero force if this process dies; None if no second process can.
+        last_word: Commands zero force if this process dies or hangs; None if no second process
+            can.
         states: Newest state, and numbers of lost and damaged frames.
 
     Raises:
@@ -252,6 +253,8 @@ class RawHidDevice:
         self._refuse_fault(states.newest)
         self._fill(states.newest)
         self._watch = SilenceDetector(self._now(), period)
+        if self.last_word is not None:
+            self.last_word.expect(period)
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
@@ -282,10 +285,16 @@ class RawHidDevice:
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a finite wrench on the axes that the device has."""
+        """Commands a finite wrench on the axes that the device has.
+
+        Raises:
+            DeviceError: It is not finite, or the loop hung and the guardian ended the force.
+        """
         values = (wrench * self._mask).tolist()
         if not all(abs(value) < LARGEST for value in values):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
+        if self.last_word is not None:
+            self.last_word.beat(has_force=any(values))
         self._send(force_frame(self._next(), values, self._watchdog_ms))
 
     def close(self) -> None:
@@ -380,6 +389,7 @@ DRIVER = Driver(
     open=open_rawhid,
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
     "to the protocol",
+    has_guardian=True,
     usage=(0xFFAB, 0x0200),
 )
 """Driver of home-made devices with Teensy's raw HID interface. Its second interface (usage page

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import shown
 from hapticbridge.device.base import (
     AXES,
     USUAL_FORCE_LIMIT,
@@ -88,6 +89,8 @@ def _machine_code() -> Callable[[NDArray[np.void], NDArray[np.float64], NDArray[
 def _check_hands(
     hand: Hand | WorstHand | None, rotational_hand: WorstHand | None, friction: float
 ) -> None:
+    if hand is not None and not isinstance(hand, Hand | WorstHand):
+        raise DeviceError(f"hand = {shown(hand)}: must be a Hand, a WorstHand or None")
     is_line = isinstance(hand, WorstHand)
     if rotational_hand is not None and not is_line:
         raise DeviceError("a rotational worst hand requires a worst hand in translation too")
@@ -101,6 +104,8 @@ def _target(
     """Returns the table of the hand's path and its duration in s; an empty one without a path."""
     if not isinstance(hand, Hand) or path is None:
         return np.empty((0, 8)), None
+    if not isinstance(path, str | os.PathLike | Motion):
+        raise DeviceError(f"path = {shown(path)}: must be a file or a Motion")
     motion = path if isinstance(path, Motion) else read_motion(path)
     return np.array(motion.relative().table, order="C"), motion.duration
 
@@ -175,7 +180,12 @@ class SimulatedDevice:
         if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
             raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
         if dof not in (3, 6):
-            raise DeviceError(f"dof = {dof!r}: must be 3 or 6 degrees of freedom")
+            raise DeviceError(f"dof = {shown(dof)}: must be 3 or 6 degrees of freedom")
+        mass = checked_number("mass", mass, "kg", is_positive=True)
+        inertia = "kg m²"
+        rotational_inertia = checked_number(
+            "rotational_inertia", rotational_inertia, inertia, is_positive=True
+        )
         _check_hands(hand, rotational_hand, friction)
         self._motion, duration = _target(hand, path)
         self.info = DeviceInfo(
