@@ -63,14 +63,12 @@ REASONS = {
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
-    "film.py: for line in lines": "a timer kills the process that draws",
     "film.py: with process": "a timer kills the process that draws",
     "film_process.py: sys.stdin.readline()": "the caller's end closes it",
     "confinement.py: os.waitpid(self._child, 0)": "it was killed",
     "confinement.py: select.poll()": "makes the object, which waits with a limit",
     "confinement.py: os.waitpid(self._child, os.WNOHANG)": "it does not wait",
     "confinement.py: os.read(self._reading, min(size - len(pieces), 1 << 20))": "poll has data",
-    "confinement.py: child.result(hear)": "it has a time limit of its own",
     "audit/replay.py: child.result()": "it has a time limit of its own",
     # studies
     "sweep/sweep.py: wait(running, return_when=FIRST_COMPLETED)": USERS,
