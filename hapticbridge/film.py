@@ -13,12 +13,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, cast
 
 from hapticbridge.arguments import Arguments
+from hapticbridge.confinement import SHARE, ForeignSceneError, death
 from hapticbridge.errors import HapticBridgeError, RecordingError
 
 RENDERERS = ("egl", "osmesa")
@@ -107,6 +108,8 @@ def draw(
     out: str | Path,
     shot: Shot | None = None,
     progress: Progress | None = None,
+    *,
+    in_process: bool = False,
 ) -> str:
     """Draws a recording into a file.
 
@@ -119,6 +122,7 @@ def draw(
             replaced.
         shot: Time, camera and size; the last tick at 800 × 600 by default.
         progress: Called with the finished and all frames.
+        in_process: True sets no limits on memory, time and files, for recordings of a known origin.
 
     Returns:
         The renderer that drew it.
@@ -127,10 +131,12 @@ def draw(
         HapticBridgeError: No renderer works here, the file's ending is unknown, or a film is
             requested without the extra 'view'.
         RecordingError: The recording cannot be drawn, or the file not written.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     shot, target = shot or Shot(), Path(out)
     _check_target(target, shot)
     job = {"recording": str(recording), "name": str(target), **asdict(shot)}
+    job["in_process"] = in_process
     try:
         with tempfile.TemporaryDirectory(
             prefix=".drawing-", dir=target.absolute().parent, ignore_cleanup_errors=True
@@ -154,7 +160,7 @@ def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
     raise HapticBridgeError(_NONE_WORKS)
 
 
-def still(recording: str | Path, shot: Shot) -> bytes:
+def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
     """Returns a picture of a recording as PNG.
 
     Raises:
@@ -162,7 +168,7 @@ def still(recording: str | Path, shot: Shot) -> bytes:
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "still.png"
-        draw(recording, file, shot)
+        draw(recording, file, shot, in_process=in_process)
         return file.read_bytes()
 
 
@@ -202,35 +208,64 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
         env=environment,
         text=True,
     )
-    watch = threading.Timer(PATIENCE, process.kill)
-    watch.start()
+    watch = _Watch(process)
+    what = f"the scene of '{job['recording']}'"
+    is_ready = False
     try:
         with process:
+            watch.allow(PATIENCE)
             print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
-            return _follow(cast(IO[str], process.stdout), watch, progress)
+            for answer in _answers(cast(IO[str], process.stdout)):
+                if "ready" in answer:
+                    is_ready = True
+                elif "seconds" in answer:
+                    watch.allow(PATIENCE + SHARE * answer["seconds"])
+                elif "frame" in answer and progress is not None:
+                    progress(answer["frame"], answer["frames"])
+                elif "error" in answer:
+                    raise RecordingError(answer["error"])
+                elif "failure" in answer:
+                    raise ForeignSceneError(f"{what} {answer['failure']}")
+                elif "done" in answer:
+                    return True
     except BrokenPipeError:
         return False  # the process ended before it read the job
+    else:
+        if is_ready:
+            end = "takes too long to draw" if watch.is_over else death(process.returncode)
+            raise ForeignSceneError(f"{what} {end}")
+        return False
     finally:
         watch.cancel()
         process.kill()
         process.wait(PATIENCE)  # Ctrl-C can leave Popen without waiting for the process
 
 
-def _follow(answers: IO[str], watch: threading.Timer, progress: Progress | None) -> bool:
-    is_ready = False
-    for line in answers:
-        if not line.startswith("{"):  # drivers print, too
-            continue
-        answer = json.loads(line)
-        if "ready" in answer:
-            is_ready = True
-            watch.cancel()
-        elif "frame" in answer and progress is not None:
-            progress(answer["frame"], answer["frames"])
-        elif "error" in answer:
-            raise RecordingError(answer["error"])
-        elif "done" in answer:
-            return True
-    if is_ready:
-        raise RecordingError("the process that draws died while it was drawing")
-    return False
+class _Watch:
+    """Time after which a process is killed."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process, self.is_over = process, False
+        self._timer: threading.Timer | None = None
+
+    def allow(self, seconds: float) -> None:
+        self.cancel()
+        self._timer = threading.Timer(min(seconds, threading.TIMEOUT_MAX), self._end)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def cancel(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _end(self) -> None:
+        self.is_over = True
+        self._process.kill()
+
+
+def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:
+    for line in lines:
+        if line.startswith("{"):  # drivers print, too
+            answer = json.loads(line)
+            if isinstance(answer, dict):
+                yield answer

@@ -1,14 +1,18 @@
 """Process that draws a recorded run: the run simulated again, a camera, frames of a film.
 
 ``hapticbridge.film`` starts it, writes one job in a line of JSON and reads one answer per line:
-``frame`` while a film is drawn, ``done``, or ``error`` with a sentence.
+``seconds`` that the work may take, ``frame`` while a film is drawn, ``done``, ``error`` with a
+sentence, or ``failure`` with what the scene did. Unless the recording is trusted, the process has
+the limits of ``confinement`` before MuJoCo sees the scene.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from hapticbridge.audit.replay import Resimulator, obstacle
+from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
+from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.snapshot import MAX_CONTACTS
 from hapticbridge.run_description import parameters_of
@@ -111,7 +117,8 @@ class Stage:
     """Recorded run that is simulated again tick by tick, forwards.
 
     Args:
-        path: The recording.
+        path: The recording, or the file that was opened.
+        on_compiled: Called after the scene was compiled, before it is simulated.
 
     Attributes:
         recording: The recording without its ticks.
@@ -129,15 +136,20 @@ class Stage:
         RecordingError: The file is no recording, or cannot be simulated again here.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.recording: RecordingFile = open_recording(path)
+    def __init__(
+        self, path: str | Path | RecordingFile, on_compiled: Callable[[], object] | None = None
+    ) -> None:
+        opened = path if isinstance(path, RecordingFile) else open_recording(path)
+        self.recording: RecordingFile = opened
         reason = obstacle(self.recording)
         if not self.recording.count:
             reason = "it holds no tick"
         if reason:
-            raise RecordingError(f"'{path}' cannot be drawn: {reason}")
+            raise RecordingError(f"'{opened.path}' cannot be drawn: {reason}")
         self.parameters: RunParameters = parameters_of(self.recording.meta)
         self._run = Resimulator(self.recording, self.parameters)
+        if on_compiled is not None:
+            on_compiled()
         self.model = self._run.model
         self.data = mujoco.MjData(self.model)
         self._rest = self.recording.blocks()
@@ -382,8 +394,45 @@ def _answer(**answer: object) -> None:
     print(json.dumps(answer), flush=True)
 
 
+GRAPHICS = (
+    *("/sys", "/etc/glvnd", "/etc/egl", "/etc/OpenCL", "/etc/drirc", "/etc/fonts", "/etc/passwd"),
+    *("/dev/dri", "/dev/nvidiactl", "/dev/nvidia0", "/dev/nvidia-uvm", "/dev/nvidia-modeset"),
+)
+"""Files and folders that drivers of graphics read besides programs."""
+
+FRAME_TIME, PIXEL_TIME = 2.0, 1e-5
+"""Processor time in s that a frame may take, and beyond it per pixel. Without a graphics card a
+frame of 800 x 600 takes 0.3 s; a scene of millions of triangles takes all."""
+
+
+def _confine(job: dict[str, Any], recording: RecordingFile) -> float:
+    """Confines this process for one job; returns the processor time in s that it may need."""
+    parameters = parameters_of(recording.meta)
+    bounds = bounds_for(recording, parameters)
+    pixels = job["width"] * job["height"]
+    is_film = job["out"].endswith(".mp4")
+    frames = 1.0
+    if is_film:
+        length = Timeline(recording.blocks(), parameters.period).duration
+        span = (length if job["stop"] is None else job["stop"]) - job["start"]
+        frames = max(1.0, min(span, length) * job["fps"] / job["speed"])
+    out = tempfile.tempdir = str(Path(job["out"]).parent)
+    devices = [path for path in GRAPHICS if path.startswith("/dev")]
+    confine(
+        reads=(*bounds["reads"], *GRAPHICS),
+        writes=(out, *devices),
+        memory=MEMORY + 64 * pixels,
+    )
+    return float(bounds["seconds"] + frames * (FRAME_TIME + PIXEL_TIME * pixels))
+
+
 def _draw(job: dict[str, Any]) -> None:
-    stage = Stage(job["recording"])
+    recording, on_compiled = open_recording(job["recording"]), None
+    if not job["in_process"]:
+        seconds = _confine(job, recording)
+        _answer(seconds=seconds)
+        on_compiled = partial(allow_time, seconds)
+    stage = Stage(recording, on_compiled)
     camera = Camera(stage, job["width"], job["height"], job["camera"])
     out = job["out"]
     if out.endswith(".png"):
@@ -410,7 +459,8 @@ def run() -> None:
     job = json.loads(sys.stdin.readline())
     try:
         _draw(job)
-    except HapticBridgeError as error:
-        _answer(error=str(error))
+    except Exception as error:
+        words, is_refusal = failure(error)
+        _answer(**{"error" if is_refusal else "failure": words})
     else:
         _answer(done=True)

@@ -1,28 +1,32 @@
 """Scene of a recording, compiled again from its attached sources.
 
 A recording may come from anyone. MuJoCo's compiler trusts its input: a scene can crash it, or make
-it take all memory. Such work is therefore done in a child process with limits on memory, time and
-files (``in_bounds``), or tried there first (``compile_recorded``).
+it take all memory. Such work is therefore done in a child process (``confinement``),
+which hands over numbers and texts.
 """
 
 from __future__ import annotations
 
-import faulthandler
-import json
-import os
-import signal
-import sys
-import tempfile
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import numpy as np
+
+from hapticbridge import jit
+from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import simulate_recorded
+from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, prepare
+from hapticbridge.rendering import check_prepared, method_named, prepare, static_load
 from hapticbridge.run_description import (
     CARRIED,
     SOURCE_PREFIX,
@@ -33,138 +37,69 @@ from hapticbridge.run_description import (
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.scene.source import refuse_outside
 
-if sys.platform != "win32":
-    import resource
-
-# Child process with limits
-
-MEMORY = 700 << 20
-"""Memory in bytes that foreign work may take beyond the present process. A scene with large meshes
-compiles in half of it; with more, a hostile scene could take a small machine's memory."""
-
-COMPILE_TIME = 4
-"""Processor time in s in which a foreign scene must compile. The shipped scenes take 0.1 s."""
-
-SIMULATION_TIME, SLOWEST = 60, 20
-"""Processor time in s that a simulation may take, and beyond it per second of the run. A first
-simulation on a machine compiles its functions for 35 s; a scene at its limit takes its run time."""
-
-_LARGEST_FILE = 256 << 20
-_DONE, _REFUSED, _NO_MEMORY, _FAILED = 0, 3, 4, 5
+SIMULATION_TIME, SLOWEST = 15, 20
+"""Processor time in s that a simulation may take, and beyond it per second of the run. Machine code
+is loaded before; a scene at its limit takes its run time."""
 
 
-Work = Callable[[Callable[[float], None]], object]
+def seconds_for(recording: RecordingFile, parameters: RunParameters) -> float:
+    """Returns the processor time in s that a simulation of the run may take."""
+    seconds = SIMULATION_TIME + SLOWEST * recording.count * parameters.period
+    return seconds if SIMULATION_TIME <= seconds < 86400.0 else 86400.0  # numbers of any file
 
 
-def in_bounds(work: Work, what: str) -> object:
-    """Does foreign work in a child process; returns its result, which must fit into JSON.
+def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str, Any]:
+    """Returns the bounds of a child process that simulates a run, as for ``Confined``.
 
-    The child is a fork of this process: nothing is imported or read again. It ends with it.
-
-    Args:
-        work: Function to call. Its argument is a function that gives the child so many seconds of
-            processor time from then on; at first it has ``COMPILE_TIME``.
-        what: Name of what is worked on, for the message.
-
-    Raises:
-        RecordingError: The work raised it.
-        ForeignSceneError: The child crashed, or exceeded memory or time.
+    The machine code of its method is loaded here first: the child inherits it.
     """
-    if sys.platform == "win32":
-        return work(unlimited)
-    with TemporaryDirectory(prefix="hapticbridge-") as folder:
-        reading, writing = os.pipe()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        child = os.fork()
-        if child == 0:
-            os.close(reading)
-            _work_and_exit(work, folder, writing)
-        os.close(writing)
-        try:
-            with open(reading, "rb") as answer:  # noqa: PTH123 - a pipe
-                text = answer.read()
-        except BaseException:
-            os.kill(child, signal.SIGKILL)
-            raise
-        finally:
-            _, status = os.waitpid(child, 0)
-    code = os.waitstatus_to_exitcode(status)
-    if code in (_DONE, _REFUSED):
-        found = json.loads(text)
-        if code == _REFUSED:
-            raise RecordingError(str(found))
-        return found
-    death = f"made MuJoCo fail: {json.loads(text)}" if code == _FAILED else _death(code)
-    raise ForeignSceneError(f"{what} {death}")
+    method = method_of(recording.meta)
+    load_machine_code(method.name, method.contact)
+    return {
+        "seconds": seconds_for(recording, parameters),
+        "reads": (Path(recording.path).absolute(), jit.cache_folder()),
+    }
 
 
-class ForeignSceneError(HapticBridgeError):
-    """A foreign scene crashed MuJoCo, or needs more than its share of memory or time."""
+@cache
+def load_machine_code(name: str, contact: str) -> None:
+    """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
-
-def unlimited(_seconds: float) -> None:
-    """Stands for the function that extends the time, where time is not limited."""
-
-
-def _work_and_exit(work: Work, folder: str, answer: int) -> None:
-    code, found = 1, b""
+    A child process may not write it, and each would load it again.
+    """
+    method = method_named(name).with_contact(contact)
+    coupling, period = Coupling(1000.0, 1.0, 1.0, 1e-3), 1e-3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = load_scene("point_mass")
     try:
-        faulthandler.disable()
-        tempfile.tempdir = folder
-        _limit_this_process()
-        found, code = json.dumps(work(_allow)).encode(), _DONE
-    except MemoryError:
-        code = _NO_MEMORY
-    except BaseException as error:
-        is_refusal = isinstance(error, RecordingError)
-        words = str(error)
-        if not is_refusal:
-            words = " ".join(f"{type(error).__name__}: {words}".split())[:200]
-        found, code = json.dumps(words).encode(), _REFUSED if is_refusal else _FAILED
-        if "allocate memory" in words:  # MuJoCo's
-            found, code = b"", _NO_MEMORY
-    finally:
-        while found:
-            found = found[os.write(answer, found) :]
-        os._exit(code)
-
-
-def _limit_this_process() -> None:
-    with open("/proc/self/statm", encoding="ascii") as pages:  # noqa: PTH123 - not a file to keep
-        present = int(pages.read().split()[0]) * resource.getpagesize()
-    _lower(resource.RLIMIT_AS, present + MEMORY)
-    _lower(resource.RLIMIT_FSIZE, _LARGEST_FILE)
-    _lower(resource.RLIMIT_CORE, 0)
-    _allow(COMPILE_TIME)
-
-
-def _lower(kind: int, most: int) -> None:
-    soft, hard = resource.getrlimit(kind)
-    known = [each for each in (soft, most) if each != resource.RLIM_INFINITY]
-    resource.setrlimit(kind, (min(known), hard))
-
-
-def _allow(seconds: float) -> None:
-    if sys.platform != "win32":
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        until = int(used.ru_utime + used.ru_stime + seconds) + 1
-        _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-        if hard != resource.RLIM_INFINITY:
-            until = min(until, hard)
-        resource.setrlimit(resource.RLIMIT_CPU, (until, hard))
-
-
-def _death(code: int) -> str:
-    if code == _NO_MEMORY:
-        return (
-            f"needs more than {MEMORY >> 20} MB of memory; audit --in-process sets no limit, for a "
-            "scene that you trust"
+        effective = prepare(scene, coupling, period, 1, method, warns=False)
+        parameters = RunParameters(
+            grip=scene.grip,
+            period=period,
+            substeps=1,
+            coupling=method.law_coupling(coupling, period),
+            force_limit=1.0,
+            torque_limit=1.0,
+            ramp_ticks=0,
+            device_origin=IDENTITY_POSE,
+            handle_origin=scene.grip_pose(),
+            device_start=IDENTITY_POSE,
+            scheme=method.scheme,
+            is_rigid=method.is_rigid,
+            effective=effective,
+            contact_stiffness=0.0 if method.has_coupling else coupling.stiffness,
         )
-    if sys.platform != "win32" and code == -signal.SIGXCPU:
-        return "needs too much processor time"
-    name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    return f"crashed MuJoCo ({name})"
+        if method.has_law:
+            static_load(scene, parameters)
+        kernel = BoundKernel(scene.model, scene.data, parameters)
+        sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
+        rows, flags = np.zeros(1, TICK_DTYPE), np.zeros(1, np.int64)
+        sample["quaternion"][:, 0] = 1.0
+        simulate_recorded(kernel.state, sample, flags, nothing, kernel.row, rows)
+        kernel.release()
+    finally:
+        scene.release()
 
 
 # Scene from its sources
@@ -236,24 +171,14 @@ def load_unpacked(
     return scene
 
 
-def compile_recorded(
-    recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
-) -> Scene:
+def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Scene:
     """Compiles the attached sources, and prepares the scene for the recorded method.
 
-    Args:
-        recording: The recording.
-        parameters: Parameters of its run.
-        is_trusted: True compiles in this process at once. False tries it in a child process first:
-            the compiler is deterministic, so that what neither crashed there nor took more than its
-            share does not do so here.
+    It belongs into a child process with limits (``confinement``), unless the recording is trusted.
 
     Raises:
         RecordingError: The recording carries no scene, or it cannot be compiled or prepared.
-        ForeignSceneError: It crashed the compiler, or takes too much memory or time.
     """
-    if not is_trusted:
-        in_bounds(lambda _: _try(recording, parameters), f"the scene of '{recording.path}'")
     folder = ""
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
@@ -270,11 +195,6 @@ def compile_recorded(
         reason = str(error).replace(f"{folder}/", "")
         raise RecordingError(f"the attached scene does not fit the metadata: {reason}") from None
     return scene
-
-
-def _try(recording: RecordingFile, parameters: RunParameters) -> None:
-    scene = compile_recorded(recording, parameters, is_trusted=True)
-    method_of(recording.meta).step(scene.model, scene.data)
 
 
 def is_as_recorded(scene: Scene, recording: RecordingFile) -> bool:

@@ -14,7 +14,7 @@ PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
     ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
-    ("arguments", "clock", "coupling", "files", "pose"),
+    ("arguments", "clock", "confinement", "coupling", "files", "pose"),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),
     ("scene", "inputs"),

@@ -322,3 +322,15 @@ def test_the_command_speaks_json_and_exits_1_where_the_machine_is_unfit(
     ):
         with pytest.raises(HapticBridgeError, match=word):
             diagnose(*numbers)
+
+
+def test_what_confines_a_strangers_scene_is_a_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "recordings from others"
+    monkeypatch.setattr(machine, "means", lambda: {"rules on paths": True})
+    assert found(tmp_path, {})[name].is_good is True
+    monkeypatch.setattr(machine, "means", lambda: {"rules on paths": False, "a filter": True})
+    item = found(tmp_path, {})[name]
+    assert item.is_good is None and "lacks 'rules on paths'" in item.sentence
+    assert "Landlock" in item.remedy

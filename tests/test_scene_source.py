@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
@@ -240,3 +244,91 @@ def test_a_run_of_a_specification_is_simulated_again_bit_for_bit(tmp_path: Path)
     recorded(path, load_scene(built_spec()), duration=0.1)
     report = audit(path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+# Bounds on what a scene may name and take
+
+
+def special(folder: Path, kind: str) -> Path:
+    """Returns a name that leads to something else than a file of the scene."""
+    path = folder / "part"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as made, contextlib.chdir(folder):
+            made.bind("part")
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    else:
+        (folder.parent / "secret").write_bytes(stl_bytes())
+        path.symlink_to(folder.parent / "secret")
+    return path
+
+
+NAMING = {
+    "mesh": mjcf(MESH.format("part"), body=MESHED),
+    "texture": mjcf("<asset><texture name='t' type='2d' file='part'/></asset>"),
+    "include": mjcf("<include file='part'/>"),
+}
+
+
+@pytest.mark.parametrize("element", NAMING)
+@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "link"])
+def test_what_is_no_file_of_the_scene_is_refused_by_name_before_it_is_opened(
+    element: str, kind: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    special(folder, kind)
+    (folder / "main.xml").write_text(NAMING[element], encoding="utf-8")
+    with pytest.raises(SceneError, match=rf"names the {kind} '.*/part'"):
+        load_scene(folder / "main.xml")
+
+
+def test_links_within_a_scene_and_its_repository_are_followed(tmp_path: Path) -> None:
+    scene = tmp_path / "repository" / "scenes" / "peg"
+    scene.mkdir(parents=True)
+    (scene / "main.xml").write_text(NAMING["mesh"], encoding="utf-8")
+    (tmp_path / "repository" / "peg.stl").write_bytes(stl_bytes())
+    (scene / "part").symlink_to(tmp_path / "repository" / "peg.stl")
+    with pytest.raises(SceneError, match="names the link"):
+        load_scene(scene / "main.xml")
+    (tmp_path / "repository" / ".git").mkdir()
+    with pytest.raises(SceneError, match=r"[Uu]nknown|extension|decode|load"):
+        load_scene(scene / "main.xml")  # a mesh needs an ending
+
+
+GRID = '<replicate count="60" offset="0 0 1">'
+
+
+@pytest.mark.parametrize("command", ["run", "check", "scenes"])
+def test_a_scene_that_compiles_too_long_or_takes_too_much_ends_in_a_sentence(
+    command: str, tmp_path: Path
+) -> None:
+    nest = f"{3 * GRID}<geom size='.1'/>{3 * '</replicate>'}"
+    (tmp_path / "long.xml").write_text(mjcf(world=nest))
+    (tmp_path / "large.xml").write_text(mjcf('<size memory="6400M"/>'))
+    program = (
+        "import sys; from hapticbridge import confinement\n"
+        "from hapticbridge.cli.main import main\n"
+        "confinement.PATIENCE_HERE = float(sys.argv.pop())\n"
+        "confinement.machine_memory = lambda: 1 << 30\n"
+        "sys.exit(main())\n"
+    )
+    for name, patience, words in (
+        ("long", 0.5, "takes more than 0.5 s to compile"),
+        ("large", 60.0, "memory"),
+    ):
+        options = ["--fast", "--duration", "0.1"] if command == "run" else []
+        done = subprocess.run(
+            [
+                *(sys.executable, "-c", program, command),
+                *(str(tmp_path / f"{name}.xml"), *options, str(patience)),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+        assert words in " ".join(done.stderr.split())

@@ -13,6 +13,7 @@ from cli_cases import Called
 from view_cases import pressed_floor
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.film_process import Stage
 from hapticbridge.recording import read_recording
 from hapticbridge.view.window import Address
 
@@ -41,8 +42,8 @@ def served(replay: Replay, address: Address) -> Iterator[tuple[Theatre, int]]:
 
 
 def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay: Replay) -> None:
-    records = read_recording(replay.stage.recording.path).ticks
-    ball = replay.stage.model.body("ball").id
+    records = read_recording(replay.recording.path).ticks
+    ball = Stage(replay.recording).model.body("ball").id
     for moment in (0.0, 0.4, 1.2):
         sight = replay.at(moment)
         row = records[max(round(sight.time * 1000) - 1, 0)]
@@ -69,7 +70,7 @@ def test_a_port_that_cannot_be_had_is_named_and_not_exchanged(replay: Replay, ca
             Theatre(replay, Address(port))
         code, _, err = call(
             "run",
-            replay.stage.recording.path.with_name("floor.xml"),
+            replay.recording.path.with_name("floor.xml"),
             "--fast",
             "--view",
             "--port",
@@ -105,7 +106,7 @@ def test_without_the_extra_a_sentence_says_how_to_get_it(
     replay: Replay, call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    for command in (("view", replay.stage.recording.path), ("run", "peg_in_hole", "--view")):
+    for command in (("view", replay.recording.path), ("run", "peg_in_hole", "--view")):
         code, _, err = call(*command)
         assert code == 2
         assert "hapticbridge[view]" in err

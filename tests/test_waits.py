@@ -63,11 +63,13 @@ REASONS = {
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
-    "film.py: for line in answers": "a timer kills the process that draws",
     "film.py: with process": "a timer kills the process that draws",
     "film_process.py: sys.stdin.readline()": "the caller's end closes it",
-    "recorded_scene.py: answer.read()": "limits on the child's processor time end it",
-    "recorded_scene.py: os.waitpid(child, 0)": "limits on the child's processor time end it",
+    "confinement.py: os.waitpid(self._child, 0)": "it was killed",
+    "confinement.py: select.poll()": "makes the object, which waits with a limit",
+    "confinement.py: os.waitpid(self._child, os.WNOHANG)": "it does not wait",
+    "confinement.py: os.read(self._reading, min(size - len(pieces), 1 << 20))": "poll has data",
+    "audit/replay.py: child.result()": "it has a time limit of its own",
     # studies
     "sweep/sweep.py: wait(running, return_when=FIRST_COMPLETED)": USERS,
     "sweep/sweep.py: wait(running)": USERS,

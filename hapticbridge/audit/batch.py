@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from hapticbridge.audit import audit
+from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
-from hapticbridge.recorded_scene import ForeignSceneError
 from hapticbridge.recording.seal import trusted_keys
 from hapticbridge.sweep.points import Value
 from hapticbridge.sweep.results import Interrupted, Table, check_format

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.structure import first_row
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import EventApplier
+from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.inputs import apply_writes
@@ -23,14 +25,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.recorded_scene import (
-    SIMULATION_TIME,
-    SLOWEST,
-    compile_recorded,
-    in_bounds,
-    is_as_recorded,
-    unlimited,
-)
+from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import RecordingFile
 from hapticbridge.run_description import (
     SOURCE_PREFIX,
@@ -58,16 +53,14 @@ instructions round differently. A larger tolerance would hide tampering, a small
 honest recordings."""
 
 
-def attached_scene(
-    recording: RecordingFile, parameters: RunParameters, *, is_trusted: bool = False
-) -> Scene:
+def attached_scene(recording: RecordingFile, parameters: RunParameters) -> Scene:
     """Compiles the attached sources, which must give the recorded model in every bit.
 
     Raises:
         ForeignModelError: Another processor compiled another model.
         RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
-    scene = compile_recorded(recording, parameters, is_trusted=is_trusted)
+    scene = compile_recorded(recording, parameters)
     if is_as_recorded(scene, recording):
         return scene
     found = "the attached sources do not compile to the recorded model (scene_sha256)"
@@ -292,31 +285,46 @@ def compare_resimulation(
 ) -> ReplayOutcome:
     """Simulates the recorded device motion again and compares every number except times.
 
-    It is done in a child process with limits (``recorded_scene.in_bounds``), unless the recording
-    is trusted.
+    It is done in a child process with limits (``confinement``), unless the recording is trusted.
 
     Raises:
         ForeignSceneError: The child process crashed, or exceeded its limits.
         RecordingError: The attachments contradict the metadata, or an event is damaged; the file
             was changed.
     """
+    with comparison(recording, described, is_trusted=is_trusted) as outcome:
+        return outcome()
+
+
+@contextmanager
+def comparison(
+    recording: RecordingFile, described: AuditedRun, *, is_trusted: bool = False
+) -> Iterator[Callable[[], ReplayOutcome]]:
+    """Starts ``compare_resimulation`` beside the work in the context.
+
+    Yields:
+        Function that waits for the outcome.
+    """
     if reason := obstacle(recording):
-        return ReplayOutcome(f"{NOT_RUN}: {reason}")
+        yield lambda: ReplayOutcome(f"{NOT_RUN}: {reason}")
+        return
     if is_trusted:
-        return _compared(recording, described, unlimited)
-    what = f"the scene of '{recording.path}'"
-    found = in_bounds(lambda allow: asdict(_compared(recording, described, allow)), what)
-    return ReplayOutcome(**cast(dict[str, Any], found))
+        yield lambda: _compared(recording, described, Unlimited())
+        return
+    with Confined(
+        lambda worker: asdict(_compared(recording, described, worker)),
+        f"the scene of '{recording.path}'",
+        **bounds_for(recording, described.parameters),
+    ) as child:
+        yield lambda: ReplayOutcome(**child.result())
 
 
-def _compared(
-    recording: RecordingFile, described: AuditedRun, allow: Callable[[float], None]
-) -> ReplayOutcome:
+def _compared(recording: RecordingFile, described: AuditedRun, worker: Worker) -> ReplayOutcome:
     try:
-        scene = attached_scene(recording, described.parameters, is_trusted=True)
+        scene = attached_scene(recording, described.parameters)
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
-    allow(SIMULATION_TIME + SLOWEST * recording.count * described.parameters.period)
+    worker.allow_run()
     run = Resimulator(recording, described.parameters, scene)
     is_exact = is_same_processor(recording)
     if fault := first_contradiction(

@@ -18,7 +18,7 @@ from hapticbridge.audit.agreement import (
 )
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import AuditedRun, AuditState, RunEvents
-from hapticbridge.audit.replay import ReplayOutcome, compare_resimulation
+from hapticbridge.audit.replay import ReplayOutcome, comparison
 from hapticbridge.audit.report import AuditReport, Verdict
 from hapticbridge.audit.structure import (
     TOLERANCE,
@@ -245,20 +245,26 @@ def verdict_on(
         facts["coupling_sentences"] = sentences + run.events.changes_of_coupling(run.method)
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
-        fault = file_fault(recording) or structure_fault(recording.blocks(), run.events)
+        fault = file_fault(recording)
         if fault is None:
-            energies = PassivityTally(is_watched=facts["certified"] is not True)
-            timing = TimingTally(run.parameters)
-            fault, facts["duration"] = _check_records(recording, run, energies, timing)
-            facts["energies"] = energies.energies
-            facts |= _time_facts(run, recording, timing, facts["certified"])
-            fault = fault or first_contradiction(
-                chain(metadata_statements(recording, run), event_statements(recording, timing))
-            )
-        if fault is None:
-            outcome = compare_resimulation(recording, run, is_trusted=in_process)
-            facts["resimulation"] = outcome.agreement
-            fault = _replay_fault(outcome)
+            with comparison(recording, run, is_trusted=in_process) as replayed:
+                fault = structure_fault(recording.blocks(), run.events)
+                if fault is None:
+                    energies = PassivityTally(is_watched=facts["certified"] is not True)
+                    timing = TimingTally(run.parameters)
+                    fault, facts["duration"] = _check_records(recording, run, energies, timing)
+                    facts["energies"] = energies.energies
+                    facts |= _time_facts(run, recording, timing, facts["certified"])
+                    fault = fault or first_contradiction(
+                        chain(
+                            metadata_statements(recording, run),
+                            event_statements(recording, timing),
+                        )
+                    )
+                if fault is None:
+                    outcome = replayed()
+                    facts["resimulation"] = outcome.agreement
+                    fault = _replay_fault(outcome)
         if fault is None:
             requested_of(recording.meta)
     except RecordingError as error:

@@ -229,7 +229,13 @@ class Audit:
 
     def _ask(self, file: Path) -> int:
         with progress("what if") as show:
-            found = what_if(file, changes_from(self.what_if), strict=self.strict, progress=show)
+            found = what_if(
+                file,
+                changes_from(self.what_if),
+                strict=self.strict,
+                in_process=self.in_process,
+                progress=show,
+            )
         if self.as_json:
             out.print_json(found.to_json())
         else:
@@ -239,7 +245,7 @@ class Audit:
         if self.report is not None:
             before = found.runs[0]
             with err.status("drawing …"):
-                scene = _scene_picture(before.recording, before.report)
+                scene = self._scene_picture(before.recording, before.report)
                 write_what_if(found, self.report, scene)
         print_written(self.plot, self.report)
         return found.exit_code
@@ -250,18 +256,19 @@ class Audit:
             if self.plot is not None:
                 plot_recording(recording, self.plot)
             if self.report is not None:
-                write_report(recording, report, self.report, _scene_picture(recording, report))
+                scene = self._scene_picture(recording, report)
+                write_report(recording, report, self.report, scene, in_process=self.in_process)
         print_written(self.plot, self.report)
 
-
-def _scene_picture(recording: Recording, report: AuditReport) -> bytes | None:
-    """Returns a picture of the scene; nothing where it cannot be drawn, which is no fault of it."""
-    try:
-        at = telling_time(recording, report)
-        return still(report.path, Shot(at=at, width=SCENE_SIZE[0], height=SCENE_SIZE[1]))
-    except (HapticBridgeError, ValueError) as error:
-        err.print(f"no picture of the scene: {plain(str(error))}")
-        return None
+    def _scene_picture(self, recording: Recording, report: AuditReport) -> bytes | None:
+        """Returns a picture of the scene; None if it cannot be drawn, which is no fault of it."""
+        try:
+            at = telling_time(recording, report)
+            shot = Shot(at=at, width=SCENE_SIZE[0], height=SCENE_SIZE[1])
+            return still(report.path, shot, in_process=self.in_process)
+        except (HapticBridgeError, ValueError) as error:
+            err.print(f"no picture of the scene: {plain(str(error))}")
+            return None
 
 
 def _print_report(report: AuditReport) -> None:

@@ -39,14 +39,14 @@ from hapticbridge.check.lean_output import (
 from hapticbridge.check.observe import quiet
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
-from hapticbridge.cli.terminal import err, out, plain, print_json, progress
+from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
 from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.rendering import RunCoupling, default_method
-from hapticbridge.scene import read_scene, settings_from
+from hapticbridge.scene import plain_model, read_scene, settings_from
 from hapticbridge.units import format_si
 
 if TYPE_CHECKING:
@@ -340,7 +340,9 @@ class Check:
         if self.overwrite and self.write is None:
             raise SceneError("--overwrite goes with --write FILE; nothing else is replaced")
         budget = checked_budget(1.0 if self.budget is None else self.budget)
-        source = read_scene(self.scene, **settings_from(self.settings))
+        with compiling(self.scene):
+            source = read_scene(self.scene, **settings_from(self.settings))
+            plain_model(source)
         if self.write is not None:
             check_target(source, self.write, overwrite=self.overwrite)
         if self.table is not None:

@@ -50,12 +50,15 @@ class Render:
     overwrite: bool = False
     """Replace the picture or film if the file exists."""
 
+    in_process: bool = False
+    """Simulate without limits on memory and time, for a recording of a known origin."""
+
     def execute(self) -> int:
         """Draws; returns the exit code."""
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
         shot = Shot(**{field.name: getattr(self, field.name) for field in fields(Shot)})
         with err.status("drawing …"), progress("drawing") as show:
-            renderer = draw(self.file, self.output, shot, show)
+            renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")
         return 0

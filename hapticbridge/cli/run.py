@@ -20,7 +20,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
-from hapticbridge.cli.terminal import err, notify, out, print_json
+from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -385,8 +385,9 @@ class Run:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
         with err.status("reading and trying the scene …"):
-            source = read_scene(self.scene, **settings_from(self.settings))
-            scene = compile_scene(source, self.grip, as_is=self.as_is)
+            with compiling(self.scene):
+                source = read_scene(self.scene, **settings_from(self.settings))
+                scene = compile_scene(source, self.grip, as_is=self.as_is)
             chosen = (
                 self
                 if self.substeps is not None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import out, plain
+from hapticbridge.cli.terminal import compiling, out, plain
 from hapticbridge.device import DEFAULT_HAND, scene_hand
 from hapticbridge.scene import (
     custom_text,
@@ -51,7 +51,8 @@ def _show(scene: str) -> int:
     """Prints what one scene is and what can be set in it."""
     path = scene_path(scene)
     # without load_scene, because the grip may have any name here
-    model, parameters = plain_model(read_scene(path)), scene_parameters(path)
+    with compiling(scene):
+        model, parameters = plain_model(read_scene(path)), scene_parameters(path)
     hand = scene_hand(model, path)
     sentence, moving = custom_text(model, "about"), int((model.body_dofnum > 0).sum())
     out.print(f"[bold]{plain(path.stem)}[/bold]" + (f": {plain(sentence)}" if sentence else ""))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,6 +41,19 @@ def notify(sentence: str) -> None:
 def print_error(error: object, what: str = "error") -> None:
     """Prints what went wrong on stderr, in one line that begins with ``what``."""
     err.print(f"[red]{what}:[/red] {plain(' '.join(str(error).splitlines()))}")
+
+
+@contextmanager
+def compiling(scene: str) -> Iterator[None]:
+    """Bounds memory and time while a scene is read and compiled; ends the program beyond them."""
+    from hapticbridge.confinement import bounded_here  # noqa: PLC0415 - for scenes alone
+
+    def end(clause: str) -> None:
+        print_error(f"scene '{scene}' {clause}")
+        os._exit(2)
+
+    with bounded_here(end):
+        yield
 
 
 @contextmanager

@@ -32,6 +32,10 @@ class View:
     """Port on this machine, where only the printed address gets in; 0: any that is free. From
     another machine: ssh -L 8080:localhost:8080 MACHINE, then open the printed address there."""
 
+    in_process: bool = False
+    """Simulate in this process, for a recording of a known origin: without the child process whose
+    memory and time are limited."""
+
     def execute(self) -> int:
         """Serves the page; returns the exit code."""
         check_view()
@@ -39,7 +43,7 @@ class View:
         from hapticbridge.view.replay import Replay, Theatre  # noqa: PLC0415 - of an extra
 
         with progress("simulating again") as show:
-            replay = Replay(self.file, show)
+            replay = Replay(self.file, show, in_process=self.in_process)
         theatre = Theatre(replay, address)
         notify(f"view: {theatre.url}")
         with contextlib.suppress(KeyboardInterrupt):

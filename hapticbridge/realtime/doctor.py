@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.clock import RealClock, period_of
+from hapticbridge.confinement import means
 from hapticbridge.device.discovery import blind_spots, plugged_devices
 from hapticbridge.device.watchdog import SHORTEST_WATCHDOG
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.realtime import (
     Grant,
     Lateness,
@@ -177,6 +178,7 @@ def findings(
         _cores(),
         _host(system, stolen, duration),
         _usb(),
+        _confinement(),
     )
 
 
@@ -322,6 +324,23 @@ def _usb() -> Finding:
     if not plugged:
         return Finding(name, None, "no haptic device is plugged in")
     return Finding(name, True, f"may be opened: {', '.join(map(str, plugged))}")
+
+
+def _confinement() -> Finding:
+    """Checks the means that confine a scene from someone else's recording."""
+    name, found = "recordings from others", means()
+    if not found:
+        return Finding(name, None, "their scenes are simulated without limits on this system")
+    limits = "their scenes run with limits on memory and time"
+    missing = [each for each, works in found.items() if not works]
+    if not missing:
+        return Finding(name, True, f"{limits}, without network, and read only their own files")
+    return Finding(
+        name,
+        None,
+        f"{limits}, but this system lacks {choices(missing)}; the names of their files are checked",
+        "Linux 5.13 or newer with Landlock, seccomp and user namespaces gives all of them",
+    )
 
 
 # Wake-up times of the bridge's clock and of a bare sleep loop

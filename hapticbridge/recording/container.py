@@ -6,6 +6,7 @@ import os
 import struct
 import threading
 import zlib
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -379,7 +380,8 @@ class Container:
                 yield opcode, position + _RECORD.size, stop
                 position = stop
                 continue
-            following = next((offset for offset in resume if position < offset < end), None)
+            place = bisect_right(resume, position)  # sorted
+            following = resume[place] if place < len(resume) and resume[place] < end else None
             # after a power failure, zeros may follow the last whole record
             is_cut_here = self.is_cut and (opcode != 0 or self._data.is_zero_from(position))
             if not is_cut_here:

@@ -67,6 +67,7 @@ class Contents:
     keeps_events: bool = True
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _topics: dict[int, str] = field(default_factory=dict)
+    _names: set[str] = field(default_factory=set)
 
     @property
     def has_ticks(self) -> bool:
@@ -98,8 +99,9 @@ class Contents:
         fields.raw(16)
         name, media_type = fields.text(), fields.text()
         data = fields.raw(fields.number(8))
-        if any(name == attachment.name for attachment in self.attachments):
+        if name in self._names:
             raise DamageError(f"there is a second attachment '{name}'")
+        self._names.add(name)
         self.attachments.append(Attachment(name, media_type, data))
 
     def add_block(self, block: Block) -> None:
@@ -291,14 +293,20 @@ class RecordingFile:
             yield from (self.kept[start : start + size] for start in range(0, self.count, size))
             return
         runs: list[NDArray[np.void]] = []
-        found = 0
-        for _ in _read_parts(self.path, runs.append, keeps_events=False):
-            while sum(run.size for run in runs) >= size:
+        found = held = 0
+
+        def take(run: NDArray[np.void]) -> None:
+            nonlocal held
+            runs.append(run)
+            held += run.size  # a sum over all runs in every part would be quadratic
+
+        for _ in _read_parts(self.path, take, keeps_events=False):
+            while held >= size:
                 block, runs[:] = _split(runs, size, self.record)
-                found += size
+                found, held = found + size, held - size
                 yield block
         if runs:
-            found += sum(run.size for run in runs)
+            found += held
             yield _join(runs, self.record)
         if found != self.count:
             raise RecordingError(f"the recording {self.path} was changed while it was read")

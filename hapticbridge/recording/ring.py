@@ -32,11 +32,14 @@ def memory_folder() -> Path:
 
     ``multiprocessing.shared_memory`` does not fit. Before Python 3.13 its resource tracker also
     tracks attached processes, removes the memory under its owner, and prints about leaks after a
-    kill.
+    kill. A confined process (``confinement``) may not open it.
     """
     memory = Path("/dev/shm")
-    usable = memory.is_dir() and os.access(memory, os.W_OK)
-    return memory if usable else Path(tempfile.gettempdir())
+    try:
+        os.close(os.open(memory, os.O_RDONLY))
+    except OSError:
+        return Path(tempfile.gettempdir())
+    return memory if os.access(memory, os.W_OK) else Path(tempfile.gettempdir())
 
 
 def created(content: str, size: int) -> tuple[mmap.mmap, str]:

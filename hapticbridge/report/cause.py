@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -22,8 +22,10 @@ from hapticbridge.certificate import (
     required_damping,
     run_conditions,
 )
-from hapticbridge.errors import RecordingError
+from hapticbridge.confinement import Worker, in_bounds
+from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.record import TickFlag
+from hapticbridge.recorded_scene import bounds_for, compile_recorded
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
@@ -308,6 +310,8 @@ def touched_pairs(
     A record counts contacts without naming them, so the run is simulated again up to the window.
     ``gained`` is the energy created in each tick of the window, (n,) in J.
     """
+    if evidence.model is None:
+        return None
     if not report.resimulation or report.resimulation.startswith(("not", "disagrees")):
         return None
     ticks, total = evidence.ticks, float(gained.sum())
@@ -436,11 +440,28 @@ def _moved_bodies(evidence: Evidence, window: slice) -> int:
 # Search for the likely cause
 
 
-def likely_cause(evidence: Evidence, report: AuditReport) -> Cause | None:
-    """Returns the likely cause of an active run; None for any other run."""
+def likely_cause(
+    evidence: Evidence, report: AuditReport, *, in_process: bool = False
+) -> Cause | None:
+    """Returns the likely cause of an active run; None for any other run.
+
+    The scene is compiled and simulated in a child process (``confinement``), unless ``in_process``.
+    """
     window = window_before(evidence, report)
     if window is None:
         return None
     if report.port == "device":
         return cause_at_device(evidence, window)
-    return cause_in_environment(evidence, report, window)
+    recording, parameters = evidence.recording, evidence.parameters
+
+    def work(worker: Worker) -> object:
+        model = compile_recorded(recording, parameters).model
+        worker.allow_run()
+        return asdict(cause_in_environment(replace(evidence, model=model), report, window))
+
+    what = f"the scene of '{recording.path}'"
+    try:
+        found = in_bounds(work, what, trusted=in_process, **bounds_for(recording, parameters))
+    except HapticBridgeError:
+        return cause_in_environment(evidence, report, window)
+    return Cause(**found)

@@ -21,7 +21,6 @@ from hapticbridge.files import printable
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.record import due_times, force_on_hand
-from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method, RunCoupling
@@ -188,7 +187,7 @@ class Evidence:
         excess: Energy given to the device beyond its dissipation and what scene and coupling
             released, so far, (n,) in J; zeros if it cannot be computed
             (``EnergyBalance.excess_device_energy``).
-        model: The compiled scene; None if its sources cannot be compiled.
+        model: The compiled scene, in the process that may compile it; else None.
     """
 
     recording: Recording
@@ -200,7 +199,7 @@ class Evidence:
     created: Array
     allowed: Array
     excess: Array
-    model: mujoco.MjModel | None
+    model: mujoco.MjModel | None = None
 
     @property
     def ticks(self) -> NDArray[np.void]:
@@ -279,12 +278,4 @@ class Evidence:
             created=energies[0],
             allowed=energies[1],
             excess=energies[2],
-            model=_model(recording, run.parameters),
         )
-
-
-def _model(recording: Recording, parameters: RunParameters) -> mujoco.MjModel | None:
-    try:
-        return compile_recorded(recording, parameters).model
-    except HapticBridgeError:
-        return None

@@ -153,19 +153,24 @@ def telling_time(recording: Recording, report: AuditReport) -> float:
 
 
 def write_report(
-    recording: Recording, report: AuditReport, path: Path, scene: bytes | None = None
+    recording: Recording,
+    report: AuditReport,
+    path: Path,
+    scene: bytes | None = None,
+    *,
+    in_process: bool = False,
 ) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
     ``scene`` is a PNG picture of the scene at ``telling_time``, or None. An existing file is
-    replaced.
+    replaced. ``in_process`` is as for ``audit``.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
     """
     evidence, meta = Evidence.of(recording), recording.meta
     rows = event_rows(recording.events)
-    run = None if evidence is None else _evidence_parts(evidence, report)
+    run = None if evidence is None else _evidence_parts(evidence, report, in_process)
     moment = None if run is None else run["moment"]
     write_page(
         path,
@@ -198,7 +203,7 @@ def _bare_curves(recording: Recording) -> str:
         return ""
 
 
-def _evidence_parts(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
+def _evidence_parts(evidence: Evidence, report: AuditReport, in_process: bool) -> dict[str, Any]:
     lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {
@@ -207,15 +212,17 @@ def _evidence_parts(evidence: Evidence, report: AuditReport) -> dict[str, Any]:
         "energies": inline_svg(draw_energies(evidence)),
         "timing": inline_svg(draw_timing(evidence)),
         "balance": balance_of(report),
-        "moment": moment_of(evidence, report),
+        "moment": moment_of(evidence, report, in_process=in_process),
         "lateness": [float(np.percentile(lateness, p)) for p in (50, 99, 100)] if is_timed else [],
         "shares": [(name, percent(on)) for name, on in activities(evidence) if on.any()],
     }
 
 
-def moment_of(evidence: Evidence, report: AuditReport) -> dict[str, Any] | None:
+def moment_of(
+    evidence: Evidence, report: AuditReport, *, in_process: bool = False
+) -> dict[str, Any] | None:
     """Returns time, energy and cause of an active run's fault; None for any other run."""
-    cause = likely_cause(evidence, report)
+    cause = likely_cause(evidence, report, in_process=in_process)
     if cause is None or report.tick is None:
         return None
     energy, allowed = evidence.judged(report)

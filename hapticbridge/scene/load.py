@@ -161,9 +161,9 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     """
     path = scene_path(path_or_name)
     try:
+        sources = collect_sources(path)  # first: it refuses what MuJoCo must not open
         spec = mujoco.MjSpec.from_file(str(path))
-        sources = collect_sources(path)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
         raise SceneError(f"cannot read scene '{path}': {clause(error)}") from None
     concerns = check_options(spec)
     check_numbers(sources)

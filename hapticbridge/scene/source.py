@@ -8,6 +8,7 @@ order and searches height fields in the wrong folder.
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import unescape
@@ -67,13 +68,16 @@ class Element:
 def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, ...]:
     """Returns the main file, first, and all existing files that it refers to.
 
-    A parameter file beside the main file is included. MuJoCo has read the scene before, so a file
-    that is not found here (in a search path of MuJoCo's own) is left out without an error. Written
-    into an empty folder under their names, the files compile to an identical model.
+    A parameter file beside the main file is included. A file that is not found here (in a search
+    path of MuJoCo's own) is left out without an error. Written into an empty folder under their
+    names, the files compile to an identical model.
 
     Args:
         path: The main file.
         main: Content of the main file if none exists at ``path``; it has no parameter file then.
+
+    Raises:
+        SceneError: A name leads to a device, pipe or socket, or through a link out of the folder.
     """
     found: dict[Path, Path] = {}
     _find_files(path, found, main)
@@ -84,6 +88,7 @@ def collect_sources(path: Path, main: bytes | None = None) -> tuple[SourceFile, 
     passed = [folder for file in found.values() for folder in _left_folders(file)]
     while not all(file.is_relative_to(root) for file in (*found, *passed)) and root != root.parent:
         root = root.parent
+    _refuse_links(found, root, path)
     names = (file.relative_to(root if file.is_relative_to(root) else file.anchor) for file in found)
     return tuple(
         SourceFile(name.as_posix(), main if main and file is path else file.read_bytes())
@@ -227,4 +232,37 @@ def _beside(reference: str, homes: Sequence[Path]) -> Iterator[Path]:
 
 
 def _existing(candidates: Iterator[Path]) -> Path | None:
-    return next((path for path in candidates if path.is_file()), None)
+    """Returns the first file that exists.
+
+    Raises:
+        SceneError: A device, pipe or socket comes before it, which would be read without end.
+    """
+    for path in candidates:
+        try:
+            mode = path.stat().st_mode
+        except (OSError, ValueError):
+            continue
+        if stat.S_ISREG(mode):
+            return path
+        if not stat.S_ISDIR(mode):
+            kind = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
+            raise SceneError(
+                f"the scene names the {kind} '{path}'; meshes, textures and includes must be files"
+            )
+    return None
+
+
+def _refuse_links(found: dict[Path, Path], root: Path, main: Path) -> None:
+    """Refuses links that lead out of the scene's folder, its main file's own, and its repository.
+
+    A recording contains all files, also those that a scene reaches through a link.
+    """
+    around = [each for each in main.absolute().parents if (each / ".git").exists()]
+    homes = [each.resolve() for each in (root, *around[:1])] + [main.resolve().parent]
+    for place, file in found.items():
+        target = file.resolve()
+        if not any(target.is_relative_to(home) for home in homes):
+            raise SceneError(
+                f"the scene names the link '{place}', which leads out of its folder to '{target}'; "
+                "copy the file there if it belongs to the scene"
+            )

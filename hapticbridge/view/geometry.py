@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from hapticbridge.check.physics import matrix_of, mesh_of
+from hapticbridge.errors import RecordingError
+from hapticbridge.summary import is_always_implicit
 
 Array = NDArray[np.float64]
 
@@ -272,6 +275,117 @@ def shell(model: mujoco.MjModel, grip: str) -> trimesh.Trimesh:
     if not parts:
         return trimesh.creation.icosphere(subdivisions=2, radius=2.0 * away)
     return trimesh.util.concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenery:
+    """All of a scene that a page draws, without MuJoCo's model.
+
+    Attributes:
+        bodies: Number of bodies.
+        extent: Size of the scene in m.
+        centre: Point in the middle, (3,) in m.
+        props: Visible geoms.
+        widths: Diameter of each visible tendon in m, (n,).
+        colours: Colour of each visible tendon, 0 to 1, (n, 4).
+        tool: Shell around the tool (``shell``).
+        is_always_implicit: True if the method falls back in every tick
+            (``summary.is_always_implicit``).
+    """
+
+    bodies: int
+    extent: float
+    centre: Array
+    props: list[Prop]
+    widths: Array
+    colours: Array
+    tool: trimesh.Trimesh
+    is_always_implicit: bool
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, grip: str) -> Scenery:
+        """Returns what is drawn of a scene; ``grip`` is the name of a site on the tool."""
+        tendons = Tendons(model)
+        return cls(
+            bodies=int(model.nbody),
+            extent=float(model.stat.extent),
+            centre=np.array(model.stat.center, np.float64),
+            props=props_of(model),
+            widths=tendons.widths,
+            colours=tendons.colours,
+            tool=shell(model, grip),
+            is_always_implicit=is_always_implicit(model, grip),
+        )
+
+    def parts(self) -> dict[str, Any]:
+        """Returns numbers, texts and arrays from which ``from_parts`` makes an equal one."""
+        names = ("bodies", "extent", "centre", "widths", "colours", "is_always_implicit")
+        return {name: getattr(self, name) for name in names} | {
+            "tool": _surface(self.tool),
+            "props": [
+                [each.body, each.place, each.turn, each.colour, *_surface(each.mesh)]
+                for each in self.props
+            ],
+        }
+
+    @classmethod
+    def from_parts(cls, parts: Any) -> Scenery:
+        """Returns a scenery from the numbers of a process that may have been taken over.
+
+        Raises:
+            RecordingError: They are no scenery.
+        """
+        try:
+            bodies, count = int(parts["bodies"]), len(parts["widths"])
+            props = [
+                Prop(
+                    body=range(bodies)[body],
+                    place=checked(place, 3),
+                    turn=checked(turn, 4),
+                    mesh=_mesh(*surface),
+                    colour=checked(colour, 4),
+                )
+                for body, place, turn, colour, *surface in parts["props"]
+            ]
+            return cls(
+                bodies=bodies,
+                extent=float(checked(np.array(parts["extent"]))),
+                centre=checked(parts["centre"], 3),
+                props=props,
+                widths=checked(parts["widths"], count),
+                colours=checked(parts["colours"], count, 4),
+                tool=_mesh(*parts["tool"]),
+                is_always_implicit=bool(parts["is_always_implicit"]),
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise RecordingError(f"the scene cannot be drawn: {error}") from None
+
+
+def checked(array: Any, *shape: int | None) -> Array:
+    """Returns finite numbers of a shape, in which None is any length.
+
+    Raises:
+        ValueError: They have another shape, or are not finite.
+    """
+    found = np.array(array, np.float64)  # a copy, which viser may keep
+    if len(shape) != found.ndim or any(
+        wanted not in (None, side) for wanted, side in zip(shape, found.shape, strict=True)
+    ):
+        raise ValueError(f"numbers have the shape {found.shape}, not {shape}")
+    if not np.isfinite(found).all():
+        raise ValueError("a number is not finite")
+    return found
+
+
+def _surface(mesh: trimesh.Trimesh) -> list[NDArray[Any]]:
+    return [np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)]
+
+
+def _mesh(corners: Any, faces: Any) -> trimesh.Trimesh:
+    corners, faces = checked(corners, None, 3), checked(faces, None, 3).astype(np.int64)
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(corners)):
+        raise ValueError("a triangle has no corner")
+    return trimesh.Trimesh(corners, faces, process=False)
 
 
 class Surfaces:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import mujoco
@@ -14,22 +14,22 @@ import viser
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.check.physics import matrix_of
+from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
 from hapticbridge.film_process import MIN_REFERENCE, force_colour, is_held
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.rendering import RunCoupling
 from hapticbridge.run_description import method_of, requested_of
-from hapticbridge.summary import is_always_implicit
 from hapticbridge.units import format_forces, format_si
 from hapticbridge.view.geometry import (
     NOT_DRAWN,
     POINTS,
+    Scenery,
     Surfaces,
     Tendons,
+    checked,
     coil,
     enlargement,
-    props_of,
-    shell,
 )
 
 Array = NDArray[np.float64]
@@ -133,6 +133,34 @@ class Sight:
             tendons=tendons.pieces(data),
         )
 
+    def parts(self) -> list[Any]:
+        """Returns numbers and arrays from which ``from_parts`` makes an equal one."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    @classmethod
+    def from_parts(cls, parts: Any, bodies: int, tendons: int) -> Sight:
+        """Returns an instant from the numbers of a process that may have been taken over.
+
+        Raises:
+            RecordingError: They are no instant of a scene of so many bodies and tendons.
+        """
+        try:
+            time, places, turns, *vectors, where, forces, lines = parts
+            return cls(
+                float(checked(np.array(time))),
+                checked(places, bodies, 3),
+                checked(turns, bodies, 4),
+                *(checked(each, side) for each, side in zip(vectors, (3, 4, 3, 3, 3), strict=True)),
+                checked(where, None, 3),
+                checked(forces, len(where), 3),
+                tuple(
+                    checked(each, None, 2, 3).astype(np.float32)
+                    for each, _ in zip(lines, range(tendons), strict=True)
+                ),
+            )
+        except (TypeError, ValueError) as error:
+            raise RecordingError(f"an instant of the run cannot be drawn: {error}") from None
+
 
 class Trace:
     """Curves of a run, thinned without losing a peak.
@@ -182,6 +210,22 @@ class Trace:
     def __len__(self) -> int:
         return len(self._points)
 
+    @property
+    def newest(self) -> tuple[float, ...]:
+        """The newest point."""
+        return self._points[-1]
+
+    def add_point(self, point: Any) -> None:
+        """Adds the newest point of another trace.
+
+        Raises:
+            RecordingError: It is none.
+        """
+        try:
+            self._points.append(tuple(np.array(point, np.float64).reshape(1 + LINES).tolist()))
+        except (TypeError, ValueError) as error:
+            raise RecordingError(f"the curves of the run cannot be drawn: {error}") from None
+
     def curves(self) -> tuple[Array, list[Array]]:
         """Returns times in s, and the lines of ``PLOTS`` in its units, newest last."""
         table = np.array(self._points, dtype=np.float64).reshape(len(self._points), 1 + LINES)
@@ -198,16 +242,15 @@ class Ghost:
 
     Args:
         scene: viser's scene.
-        model: The scene of the run.
-        grip: Name of the site on the tool.
+        scenery: The scene of the run.
 
     Attributes:
         times: Length of the drawn spring divided by the stretch.
     """
 
-    def __init__(self, scene: viser.SceneApi, model: mujoco.MjModel, grip: str) -> None:
-        self._extent = extent = float(model.stat.extent)
-        self._shell = shell(model, grip)
+    def __init__(self, scene: viser.SceneApi, scenery: Scenery) -> None:
+        self._extent = extent = scenery.extent
+        self._shell = scenery.tool
         self._longest, self.times = 0.0, 1
         self._handle = scene.add_frame("/handle", show_axes=False)
         faces = np.asarray(self._shell.faces)
@@ -292,7 +335,7 @@ class Page:
 
     Args:
         server: Server of the page.
-        model: The run's scene.
+        scenery: The run's scene.
         parameters: Parameters of the run.
         facts: Metadata of the run, as recorded.
 
@@ -304,18 +347,18 @@ class Page:
     def __init__(
         self,
         server: viser.ViserServer,
-        model: mujoco.MjModel,
+        scenery: Scenery,
         parameters: RunParameters,
         facts: dict[str, str],
     ) -> None:
         self._server, self._is_held = server, is_held(facts)
         self.hand_reference = self.tool_reference = MIN_REFERENCE
-        self._extent, self._strongest = float(model.stat.extent), 0.0
-        self._build_scene(model)
-        self._ghost = Ghost(server.scene, model, parameters.grip)
+        self._extent, self._strongest = scenery.extent, 0.0
+        self._build_scene(scenery)
+        self._ghost = Ghost(server.scene, scenery)
         server.gui.set_panel_label(printable(f"hapticbridge: {facts.get('scene', '')}"))
         self.status = server.gui.add_markdown("waiting for the first tick")
-        self._caption = _caption(model, parameters, facts)
+        self._caption = _caption(scenery, parameters, facts)
         self._plots: list[viser.GuiUplotHandle] = []
 
     def add_curves(self) -> None:
@@ -395,13 +438,13 @@ class Page:
         for handle, (_, names) in zip(self._plots, PLOTS, strict=True):
             handle.data = (time, *(next(rest) for _ in names))
 
-    def _build_scene(self, model: mujoco.MjModel) -> None:
+    def _build_scene(self, scenery: Scenery) -> None:
         scene, extent = self._server.scene, self._extent
         scene.set_up_direction("+z")
         self._bodies = {
-            body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(model.nbody)
+            body: scene.add_frame(f"/body{body}", show_axes=False) for body in range(scenery.bodies)
         }
-        for index, prop in enumerate(props_of(model)):
+        for index, prop in enumerate(scenery.props):
             red, green, blue = np.round(255.0 * prop.colour[:3]).astype(int).tolist()
             scene.add_mesh_simple(
                 f"/body{prop.body}/geom{index}",
@@ -414,13 +457,12 @@ class Page:
                 wxyz=prop.turn,
             )
         nothing = np.zeros((1, 2, 3), dtype=np.float32)
-        tendons = Tendons(model)
         self._tendons = [
             scene.add_line_segments(
                 f"/tendon{index}", nothing, linear(255.0 * colour[:3]), thickness=width
             )
             for index, (width, colour) in enumerate(
-                zip(tendons.widths.tolist(), tendons.colours, strict=True)
+                zip(scenery.widths.tolist(), scenery.colours, strict=True)
             )
         ]
         thin = {
@@ -439,7 +481,7 @@ class Page:
             point_shape="circle",
             visible=False,
         )
-        centre, away = np.array(model.stat.center), 1.25 * extent
+        centre, away = scenery.centre, 1.25 * extent
         self._server.initial_camera.look_at = tuple(centre)
         self._server.initial_camera.position = tuple(centre + away * np.array([0.7, -0.8, 0.6]))
         self._server.initial_camera.near = 0.01 * extent
@@ -461,7 +503,7 @@ def _strongest(sight: Sight) -> float:
     return float(np.linalg.norm(sight.contact_forces, axis=1).max(initial=0.0))
 
 
-def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, str]) -> str:
+def _caption(scenery: Scenery, parameters: RunParameters, facts: dict[str, str]) -> str:
     method = method_of(facts)
     coupling = RunCoupling.of(
         method,
@@ -469,7 +511,7 @@ def _caption(model: mujoco.MjModel, parameters: RunParameters, facts: dict[str, 
         requested_of(facts),
         law=parameters.coupling,
         measured=parameters.effective,
-        is_always_implicit=is_always_implicit(model, parameters.grip),
+        is_always_implicit=scenery.is_always_implicit,
     )
     head = f"Method **{method.name}**, {1 / parameters.period:g} Hz"
     lines = [head, *coupling.sentences(), NOT_DRAWN]

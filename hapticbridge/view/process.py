@@ -28,7 +28,7 @@ from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, allowance_of
-from hapticbridge.view.geometry import Tendons
+from hapticbridge.view.geometry import Scenery, Tendons
 from hapticbridge.view.page import Page, Sight, Trace, quoted
 from hapticbridge.view.server import serve
 from hapticbridge.view.window import Address
@@ -58,7 +58,8 @@ class LiveRun:
         run: Metadata and attachments of the run.
 
     Attributes:
-        model: The scene.
+        model: The scene, this user's own.
+        scenery: All of it that the page draws.
         parameters: Parameters of the run.
         hand_reference: Largest force on the hand in N so far, or ``MIN_REFERENCE``.
         tool_reference: Largest force on the tool in N so far, or ``MIN_REFERENCE``.
@@ -68,7 +69,8 @@ class LiveRun:
 
     def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
         self.parameters = parameters_of(run.meta)
-        self.model = compile_recorded(run, self.parameters, is_trusted=True).model
+        self.model = compile_recorded(run, self.parameters).model
+        self.scenery = Scenery.of(self.model, self.parameters.grip)
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
@@ -191,7 +193,7 @@ def run() -> None:
         address = Address(job["port"], job["token"])
         server = serve(address)
         outlet = Outlet(answers.fileno())
-        page = Page(server, live.model, live.parameters, dict(run.meta))
+        page = Page(server, live.scenery, live.parameters, dict(run.meta))
         controls = Controls(server, allowance_of(run.meta), outlet.ask)
         page.add_curves()
     except HapticBridgeError as error:

@@ -7,11 +7,17 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import viser
 
-from hapticbridge.film_process import Stage, is_held
-from hapticbridge.view.geometry import Tendons
+from hapticbridge.confinement import Worker, in_bounds
+from hapticbridge.film_process import MIN_REFERENCE, Stage, is_held
+from hapticbridge.recorded_scene import bounds_for
+from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.run_description import parameters_of
+from hapticbridge.view.geometry import Scenery, Tendons, checked
 from hapticbridge.view.page import Page, Sight, Trace
 from hapticbridge.view.server import serve, stop
 from hapticbridge.view.window import Address
@@ -29,43 +35,88 @@ Progress = Callable[[int, int], None]
 class Replay:
     """Every instant of a recorded run, ready to be shown in any order.
 
+    The run is simulated in a child process with limits (``confinement``), which hands over poses
+    and triangles.
+
     Args:
         path: The recording.
         progress: Called with the finished and all instants.
+        in_process: True simulates in this process, for recordings of a known origin.
 
     Attributes:
-        stage: The run, at its end.
+        recording: The recording without its ticks.
+        parameters: Parameters of the run.
+        scenery: The scene as it is drawn.
         sights: Its instants.
         step: Time in s between two of them.
         trace: Its curves.
+        hand_reference: Largest force on the hand in N, as in ``Stage``.
+        tool_reference: Largest force on the tool in N, as in ``Stage``.
 
     Raises:
         RecordingError: The file is no recording, or cannot be simulated again here.
+        ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
 
-    def __init__(self, path: str | Path, progress: Progress | None = None) -> None:
-        self.stage = stage = Stage(path)
-        self.step = max(FRAME, stage.duration / MOST)
+    scenery: Scenery
+
+    def __init__(
+        self, path: str | Path, progress: Progress | None = None, *, in_process: bool = False
+    ) -> None:
+        self.recording = recording = open_recording(path)
+        self.parameters = parameters_of(recording.meta)
         self.sights: list[Sight] = []
-        self.trace = Trace(is_held=is_held(stage.recording.meta))
-        count = max(1, int(stage.duration / self.step) + 1)
-        tendons = Tendons(stage.model)
-        for number in range(count):
-            stage.show(stage.tick_at(min(number * self.step, stage.duration)))
-            self.sights.append(
-                Sight.of(
-                    stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
-                )
-            )
-            self.trace.add(stage.passed, stage.slack)
-            if progress is not None:
-                progress(number + 1, count)
+        self.trace = Trace(is_held=is_held(recording.meta))
+        self.hand_reference = self.tool_reference = MIN_REFERENCE
+        self.step = FRAME
+        self._count, self._progress = 1, progress
+        in_bounds(
+            lambda worker: _played(recording, worker),
+            f"the scene of '{path}'",
+            trusted=in_process,
+            hear=self._add,
+            **bounds_for(recording, self.parameters),
+        )
+
+    def _add(self, told: Any) -> None:
+        """Takes the scenery, which comes first, or an instant."""
+        if not isinstance(told, list):
+            self.scenery = Scenery.from_parts(told)
+            steps = checked([told[name] for name in ("step", "count", "on_hand", "on_tool")], 4)
+            self.step, self._count = max(float(steps[0]), FRAME), int(steps[1])
+            self.hand_reference, self.tool_reference = map(float, np.maximum(steps[2:], 1e-9))
+            return
+        instant, point = told
+        scenery = self.scenery
+        sight = Sight.from_parts(instant, scenery.bodies, len(scenery.widths))
+        self.sights.append(sight)
+        self.trace.add_point(point)
+        if self._progress is not None:
+            self._progress(len(self.sights), self._count)
 
     def at(self, moment: float) -> Sight:
         """Returns the instant nearest to a time in s; the first for a value that is no time."""
         if math.isnan(moment):
             return self.sights[0]
         return self.sights[round(min(max(moment / self.step, 0.0), len(self.sights) - 1.0))]
+
+
+def _played(recording: RecordingFile, worker: Worker) -> None:
+    """Tells the scenery of a run, and each of its instants with a point of the curves."""
+    stage = Stage(recording, worker.allow_run)
+    step = max(FRAME, stage.duration / MOST)
+    count = max(1, int(stage.duration / step) + 1)
+    scenery = Scenery.of(stage.model, stage.parameters.grip).parts()
+    references = {"on_hand": stage.hand_reference, "on_tool": stage.tool_reference}
+    worker.tell(scenery | references | {"step": step, "count": count})
+    tendons, trace = Tendons(stage.model), Trace(is_held=is_held(stage.recording.meta))
+    for number in range(count):
+        stage.show(stage.tick_at(min(number * step, stage.duration)))
+        trace.add(stage.passed, stage.slack)
+        sight = Sight.of(
+            stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
+        )
+        worker.tell([sight.parts(), trace.newest])
 
 
 class Theatre:
@@ -88,16 +139,16 @@ class Theatre:
         self._turn = threading.Lock()
         self._server: viser.ViserServer = serve(address)
         self.url = address.url(self._server.get_port())
-        stage = replay.stage
         last = replay.sights[-1].time
         with self._server.gui.add_folder(None):
             self.slider = self._server.gui.add_slider(
                 "time (s)", 0.0, max(last, replay.step), 1e-3, 0.0
             )
             self._playing = self._server.gui.add_checkbox("play", initial_value=False)
-        self._page = Page(self._server, stage.model, stage.parameters, dict(stage.recording.meta))
-        self._page.hand_reference = stage.hand_reference
-        self._page.tool_reference = stage.tool_reference
+        facts = dict(replay.recording.meta)
+        self._page = Page(self._server, replay.scenery, replay.parameters, facts)
+        self._page.hand_reference = replay.hand_reference
+        self._page.tool_reference = replay.tool_reference
         self._page.allow(replay.sights)
         self._page.add_curves()
         if len(replay.trace) > 1:

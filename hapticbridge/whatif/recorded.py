@@ -25,8 +25,6 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import (
-    compile_recorded,
-    is_as_recorded,
     load_unpacked,
     recorded_values,
     unpack_scene,
@@ -179,13 +177,6 @@ class RecordedRun:
         return load_unpacked(
             self.scene_file, self.parameters.grip, settings.scene, self.recording.meta
         )
-
-    def is_scene_as_recorded(self) -> bool:
-        """Returns True if the attached sources compile to the recorded model.
-
-        They do not if a program changed the model after loading.
-        """
-        return is_as_recorded(compile_recorded(self.recording, self.parameters), self.recording)
 
 
 def _requested_hold(hold: float, load: float) -> float:

@@ -7,8 +7,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +18,15 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.compare import compare
+from hapticbridge.confinement import Work, Worker, in_bounds
 from hapticbridge.device import Device
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
 from hapticbridge.record import TickFlag
+from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.scene import Scene
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import (
     IdentifiedDevice,
@@ -119,6 +124,7 @@ def what_if(
     changes: Mapping[str, Value],
     *,
     strict: bool = False,
+    in_process: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> WhatIf:
     """Simulates a recorded run again with a changed bridge.
@@ -133,6 +139,7 @@ def what_if(
         changes: New values by name: ``settings.UNITS``, or the scene's own parameters. Without
             changes the prescribed run equals the recorded one in every bit.
         strict: As for ``audit``.
+        in_process: As for ``audit``.
         progress: Called with the number of runs done, their total, and the name of the next one.
 
     Raises:
@@ -141,7 +148,8 @@ def what_if(
     """
     progress = progress or (lambda _done, _total, _name: None)
     progress(0, 4, "auditing what was recorded")
-    report = audit(path, strict=strict)
+    judge = partial(audit, strict=strict, in_process=in_process)
+    report = judge(path)
     if report.verdict == "invalid":
         raise RecordingError(f"an invalid recording cannot be simulated again: {report.reason}")
     recording = read_recording(path)
@@ -153,7 +161,12 @@ def what_if(
                 f"'{recording.path}' has {len(run.ticks)} ticks; a what-if needs 3"
             )
         file = folder / "run.mcap"
-        return _Experiment(run, report, file, progress, strict).changed(changes)
+        return _Experiment(run, report, file, progress, judge, in_process).changed(changes)
+
+
+START_TIME, MOST_TIMES = 40.0, 100.0
+"""Processor time in s for the start of a bridge, which rehearses slow scenes for up to 37 s; and
+largest work of a changed run relative to the recorded one."""
 
 
 @dataclass(slots=True)
@@ -164,7 +177,8 @@ class _Experiment:
     report: AuditReport
     path: Path
     progress: Callable[[int, int, str], None]
-    strict: bool
+    judge: Callable[[Path], AuditReport]
+    in_process: bool
     concerns: dict[str, None] = field(default_factory=dict)
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
@@ -173,7 +187,7 @@ class _Experiment:
         new = settings.changed(changes)
         is_changed = new != settings
         notes = []
-        if not run.is_scene_as_recorded():
+        if not self._is_scene_as_recorded():
             notes.append(
                 "the attached scene does not compile to the recorded model: a program changed it "
                 "after loading, or it was compiled elsewhere; these runs lack that change"
@@ -217,22 +231,63 @@ class _Experiment:
         run = self.run
         if settings.rate == run.settings.rate:
             clock = RecordedClock(run.ticks, run.period)
-            return self._simulated(PRESCRIBED, RecordedMotion(run, clock), clock, settings)
-        return self._simulated(PRESCRIBED, ResampledMotion(run), SimulatedClock(), settings)
+            device = RecordedMotion(run, clock)
+            return self._simulated(PRESCRIBED, lambda _: device, clock, settings)
+        resampled = ResampledMotion(run)
+        return self._simulated(PRESCRIBED, lambda _: resampled, SimulatedClock(), settings)
 
     def _closed(self, settings: Settings) -> WhatIfRun:
-        scene = self.run.scene(settings)
-        device = IdentifiedDevice(self.run, scene_hand(scene.model, scene.path))
+        def device(scene: Scene) -> Device:
+            return IdentifiedDevice(self.run, scene_hand(scene.model, scene.path))
+
         return self._simulated(CLOSED, device, SimulatedClock(), settings)
 
-    def _simulated(self, name: str, device: Device, clock: Clock, settings: Settings) -> WhatIfRun:
-        repetition, path = Repetition(self.run, settings), self.path
-        period, trip = repetition.into(path, device, clock)
-        if settings != self.run.settings:
-            self.concerns |= dict.fromkeys(repetition.warned)
+    def _simulated(
+        self, name: str, device_in: Callable[[Scene], Device], clock: Clock, settings: Settings
+    ) -> WhatIfRun:
+        run, path = self.run, self.path
+
+        def work(worker: Worker) -> object:
+            scene = run.scene(settings)
+            worker.allow_run()
+            repetition = Repetition(run, settings)
+            period, trip = repetition.into(path, device_in(scene), clock)
+            return period, trip, repetition.warned
+
+        old = run.settings
+        steps = settings.rate * settings.substeps / (old.rate * old.substeps)
+        period, trip, warned = self._in_bounds(work, max(1.0, steps))
+        if settings != run.settings:
+            self.concerns |= dict.fromkeys(map(str, warned))
         recording = read_recording(path)
-        report = audit(path, strict=self.strict)
-        return WhatIfRun(name, report, self._peaks(recording.ticks), trip, period, recording)
+        report = self.judge(path)
+        return WhatIfRun(
+            name, report, self._peaks(recording.ticks), str(trip), float(period), recording
+        )
+
+    def _is_scene_as_recorded(self) -> bool:
+        recording, parameters = self.run.recording, self.run.parameters
+        return bool(
+            self._in_bounds(
+                lambda _: is_as_recorded(compile_recorded(recording, parameters), recording)
+            )
+        )
+
+    def _in_bounds(self, work: Work, times: float = 1.0) -> Any:
+        """Does work with the run's scene in a child process with limits (``confinement``).
+
+        ``times`` is the work relative to a simulation of the recorded run.
+        """
+        run = self.run
+        bounds = bounds_for(run.recording, run.parameters)
+        return in_bounds(
+            work,
+            f"the scene of '{run.recording.path}'",
+            trusted=self.in_process,
+            seconds=START_TIME + min(times, MOST_TIMES) * bounds["seconds"],
+            reads=bounds["reads"],
+            writes=(self.path.parent,),
+        )
 
     def _agreement(self) -> str:
         found = compare(self.run.recording.path, self.path)

@@ -6,21 +6,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from audit_cases import tapped
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.device import DeviceInfo
+from hapticbridge.commands.command import command_of
+from hapticbridge.confinement import unpacked
+from hapticbridge.device import DeviceInfo, spacemouse
+from hapticbridge.device.falcon.protocol import read_firmware
+from hapticbridge.device.pid.reports import has_force_feedback
 from hapticbridge.device.profile import read_profile
+from hapticbridge.device.rawhid import protocol as rawhid
 from hapticbridge.device.trajectory import read_motion
+from hapticbridge.device.transport import websocket
+from hapticbridge.device.transport.hid_descriptor import fields_of
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import GuardParameters
+from hapticbridge.recorded_scene import recorded_values
 from hapticbridge.recording import read_recording
-from hapticbridge.scene import scene_parameters
+from hapticbridge.scene import scene_parameters, settings_from
 from hapticbridge.scene.source import read_elements, refuse_outside
+from hapticbridge.view.window import Address
+from hapticbridge.whatif import changes_from
 
 SEEDS = (
     b"a=" + b"[" * 100_000,
@@ -37,6 +48,9 @@ WORDS = st.sampled_from(
     (
         *(b"[parameters.a]\n", b"unit='m'\n", b"default=", b"sets=[{kind='geom'}]\n", b"1e999"),
         *(b"<mujoco>", b"<mesh file='", b"/dev/zero", b"'/>", b"<!--", b"-->", b"&#47;"),
+        *(b"\x05\x01\x09\x04", b"\xa1\x01", b"\x75\x10\x95\x06\x81\x02", b"\xc0", b"\x27\xff"),
+        *(b"localhost:8080\n", b"http://localhost:8080", b"token=", b"/?token=", b"[::1]"),
+        *(b'{"command":"', b'stop"', b'{"array of bytes":["<f8",', b"2,3]}", b"clearance=", b"1e"),
         *(b'{"damping":', b"null", b"NaN", b"}", b"t,x,y,z,qw,qx,qy,qz\n", b"0,", b"\n", b"\0"),
     )
 )
@@ -63,6 +77,31 @@ def recording(data: bytes, folder: Path) -> None:
     read_recording(folder / "run.mcap")
 
 
+def firmware(data: bytes, folder: Path) -> None:
+    (folder / "nvent_firmware.bin").write_bytes(data)
+    assert read_firmware(str(folder / "nvent_firmware.bin")) == data
+
+
+def request(data: bytes, _: Path) -> None:
+    """No request enters without the token, however its host, origin, cookie and path read."""
+    token = "5" * 32
+    path, *values = data.decode("latin-1").split("\n")
+    names = ("Host", "Origin", "Cookie", "Host".lower())
+    assume(token not in data.decode("latin-1"))
+    assert Address(8080, token).refusal(path, dict(zip(names, values, strict=False)))
+
+
+def answer(data: bytes, _: Path) -> None:
+    """A damaged answer of a child process is a ValueError, which its reader takes for one."""
+    half = len(data) // 2
+    with suppress(ValueError, TypeError, RecursionError):
+        unpacked(data[:half], data[half:])
+
+
+def text_of(data: bytes) -> str:
+    return data.decode(errors="replace")
+
+
 PARSERS: dict[str, Callable[[bytes, Path], object]] = {
     "scene parameters": toml,
     "device profile": profile,
@@ -70,8 +109,20 @@ PARSERS: dict[str, Callable[[bytes, Path], object]] = {
     "recording": recording,
     "elements": lambda data, _: list(read_elements(data)),
     "file names": lambda data, _: refuse_outside(data, "main.xml"),
-    "guard": lambda data, _: GuardParameters.from_json(data.decode(errors="replace")),
-    "device": lambda data, _: DeviceInfo.from_json(data.decode(errors="replace")),
+    "guard": lambda data, _: GuardParameters.from_json(text_of(data)),
+    "device": lambda data, _: DeviceInfo.from_json(text_of(data)),
+    "scene values": lambda data, _: recorded_values({"scene_parameters": text_of(data)}),
+    "settings": lambda data, _: settings_from(text_of(data).split()),
+    "changes": lambda data, _: changes_from(tuple(text_of(data).split())),
+    "firmware": firmware,
+    "report descriptor": lambda data, _: fields_of(data),
+    "force feedback": lambda data, _: has_force_feedback(data),
+    "raw frame": lambda data, _: rawhid.decoded(data),
+    "report of a mouse": lambda data, _: spacemouse.decoded(data),
+    "message of a server": lambda data, _: websocket.decoded(text_of(data), "it"),
+    "command": lambda data, _: command_of(data),
+    "request": request,
+    "answer": answer,
 }
 
 

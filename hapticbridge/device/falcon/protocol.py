@@ -237,14 +237,15 @@ def read_firmware(path: str) -> bytes:
         DeviceError: The file does not exist, cannot be read, or has an impossible size.
     """
     try:
-        image = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            image = file.read(LARGEST_FIRMWARE + 1)  # a device gives bytes without end
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise DeviceError(f"firmware = '{path}': cannot be read ({reason})") from None
     if not 0 < len(image) <= LARGEST_FIRMWARE:
         raise DeviceError(
-            f"firmware = '{path}': has {len(image)} bytes; a Falcon's firmware has 1 to "
-            f"{LARGEST_FIRMWARE}"
+            f"firmware = '{path}': has {'no' if not image else 'too many'} bytes; a Falcon's "
+            f"firmware has 1 to {LARGEST_FIRMWARE}"
         )
     return image
 
