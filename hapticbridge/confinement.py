@@ -84,7 +84,7 @@ def packed(kind: int, value: object) -> list[bytes | memoryview]:
     def placed(item: object) -> object:
         if isinstance(item, np.ndarray):
             item = np.ascontiguousarray(item)
-            pieces.append(memoryview(item).cast("B") if item.size else b"")
+            pieces.append(item.data.cast("B") if item.size else b"")
             return {_ARRAY: [item.dtype.str, *item.shape]}
         if isinstance(item, bytes):
             pieces.append(item)

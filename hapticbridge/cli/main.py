@@ -50,7 +50,13 @@ class, without importing it. The class has the command's name with a capital."""
 _HEADINGS = {"run": "Scenes", "audit": "Recordings", "devices": "Devices", "bound": "Theory"}
 """Headings of the top-level help, by the command below."""
 
-_MODULES = {"compare": "recordings", "export": "recordings", "repair": "audit", "bound": "zwidth"}
+_MODULES = {
+    "compare": "recordings",
+    "export": "recordings",
+    "repair": "audit",
+    "render": "view",
+    "bound": "zwidth",
+}
 """Modules of commands that share one; any other command has a module of its name."""
 
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)

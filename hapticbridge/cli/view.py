@@ -1,16 +1,18 @@
-"""``hapticbridge view``."""
+"""``hapticbridge view`` and ``hapticbridge render``."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from hapticbridge.cli.terminal import notify, progress
+from hapticbridge.cli.terminal import err, notify, out, plain, progress
+from hapticbridge.errors import RecordingError
+from hapticbridge.film import Shot, draw
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
 
@@ -49,4 +51,55 @@ class View:
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()
+        return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Render:
+    """Draw a recorded run: a picture, or a film of it.
+
+    No display is needed: EGL or OSMesa draws, and MUJOCO_GL chooses between them. The handle is a
+    ghost, the coupling a line that turns red with the force on the tool. The orange arrow is the
+    force on the hand, turquoise ones are contact forces.
+
+    Examples:
+        hapticbridge render run.mcap run.png --at 2.5
+        hapticbridge render run.mcap run.mp4
+        hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1
+    """
+
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    """The recording (.mcap)."""
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
+    """The picture (.png), or the film (.mp4, extra 'view')."""
+    at: float | None = None
+    """Time of a picture in s from the start of the run; by default its last tick."""
+    start: float = 0.0
+    """Start of a film in s of the run."""
+    stop: float | None = None
+    """End of a film in s of the run; by default the run's end."""
+    speed: float = 1.0
+    """Speed of a film: 0.1 shows a second of the run in ten."""
+    camera: str | None = None
+    """A camera of the scene, by name; by default the free one, as the scene's file sets it."""
+    width: int = 800
+    """Width in pixels, even."""
+    height: int = 600
+    """Height in pixels, even."""
+    fps: int = 30
+    """Frames per second of a film."""
+    overwrite: bool = False
+    """Replace the picture or film if the file exists."""
+
+    in_process: bool = False
+    """Simulate without limits on memory and time, for a recording of a known origin."""
+
+    def execute(self) -> int:
+        """Draws; returns the exit code."""
+        if self.output.exists() and not self.overwrite:
+            raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
+        shot = Shot(**{field.name: getattr(self, field.name) for field in fields(Shot)})
+        with err.status("drawing …"), progress("drawing") as show:
+            renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
+        out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")
         return 0

@@ -145,12 +145,16 @@ class Sight:
             RecordingError: They are no instant of a scene of so many bodies and tendons.
         """
         try:
-            time, places, turns, *vectors, where, forces, lines = parts
+            time, places, turns, handle, handle_turn, grip, hand, tool, where, forces, lines = parts
             return cls(
                 float(checked(np.array(time))),
                 checked(places, bodies, 3),
                 checked(turns, bodies, 4),
-                *(checked(each, side) for each, side in zip(vectors, (3, 4, 3, 3, 3), strict=True)),
+                checked(handle, 3),
+                checked(handle_turn, 4),
+                checked(grip, 3),
+                checked(hand, 3),
+                checked(tool, 3),
                 checked(where, None, 3),
                 checked(forces, len(where), 3),
                 tuple(
