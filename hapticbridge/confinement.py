@@ -44,7 +44,7 @@ from hapticbridge.errors import (
 if sys.platform != "win32":
     import resource
 
-MEMORY = 700 << 20
+MEMORY = 640 << 20
 """Memory in bytes that foreign work may take beyond the present process. A scene with large meshes
 compiles in half of it; with more, a hostile scene could take a small machine's memory."""
 

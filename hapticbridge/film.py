@@ -6,6 +6,7 @@ process draws (``film_process``). It reads one job in a line of JSON and answers
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -30,6 +31,10 @@ ENDINGS = (".mp4", ".png")
 
 PATIENCE = 120.0
 """Longest wait for a renderer in s. A machine that compiles the code first needs half a minute."""
+
+LONGEST_LINE = 1 << 16
+"""Characters of an answer of the drawing process. A longer line is no answer, and would take this
+process's memory."""
 
 MAX_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
@@ -207,6 +212,8 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
         stderr=subprocess.DEVNULL,
         env=environment,
         text=True,
+        encoding="utf-8",
+        errors="replace",
     )
     watch = _Watch(process)
     what = f"the scene of '{job['recording']}'"
@@ -264,8 +271,10 @@ class _Watch:
 
 
 def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:
-    for line in lines:
+    while line := lines.readline(LONGEST_LINE):
+        answer = None
         if line.startswith("{"):  # drivers print, too
-            answer = json.loads(line)
-            if isinstance(answer, dict):
-                yield answer
+            with contextlib.suppress(ValueError, RecursionError):
+                answer = json.loads(line)
+        if isinstance(answer, dict):
+            yield answer

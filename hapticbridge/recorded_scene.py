@@ -104,6 +104,9 @@ def load_machine_code(name: str, contact: str) -> None:
 
 # Scene from its sources
 
+MOST_STEPS = 4
+"""Names that one path is joined from: asset folder, name in an include, in a model, in a file."""
+
 
 def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
     """Writes a recording's scene files to a folder; returns the main file.
@@ -114,10 +117,19 @@ def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
         RecordingError: The recording carries no scene, or files that cannot be written there.
     """
     main: Path | None = None
-    for name, data in recording.attachments.items():
-        if not name.startswith(SOURCE_PREFIX):
-            continue
-        inner = PurePosixPath(name.removeprefix(SOURCE_PREFIX))
+    files = {
+        name: (PurePosixPath(name.removeprefix(SOURCE_PREFIX)), data)
+        for name, data in recording.attachments.items()
+        if name.startswith(SOURCE_PREFIX)
+    }
+    climbs = [
+        refuse_outside(data, inner.as_posix())
+        for inner, data in files.values()
+        if inner.suffix != ".toml"
+    ]
+    # a name may be taken relative to another file and to an asset folder that climbs, too
+    folder = folder.joinpath(*MOST_STEPS * max(climbs, default=0) * ["inner"])
+    for name, (inner, data) in files.items():
         # a foreign recording must not write outside the folder
         if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:
             raise RecordingError(
@@ -127,13 +139,12 @@ def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise RecordingError(
-                f"the attachment {name!r:.80} cannot be unpacked: {error}"
+                f"the attachment {name!r:.80} cannot be unpacked: {reason}"
             ) from None
         main = main or path
-        if inner.suffix != ".toml":
-            refuse_outside(data, inner.as_posix())
     if main is None:
         raise RecordingError(f"{recording.path} carries no scene, so it cannot be simulated again")
     return main
@@ -179,11 +190,11 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
     Raises:
         RecordingError: The recording carries no scene, or it cannot be compiled or prepared.
     """
-    folder = ""
+    home = ""
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
             main = unpack_scene(recording, Path(folder))
-            meta = recording.meta
+            home, meta = f"{main.parent}/", recording.meta
             scene = load_unpacked(main, parameters.grip, recorded_values(meta), meta)
             requested, method = requested_of(meta), method_of(meta)
             steps = parameters.period, parameters.substeps
@@ -192,7 +203,7 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
     except RecordingError:
         raise
     except HapticBridgeError as error:
-        reason = str(error).replace(f"{folder}/", "")
+        reason = str(error).replace(home, "") if home else str(error)
         raise RecordingError(f"the attached scene does not fit the metadata: {reason}") from None
     return scene
 

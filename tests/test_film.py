@@ -171,6 +171,24 @@ def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
         Stage(rewritten(recording, tmp_path / "old.mcap", meta={"versions": versions}))
 
 
+BABBLE = """
+import json, sys
+job = json.loads(sys.stdin.readline())
+sys.stdout.buffer.write(b'{"ready": true}\\n\\xff\\n{"a\\n[1]\\n' + b'{"a":' * 100_000 + b'\\n')
+open(job["out"], "wb").write(b"drawn")
+print('{"done": true}')
+"""
+"""A driver that prints what is no answer; a process that a scene took over might."""
+
+
+def test_what_is_no_answer_of_the_drawing_process_is_passed_over(
+    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.film._BOOTSTRAP", BABBLE)
+    draw(sway, tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes() == b"drawn"
+
+
 def test_where_no_renderer_works_a_sentence_says_what_to_install(
     sway: Path, call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

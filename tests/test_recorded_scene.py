@@ -316,6 +316,61 @@ def test_a_scene_names_only_files_of_its_own_folder(text: str, is_refused: bool)
     refuse_outside(b"<mesh file='../shared/a.stl'/>", "scenes/main.xml")
 
 
+def test_names_that_climb_by_steps_do_not_leave_the_folder_in_this_process_either(
+    honest: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An include that lies deep may climb; MuJoCo takes its names from the main file's folder."""
+    (tmp_path / "secret.xml").write_text("<mujoco><asset/></mujoco>")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "inner"))
+    (tmp_path / "inner").mkdir()
+    deep = "a/b/c/d.xml"
+    main = before_world(f'<include file="{deep}"/>'.encode())(honest.attachments[SCENE])
+    for target, is_read in (("../../secret.xml", False), ("a/own.xml", True)):
+        files = {
+            SCENE: main,
+            f"{SOURCE_PREFIX}a/own.xml": b"<mujoco><asset/></mujoco>",
+            SOURCE_PREFIX + deep: f'<mujoco><include file="{target}"/></mujoco>'.encode(),
+        }
+        path = rewritten(honest, tmp_path / "a.mcap", attachments=files)
+        if is_read:
+            assert audit(path, in_process=True).resimulation == "bit for bit"
+        else:
+            reason = audit(path, in_process=True).reason
+            assert "cannot read scene" in reason and "secret.xml" in reason
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("a\0b", "null byte"),
+        ("a/../../b", "outside the scene's folder"),
+        ("/etc/b", "outside the scene's folder"),
+        ("a/" * 1500 + "b", "cannot be unpacked"),
+        (".", "cannot be unpacked: Is a directory"),
+        ("peg_in_hole.xml/b", "cannot be unpacked: "),
+    ],
+)
+def test_an_attachment_that_cannot_lie_in_the_folder_is_named(
+    name: str, words: str, honest: Recording, tmp_path: Path
+) -> None:
+    path = rewritten(honest, tmp_path / "a.mcap", attachments={SOURCE_PREFIX + name: b"x"})
+    reason = told(path)
+    assert words in reason and "\n" not in reason and "/tmp" not in reason.replace(str(path), "")
+
+
+def test_attachments_named_as_modules_are_not_imported(honest: Recording, tmp_path: Path) -> None:
+    code = f"open({str(tmp_path / 'imported')!r}, 'w')".encode()
+    names = ("numpy.py", "mujoco/__init__.py", "encodings.py", "sitecustomize.py")
+    path = rewritten(
+        honest,
+        tmp_path / "a.mcap",
+        attachments={**{SOURCE_PREFIX + name: code for name in names}, "json.py": code},
+    )
+    assert audit(path).resimulation == "bit for bit"
+    assert audit(path, in_process=True).resimulation == "bit for bit"
+    assert not (tmp_path / "imported").exists()
+
+
 # Child process
 
 
@@ -364,7 +419,7 @@ def answer(data: bytes) -> Callable[[object], None]:
     ("work", "words"),
     [
         (crash, r"crashed MuJoCo \(SIGSEGV\)"),
-        (lambda _: np.ones(1 << 28).sum(), "needs more than 700 MB of memory"),
+        (lambda _: np.ones(1 << 28).sum(), "needs more than 640 MB of memory"),
         (spin, "needs too much processor time"),
         (lambda _: time.sleep(1e3), "needs more than 1 s"),
         (lambda _: sys.exit(9), "made MuJoCo fail: SystemExit: 9"),

@@ -72,7 +72,7 @@ def warnings_in_a_sentence() -> Iterator[None]:
 
 
 def _print_mujoco_warning(message: str) -> None:
-    err.print(f"[yellow]MuJoCo warns:[/yellow] {escape(message)}")
+    err.print(f"[yellow]MuJoCo warns:[/yellow] {plain(' '.join(message.splitlines()))}")
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:

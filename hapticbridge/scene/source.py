@@ -101,8 +101,10 @@ _FILE_NAME = re.compile(
 )
 
 
-def refuse_outside(data: bytes, name: str) -> None:
+def refuse_outside(data: bytes, name: str) -> int:
     """Refuses a file of a foreign scene that names files outside the scene's folder.
+
+    Returns the largest number of ``..`` in one name.
 
     Every text that looks like a file's name counts, also in a comment: this pattern and MuJoCo's
     parser need not agree on what a comment is.
@@ -116,15 +118,17 @@ def refuse_outside(data: bytes, name: str) -> None:
     """
     text = data.decode("utf-8-sig", errors="replace")
     names = {unescape(double or single) for double, single in _FILE_NAME.findall(text)}
-    depth = name.count("/")
+    depth, climb = name.count("/"), 0
     for found in names:
         parts = found.replace("\\", "/").split("/")
+        climb = max(climb, parts.count(".."))
         is_absolute = found[:1] in ("/", "\\", "~") or ":" in parts[0]
         if is_absolute or parts.count("..") > depth:
             raise SceneError(
                 f"'{name}' names the file '{found:.80}', which lies outside the scene's folder; a "
                 "recording's scene may only name its own files"
             )
+    return climb
 
 
 def read_elements(data: bytes) -> Iterator[Element]:

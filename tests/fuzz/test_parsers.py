@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from audit_cases import tapped
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hapticbridge.commands.command import command_of
@@ -87,7 +87,8 @@ def request(data: bytes, _: Path) -> None:
     token = "5" * 32
     path, *values = data.decode("latin-1").split("\n")
     names = ("Host", "Origin", "Cookie", "Host".lower())
-    assume(token not in data.decode("latin-1"))
+    if token in data.decode("latin-1"):
+        return
     assert Address(8080, token).refusal(path, dict(zip(names, values, strict=False)))
 
 
