@@ -240,9 +240,9 @@ def test_the_device_is_closed_before_the_recorder_is_waited_for(
     order: list[str] = []
     usual = Recorder.close
 
-    def noted(recorder: Recorder) -> None:
+    def noted(recorder: Recorder, *signer: Any) -> None:
         order.append("recorder")
-        usual(recorder)
+        usual(recorder, *signer)
 
     monkeypatch.setattr(Recorder, "close", noted)
     device = ScriptedDevice(sway, on_close=lambda: order.append("device"))

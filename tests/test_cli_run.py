@@ -152,10 +152,12 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
     monkeypatch.setattr("hapticbridge.view.window.check_view", lambda: None)
     monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", SPECTATOR)
     run = ("run", "point_mass", "--fast", "--overwrite", "--view", "--port", 0)
-    began = time.monotonic()
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: ScriptedDevice(still))
-    assert call(*run, "--record", tmp_path / "first.mcap", "--duration", 0.01)[0] == 0
-    usual, generator = time.monotonic() - began, np.random.default_rng(8)
+    for _ in range(2):  # the first one compiles
+        began = time.monotonic()
+        assert call(*run, "--record", tmp_path / "first.mcap", "--duration", 0.01)[0] == 0
+        usual = time.monotonic() - began
+    generator = np.random.default_rng(8)
     early, before = 0, children(os.getpid())
     for number, moment in enumerate(generator.uniform(0.0, 1.1 * usual, MOMENTS)):
         path, device = tmp_path / f"{number}.mcap", ScriptedDevice(still)

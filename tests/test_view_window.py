@@ -78,6 +78,7 @@ class SayingProcess:
 
     def __init__(self, said: bytes) -> None:
         self.is_heard, self.is_told = threading.Event(), threading.Event()
+        self.returncode: int | None = None
         lines = [b'{"url": "u"}\n', *said.splitlines(keepends=True)]
         self.stdout = types.SimpleNamespace(readline=self.readline, close=lambda: None)
         self.stdin = types.SimpleNamespace(
@@ -97,6 +98,7 @@ class SayingProcess:
     def wait(self, _timeout: float) -> None:
         """Ends when it is told no more."""
         self.is_told.wait(PATIENCE)
+        self.returncode = 0
 
 
 @pytest.mark.parametrize(
