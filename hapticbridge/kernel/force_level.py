@@ -49,6 +49,7 @@ LEVEL_DTYPE = np.dtype(
         ("previous", "<f8", 2),
         ("compliance", "<f8", 2),
         ("is_solved", "<i8"),
+        ("reads_poses", "<i8"),
         ("repetitions", "<i8"),
         ("state_before", "<i8"),
         ("flags", "<i8"),
@@ -56,8 +57,9 @@ LEVEL_DTYPE = np.dtype(
 )
 """Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
 the tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
-``compliance`` σ; ``is_solved`` is 1 if steps are repeated; ``repetitions`` counts them since the
-start; ``state_before`` is the address of MuJoCo's state before the step."""
+``compliance`` σ. ``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins
+or a callback read the bodies' poses then; ``repetitions`` counts repetitions since the start;
+``state_before`` is the address of MuJoCo's state before the step."""
 
 
 def bind_level(
@@ -74,6 +76,9 @@ def bind_level(
     level["level"] = levels
     level["share"] = level["previous"] = 1.0
     level["is_solved"] = is_solved
+    level["reads_poses"] = (
+        model.nsensor > 0 or model.nplugin > 0 or mujoco.get_mjcb_control() is not None
+    )
     before = np.zeros(model.nq + model.nv + model.na + model.nhistory + 1)
     level["state_before"] = before.ctypes.data
     return {"state_before": before}
@@ -105,6 +110,14 @@ def _copy_state(s: State, is_kept: bool) -> None:
 def keep_state(s: State) -> None:
     """Keeps MuJoCo's state before a step, for a repetition of the step."""
     _copy_state(s, True)
+
+
+@compiled
+def _has_loaded_body(s: State) -> bool:
+    found = False
+    for value in floats(s.mj.xfrc_applied, 6 * s.mj.nbody):
+        found = found or value != 0.0
+    return found
 
 
 @compiled
@@ -187,7 +200,8 @@ def solve_level(s: State) -> bool:
         set_gains(s, 1.0)
         if count == 0:
             _copy_state(s, False)
-            mj_kinematics(s.mj.model, s.mj.data)  # forces on bodies act at the start's positions
+            if level.reads_poses or _has_loaded_body(s):  # which act at the start's positions
+                mj_kinematics(s.mj.model, s.mj.data)
         _repeat_step(s)
         spend_within_tank(s)
         count += 1
