@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import os
 import resource
 import signal
@@ -25,7 +27,7 @@ from cli_cases import Called
 from hapticbridge import confinement
 from hapticbridge.audit import audit
 from hapticbridge.audit.replay import Resimulator
-from hapticbridge.confinement import ForeignSceneError, Worker, in_bounds
+from hapticbridge.confinement import ForeignSceneError, Worker, in_bounds, unpacked
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError, SceneError
 from hapticbridge.film import Shot, still
 from hapticbridge.recorded_scene import compile_recorded
@@ -486,6 +488,62 @@ def test_a_child_reads_only_what_it_is_given_and_has_no_network(tmp_path: Path) 
         assert not found["service"]
     assert tried(secret.read_text)
     assert tried(lambda: socket.socket(socket.AF_UNIX).close())
+
+
+def error_of(action: Callable[[], object]) -> int:
+    """Returns the number of the error in which an action ends; 0 without one."""
+    try:
+        action()
+    except OSError as error:
+        return error.errno or -1
+    return 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the numbers are Linux'")
+def test_a_child_has_few_and_small_files_no_dump_and_no_descriptor_of_this_process(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(confinement, "LARGEST_FILE", 1 << 20)
+    monkeypatch.setattr(confinement, "MOST_FILES", 64)
+    libc = ctypes.CDLL(None, use_errno=True)
+    io_uring_setup, get_death_signal = 425, 2
+
+    def work(worker: Worker) -> dict[str, int]:
+        large = Path(tempfile.mkdtemp(), "large")
+        signal_of_death = ctypes.c_int()
+        libc.prctl(get_death_signal, ctypes.byref(signal_of_death), 0, 0, 0)
+        libc.syscall(io_uring_setup, 1, None)
+        return {
+            "io_uring": ctypes.get_errno() if worker.means["a filter of sockets"] else errno.EPERM,
+            "death": signal_of_death.value,
+            "foreign": error_of(lambda: os.fstat(mine.fileno())),
+            "size": error_of(lambda: large.write_bytes(bytes(1 << 21))),
+            "count": error_of(lambda: [os.dup(1) for _ in range(100)]),
+            "dump": resource.getrlimit(resource.RLIMIT_CORE)[0],
+            "alone": int(Path("/proc/self/ns/net").readlink() == network)
+            if worker.means["a network of its own"]
+            else 0,
+        }
+
+    network = Path("/proc/self/ns/net").readlink()
+    with (tmp_path / "mine").open("w") as mine:
+        found = in_bounds(work, "it")
+    assert found == {
+        "io_uring": errno.EPERM,
+        "death": signal.SIGKILL,
+        "size": errno.EFBIG,
+        "count": errno.EMFILE,
+        "foreign": errno.EBADF,
+        "dump": 0,
+        "alone": 0,
+    }
+
+
+@pytest.mark.parametrize("kind", ["|O8", "<U4", "<M8[s]"])
+def test_an_answer_holds_numbers_alone(kind: str) -> None:
+    text = b'{"array of bytes": ["%s", 1]}' % kind.encode()
+    with pytest.raises(ValueError, match=r"an array holds no numbers|not understood"):
+        unpacked(text, bytes(64))
 
 
 def test_the_audit_is_the_same_where_the_kernel_has_no_such_means(
