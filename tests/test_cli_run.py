@@ -151,6 +151,7 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
 ) -> None:
     monkeypatch.setattr("hapticbridge.view.window.check_view", lambda: None)
     monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", SPECTATOR)
+    monkeypatch.setattr("hapticbridge.view.window.PATIENCE", 0.05)  # it does not end by itself
     run = ("run", "point_mass", "--fast", "--overwrite", "--view", "--port", 0)
     monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: ScriptedDevice(still))
     for _ in range(2):  # the first one compiles

@@ -384,17 +384,17 @@ class Run:
         if self.port is not None and not self.view:
             raise HapticBridgeError("--port without --view has no effect")
         window = self._window() if self.view else None
-        with err.status("reading and trying the scene …"):
-            with compiling(self.scene):
-                source = read_scene(self.scene, **settings_from(self.settings))
-                scene = compile_scene(source, self.grip, as_is=self.as_is)
-            chosen = (
-                self
-                if self.substeps is not None
-                else replace(self, substeps=self._own_substeps(source, scene))
-            )
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
+            with err.status("reading and trying the scene …"):
+                with compiling(self.scene):
+                    source = read_scene(self.scene, **settings_from(self.settings))
+                    scene = compile_scene(source, self.grip, as_is=self.as_is)
+                chosen = (
+                    self
+                    if self.substeps is not None
+                    else replace(self, substeps=self._own_substeps(source, scene))
+                )
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
             return chosen._feel(scene, device, clock, stack, window, interrupts)
