@@ -23,10 +23,15 @@ from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
-from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import check_prepared, method_named, prepare, static_load
+from hapticbridge.rendering import (
+    check_prepared,
+    method_named,
+    prepare,
+    static_load,
+    unguarded_parameters,
+)
 from hapticbridge.run_description import (
     CARRIED,
     SOURCE_PREFIX,
@@ -73,23 +78,7 @@ def load_machine_code(name: str, contact: str) -> None:
         warnings.simplefilter("ignore")
         scene = load_scene("point_mass")
     try:
-        effective = prepare(scene, coupling, period, 1, method, warns=False)
-        parameters = RunParameters(
-            grip=scene.grip,
-            period=period,
-            substeps=1,
-            coupling=method.law_coupling(coupling, period),
-            force_limit=1.0,
-            torque_limit=1.0,
-            ramp_ticks=0,
-            device_origin=IDENTITY_POSE,
-            handle_origin=scene.grip_pose(),
-            device_start=IDENTITY_POSE,
-            scheme=method.scheme,
-            is_rigid=method.is_rigid,
-            effective=effective,
-            contact_stiffness=0.0 if method.has_coupling else coupling.stiffness,
-        )
+        parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
         kernel = BoundKernel(scene.model, scene.data, parameters)

@@ -475,6 +475,46 @@ def prepare(
     return effective
 
 
+UNLIMITED = 1e30
+"""Force in N and torque in N m of a device without limits; infinity is no limit of a run."""
+
+
+def unguarded_parameters(
+    scene: Scene, coupling: Coupling, period: float, substeps: int, method: Method
+) -> RunParameters:
+    """Prepares a scene for a handle without a device, and returns the parameters of its run.
+
+    Nothing limits the wrench, and no guard acts. The samples are poses relative to the grip's.
+
+    Args:
+        scene: Changed in place, as by ``prepare``.
+        coupling: The requested coupling.
+        period: T in s.
+        substeps: MuJoCo steps per tick.
+        method: The rendering method.
+
+    Raises:
+        SceneError: As for ``prepare``.
+    """
+    effective = prepare(scene, coupling, period, substeps, method, warns=False)
+    return RunParameters(
+        grip=scene.grip,
+        period=period,
+        substeps=substeps,
+        coupling=method.law_coupling(coupling, period / substeps),
+        force_limit=UNLIMITED,
+        torque_limit=UNLIMITED,
+        ramp_ticks=0,
+        device_origin=IDENTITY_POSE,
+        handle_origin=scene.grip_pose(),
+        device_start=IDENTITY_POSE,
+        scheme=method.scheme,
+        is_rigid=method.is_rigid,
+        effective=effective,
+        contact_stiffness=resolve_contact_stiffness(method, coupling, None),
+    )
+
+
 AT_REST = 1e-6
 """Largest acceleration in m/s² or rad/s² of a tool that rests without a hand. Rounding leaves less;
 a smaller value would start every scene by looking for a load of nothing."""

@@ -176,37 +176,30 @@ class Parts:
 Forge = Callable[[Bench, Path], Path]
 
 
-def but(name: str, change: Callable[[Parts], object]) -> Forge:
-    """Changes the records and writes the seal anew, with one hash left as it was."""
+def changed(change: Callable[[Parts], object], write: Callable[[Parts, Path], Path]) -> Forge:
+    """Changes the records and writes them."""
 
     def forge(bench: Bench, path: Path) -> Path:
         parts = Parts.of(bench.run)
         change(parts)
-        return parts.sealed_but(name, path)
+        return write(parts, path)
 
     return forge
+
+
+def but(name: str, change: Callable[[Parts], object]) -> Forge:
+    """Changes the records and writes the seal anew, with one hash left as it was."""
+    return changed(change, lambda parts, path: parts.sealed_but(name, path))
 
 
 def kept(change: Callable[[Parts], object]) -> Forge:
     """Changes the records; the seal stays."""
-
-    def forge(bench: Bench, path: Path) -> Path:
-        parts = Parts.of(bench.run)
-        change(parts)
-        return parts.write(path)
-
-    return forge
+    return changed(change, Parts.write)
 
 
 def anew(change: Callable[[Parts], object]) -> Forge:
     """Changes the records and writes the seal anew, with the old signature."""
-
-    def forge(bench: Bench, path: Path) -> Path:
-        parts = Parts.of(bench.run)
-        change(parts)
-        return parts.sealed(path)
-
-    return forge
+    return changed(change, Parts.sealed)
 
 
 def content(change: Callable[[Recording], Mapping[str, Any]], source: str = "run") -> Forge:

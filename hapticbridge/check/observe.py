@@ -21,9 +21,8 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
-from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import RIGID, default_method, prepare
+from hapticbridge.rendering import RIGID, default_method, unguarded_parameters
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
 
@@ -164,9 +163,6 @@ def _trees_of_tendon(model: mujoco.MjModel, tendon: int) -> set[int]:
 
 # Rehearsal of a scene under a motion
 
-_UNLIMITED = 1e30
-"""Force limit in N and torque limit in N m without effect, because the full force is compared."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Playback:
@@ -259,26 +255,13 @@ def rehearsal_parameters(scene: Scene, setting: Setting) -> RunParameters:
     Raises:
         SceneError: A value is out of range.
     """
-    coupling, period, substeps = setting.coupling, setting.period, setting.substeps
+    substeps = setting.substeps
     method = default_method(substeps).with_contact(setting.contact)
-    prepare(scene, coupling, period, substeps, method, warns=False)
+    parameters = unguarded_parameters(scene, setting.coupling, setting.period, substeps, method)
     # an error inside the C function would end the process; the first step in Python raises instead
     mujoco.mj_step(scene.model, scene.data)
     scene.reset()
-    return RunParameters(
-        grip=scene.grip,
-        period=period,
-        substeps=substeps,
-        coupling=method.law_coupling(coupling, period / substeps),
-        force_limit=_UNLIMITED,
-        torque_limit=_UNLIMITED,
-        ramp_ticks=0,
-        device_origin=IDENTITY_POSE,
-        handle_origin=scene.grip_pose(),
-        device_start=IDENTITY_POSE,
-        scheme=method.scheme,
-        is_rigid=method.is_rigid,
-    )
+    return parameters
 
 
 _TYPE = mujoco.mjtConstraint

@@ -32,6 +32,10 @@ BUS = Path("/sys/bus/usb/devices")
 NODES = Path("/dev/bus/usb")
 """Folder of the nodes that libusb opens: a folder per bus, a node per device."""
 
+NOT_SUPPORTED = NotImplementedError
+"""Error with which pyusb reports LIBUSB_ERROR_NOT_SUPPORTED: the system has no driver for the
+device through which libusb could open it, or none to detach from it."""
+
 
 @dataclass(frozen=True, slots=True)
 class OnTheBus:
@@ -243,7 +247,7 @@ def devices_of(driver: Driver, backend: Any) -> list[Any]:
     try:
         devices: Iterable[Any] = usb.core.find(find_all=True, backend=backend)
         known = [d for d in devices if driver.model(d.idVendor, d.idProduct) is not None]
-    except (usb.core.USBError, NotImplementedError):  # pyusb's errors if libusb cannot list them
+    except (usb.core.USBError, NOT_SUPPORTED):  # libusb cannot list them
         return []
     return sorted(known, key=node_of)
 
@@ -263,7 +267,7 @@ def _described(driver: Driver, device: Any) -> FoundDevice:
         ]
     except usb.core.USBError as error:
         problem = permission_problem(node) if error.errno == errno.EACCES else None
-    except (ValueError, NotImplementedError):
+    except (ValueError, NOT_SUPPORTED):
         pass  # the device has no texts, or libusb cannot open it here
     finally:
         usb.util.dispose_resources(device)
@@ -359,8 +363,7 @@ class UsbLink:
             raise DeviceError(f"{plugged} has just been unplugged; plug it in again")
         try:
             _claim(device)
-        # pyusb raises NotImplementedError for LIBUSB_ERROR_NOT_SUPPORTED: no suitable driver
-        except (usb.core.USBError, NotImplementedError) as error:
+        except (usb.core.USBError, NOT_SUPPORTED) as error:
             usb.util.dispose_resources(device)
             number = getattr(error, "errno", None)
             reason = {
@@ -475,8 +478,8 @@ def _claim(device: Any) -> None:
     try:
         if device.is_kernel_driver_active(0):
             device.detach_kernel_driver(0)
-    except NotImplementedError:
-        pass  # pyusb's error on systems without drivers to detach
+    except NOT_SUPPORTED:
+        pass  # the system has no drivers to detach
     try:
         device.get_active_configuration()
     except usb.core.USBError as error:
