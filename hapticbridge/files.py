@@ -69,6 +69,13 @@ def read_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+def remove_file(path: Path) -> None:
+    """Removes a regular file; does nothing if there is none, or it cannot be removed."""
+    if path.is_file():
+        with suppress(OSError):
+            path.unlink()
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary path; after the block the file replaces the target.

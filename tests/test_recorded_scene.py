@@ -9,6 +9,7 @@ import os
 import resource
 import signal
 import socket
+import stat
 import struct
 import sys
 import tempfile
@@ -453,6 +454,16 @@ def test_a_child_has_the_time_that_it_is_allowed() -> None:
 
     before, after = in_bounds(work, "it", seconds=100.0)
     assert before <= confinement.COMPILE_TIME + 0.1 < 99.0 < after <= 100.1
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022])
+def test_a_childs_folder_is_its_users_alone_under_any_umask(umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        mode = in_bounds(lambda _: Path(tempfile.gettempdir()).stat().st_mode, "it")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(mode) == 0o700
 
 
 def test_a_child_reads_only_what_it_is_given_and_has_no_network(tmp_path: Path) -> None:

@@ -238,8 +238,10 @@ def test_a_recorder_that_stands_still_is_left_to_finish(
     os.kill(recorder.pid, signal.SIGSTOP)
     for number in range(3000 * has_full_pipe):
         recorder.event({"event": "mark", "text": "x" * 100, "number": number}, number)
+    began = time.monotonic()
     with pytest.raises(RecordingError, match="is left to finish"):
         recorder.close()
+    assert time.monotonic() - began < 10.0  # the longest close of one that works takes 30 s
     recorder.close()
     assert recorder.is_left
     os.kill(recorder.pid, signal.SIGCONT)

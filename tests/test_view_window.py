@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import subprocess
 import threading
 import types
@@ -12,6 +13,7 @@ import pytest
 
 from hapticbridge.commands import Command, Couple, Switch
 from hapticbridge.commands.command import Stop, line_of
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.view.window import Address, Window
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
@@ -131,3 +133,16 @@ def test_a_run_hears_commands_and_nothing_else(
     job, *answers = [json.loads(line) for line in process.told.splitlines()]
     assert job["ring"] == "ring"
     assert [answer["event"] for answer in answers] == ["refused"] * refused
+
+
+def test_a_page_that_is_never_served_is_waited_for_a_limited_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hapticbridge.view.window.START_PATIENCE", 0.2)
+    monkeypatch.setattr("hapticbridge.view.window._BOOTSTRAP", "import time; time.sleep(60)")
+    window = Window(Address(0))
+    with pytest.raises(HapticBridgeError, match=r"served nothing within 0\.2 s"):
+        window.start("ring", "snapshot", {}, ())
+    assert window.process_id is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(window.process_id, 0)

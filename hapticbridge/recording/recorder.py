@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import remove_file
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
@@ -230,8 +231,8 @@ class Recorder:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing. The wait ends ``STANDSTILL`` after the last sign of life. ``signer`` signs it;
-        the process gets the key here, so that a bridge that dies leaves an unsigned one.
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life. The process gets the key
+        of ``signer`` only here, so that a bridge that dies leaves an unsigned file.
 
         Raises:
             RecordingError: The process died, could not write the file, or stands still and is left
@@ -554,9 +555,8 @@ class RecordStream:
 
     def _discard(self, recorder: Recorder) -> None:
         recorder.abort()
-        if self._path is not None and self._path.is_file():
-            with contextlib.suppress(OSError):
-                self._path.unlink()
+        if self._path is not None:
+            remove_file(self._path)
 
     def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:

@@ -28,6 +28,7 @@ from rich.live import Live
 from rich.text import Text
 
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import remove_file
 from hapticbridge.record import TickFlag
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.ring import Ring
@@ -207,7 +208,7 @@ class _Session:
         if self._writer is not None:
             self._writer.close(self._signer)
             if end == "died" and self._last_tick < 0:  # before its first tick
-                _remove_file(self._path)
+                remove_file(self._path)
         if self._live is not None:
             self._live.close()
 
@@ -247,12 +248,6 @@ class _Session:
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:
             self._writer.write_event(event, time_ns)
-
-
-def _remove_file(path: Path) -> None:
-    if path.is_file():
-        with contextlib.suppress(OSError):
-            path.unlink()
 
 
 def _listen(stream: IO[bytes], inbox: SimpleQueue[dict[str, Any] | None]) -> None:

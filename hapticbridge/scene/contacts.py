@@ -184,9 +184,9 @@ def announce_soft_equalities(model: mujoco.MjModel) -> tuple[str, ...]:
     """Returns a sentence on equality constraints that rigid ones replace, as ``name: old → new``.
 
     An equality holds a mass with ω² = κ/h² (κ of the module's first equation), so softly below
-    ``SOFT_FREQUENCY``. MuJoCo's spring follows the inertia and its energy is in no account: one
-    that was stretched by 5 mm at the start created 0.1 to 8 mJ in 8 of 14 settings, one at rest
-    none in 13 of 14.
+    ``SOFT_FREQUENCY``. MuJoCo's spring follows the inertia and its energy is in no account: of
+    14 settings, 8 were active after a stretch of 5 mm at the start (45 nJ to 10 mJ), and one at
+    rest was not strict (8.7 mJ, within slack).
     """
     step, names, slowest = float(model.opt.timestep), [], math.inf
     for i in np.flatnonzero(model.eq_type <= int(mujoco.mjtEq.mjEQ_TENDON)).tolist():
