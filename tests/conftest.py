@@ -88,6 +88,12 @@ def call(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) ->
     return called
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Puts a few bytes in place of a report's picture, which a process would draw for a second."""
+    monkeypatch.setattr("hapticbridge.cli.audit.still", lambda *_, **__: b"a picture")
+
+
 @pytest.fixture(scope="module")
 def plain_ticks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, NDArray[np.void]]:
     folder = tmp_path_factory.mktemp("plain")

@@ -29,25 +29,25 @@ Values = dict[str, float]
 HANDS: list[tuple[str, Values, float, int]] = [
     ("point_mass", {}, 0.0, 0),
     ("virtual_wall", {}, 0.0, 800),
-    ("planar_peg", {}, 0.0, 800),
-    ("planar_peg", {}, -0.045, 12000),
-    ("planar_peg", {"length": 0.04}, -0.025, 12000),
-    ("planar_peg", {"length": 0.2}, -0.185, 12000),
+    ("planar_peg", {}, 0.0, 400),
+    ("planar_peg", {}, -0.045, 7000),
+    ("planar_peg", {"length": 0.04}, -0.025, 7000),
+    ("planar_peg", {"length": 0.2}, -0.185, 7000),
     ("peg_in_hole", {}, 0.0, 800),
-    ("peg_in_hole", {}, -0.045, 12000),
+    ("peg_in_hole", {}, -0.045, 7000),
     ("round_peg", {}, 0.0, 800),
-    ("round_peg", {}, -0.045, 12000),
+    ("round_peg", {}, -0.045, 7000),
     ("drawer", {}, 0.0, 200),  # its friction holds it most times
     ("hammer", {}, 0.0, 400),
-    ("open_wrench", {}, 0.0, 12000),
-    ("ratchet", {}, 0.0, 12000),
+    ("open_wrench", {}, 0.0, 7000),
+    ("ratchet", {}, 0.0, 7000),
     ("pliers", {}, 0.0, 800),
     ("lock", {}, 0.0, 800),
-    ("screwdriver", {}, -0.002, 12000),
-    ("hex_key", {}, -0.002, 12000),
+    ("screwdriver", {}, -0.002, 7000),
+    ("hex_key", {}, -0.002, 7000),
 ]
 """Scene, parameters, by how much the hand goes up in m before it is random (into the hole, or to
-press a tool that starts seated), and how many ticks of the eight runs there is a contact at least:
+press a tool that starts seated), and how many ticks of the four runs there is a contact at least:
 otherwise nothing was tried."""
 
 
@@ -58,7 +58,7 @@ TOWARDS = {"pliers": [0.0, -0.02, 0.0], "lock": [-0.02, 0.0, 0.0]}
 """Where the hand goes while it is random, in m: onto the wire, into the keyway."""
 
 SEED = {"drawer": 8}
-"""First of the eight random hands; most hands are too weak for the drawer's friction."""
+"""First of the four random hands; most hands are too weak for the drawer's friction."""
 
 OWN_TICKS = 8001
 """Ticks of the path that a scene brings."""
@@ -94,7 +94,7 @@ def test_hands_leave_it_whole(name: str, values: Values, first: float, least: in
     loop = ClosedLoop(hb.load_scene(name, "grip", as_is=False, **values))
     contacts, strongest, worst = 0, -1.0, 0
     begin = SEED.get(name, 0)
-    for seed in range(begin, begin + 8):
+    for seed in range(begin, begin + 4):
         records = run_of(loop, seed, first).records
         contacts += int(np.count_nonzero(records["flags"] & TickFlag.CONTACT))
         twist = float(norms(records["wrench_on_tool"])[1].max())
@@ -135,20 +135,17 @@ def test_both_ends_of_a_parameter_are_strict_in_any_hand(
     name: str, parameter: scenes.Parameter
 ) -> None:
     used = 0
-    for value in (parameter.minimum, parameter.maximum):
+    for value, seed in ((parameter.minimum, 0), (parameter.maximum, 7)):
         loop = ClosedLoop(hb.load_scene(name, "grip", as_is=False, **{parameter.name: value}))
-        for seed in (0, 7):
-            rows = random_motion(seed, first=FIRST.get(name, 0.0)).table
-            towards = smooth(rows[:, :1]) * np.array(TOWARDS.get(name, [0.0, 0.0, 0.0]))
-            motion = Motion(rows[:, 0], rows[:, 1:4] + towards, rows[:, 4:])
-            outcome = shaken(loop, motion, STRONG if name in FIRST else None)
-            assert (outcome.environment, outcome.ticks) == ("strict", 5000), (
-                f"seed {seed}: {outcome}"
-            )
-            assert outcome.peak_force < FORCE_LIMIT or name in FIRST
-            assert not any(warning.number for warning in loop.scene.data.warning)
-            touching = outcome.records["contacts"] > (3 if name == "lock" else 0)
-            used += int(np.count_nonzero(touching))
+        rows = random_motion(seed, first=FIRST.get(name, 0.0)).table
+        towards = smooth(rows[:, :1]) * np.array(TOWARDS.get(name, [0.0, 0.0, 0.0]))
+        motion = Motion(rows[:, 0], rows[:, 1:4] + towards, rows[:, 4:])
+        outcome = shaken(loop, motion, STRONG if name in FIRST else None)
+        assert (outcome.environment, outcome.ticks) == ("strict", 5000), f"seed {seed}: {outcome}"
+        assert outcome.peak_force < FORCE_LIMIT or name in FIRST
+        assert not any(warning.number for warning in loop.scene.data.warning)
+        touching = outcome.records["contacts"] > (3 if name == "lock" else 0)
+        used += int(np.count_nonzero(touching))
         own = device_for(loop.scene, "simulated")
         assert isinstance(own, SimulatedDevice)
         coupling = default_coupling(own.info, T, 1.0, 1.0)
@@ -177,8 +174,7 @@ def default_run(name: str, **values: float) -> Done:
 
         def observe(_: object) -> None:
             joints.append(scene.data.qpos.copy())
-            held = (-float(contact.dist) for contact in scene.data.contact)
-            deepest.append(max(held, default=0.0))
+            deepest.append(-float(scene.data.contact.dist.min(initial=0.0)))
 
         summary = bridge.run(on_tick=observe)
         sent = bridge.latest_records(summary.ticks)["wrench_on_device"]

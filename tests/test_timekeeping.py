@@ -256,6 +256,7 @@ def test_a_device_that_never_bears_it_is_not_blamed_on_time(tmp_path: Path) -> N
 # Command line
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_and_audit_say_so_and_fail(
     call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -249,10 +249,10 @@ def test_a_recording_that_is_not_what_it_says_is_not_simulated(wall: Path, tmp_p
         what_if(rewritten(recording, tmp_path / "c.mcap", attachments=evil), {})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_shows_runs_side_by_side_and_draws_them(
-    wall: Path, tmp_path: Path, call: Called, monkeypatch: pytest.MonkeyPatch
+    wall: Path, tmp_path: Path, call: Called
 ) -> None:
-    monkeypatch.setattr("hapticbridge.cli.audit.still", lambda *_, **__: b"a picture")
     picture, page = tmp_path / "what_if.png", tmp_path / "page.html"
     command = ("audit", wall, "--what-if", "stiffness=5000", "--plot", picture, "--report", page)
     code, out, err = call(*command)
