@@ -57,6 +57,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.check.run_faults",
         "hapticbridge.realtime.doctor",
         "hapticbridge.film",
+        "glfw",
         "hapticbridge.identify",
         "hapticbridge.theory_plots",
         "hapticbridge.plotting",

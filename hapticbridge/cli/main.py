@@ -12,7 +12,8 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
@@ -135,7 +136,7 @@ def _execute(name: str, words: list[str]) -> int:
 def command_class(name: str) -> type[Any]:
     """Imports the command's module and returns its class."""
     try:
-        with leaving_on_signals():
+        with leaving_on_signals(), _without_glfw():
             module = importlib.import_module(f"hapticbridge.cli.{_MODULES.get(name, name)}")
     except RuntimeError as error:
         if "MUJOCO_GL" not in str(error):
@@ -146,6 +147,23 @@ def command_class(name: str) -> type[Any]:
         ) from None
     command: type[Any] = getattr(module, name.capitalize())
     return command
+
+
+@contextmanager
+def _without_glfw() -> Iterator[None]:
+    """Imports MuJoCo without GLFW, unless the user chose a renderer.
+
+    Pictures are drawn in processes of their own. GLFW's import takes 0.1 s, in a child that asks
+    for its version, and that child prints a traceback if a signal ends this process meanwhile.
+    """
+    is_ours = not os.environ.get("MUJOCO_GL")
+    if is_ours:
+        os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        if is_ours:
+            del os.environ["MUJOCO_GL"]
 
 
 def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
