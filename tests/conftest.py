@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from audit_cases import recorded, tapped
 from cli_cases import Called
+from forked_recorder import ForkedRecorder
 from hypothesis import settings
 from numpy.typing import NDArray
 from outside_scenes import GRIPPED, hand_file, mjcf, scene_file, ticks
@@ -24,6 +26,18 @@ from hapticbridge.recording import Recording, read_recording
 # a deadline is a timing, and other work on the machine must fail no test
 settings.register_profile("hapticbridge", deadline=None)
 settings.load_profile("hapticbridge")
+
+
+PROCESSES = ("faults.", "test_bridge_killed", "test_realtime", "test_recording_recorder")
+"""Modules whose recorders are processes as users have them."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forked_recorders(request: pytest.FixtureRequest) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        if sys.platform == "linux" and not request.module.__name__.startswith(PROCESSES):
+            patch.setattr("hapticbridge.recording.recorder.recorder_process", ForkedRecorder)
+        yield
 
 
 @pytest.fixture(scope="module")

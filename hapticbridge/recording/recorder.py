@@ -183,7 +183,7 @@ class Recorder:
         self.is_disk_full = False
         self.is_left = self._has_failed = False
         with deferring_stops():  # an interrupted caller would not have the process to end it
-            self._process = _start()
+            self._process = recorder_process()
         self._input = cast(IO[bytes], self._process.stdin)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
@@ -353,7 +353,12 @@ class Recorder:
         self._answers.put({"exited": True})
 
 
-def _start() -> subprocess.Popen[bytes]:
+def recorder_process() -> subprocess.Popen[bytes]:
+    """Starts a recorder's process, which waits for its configuration.
+
+    Raises:
+        RecordingError: The process cannot be started.
+    """
     package = str(Path(__file__).resolve().parents[1])
     try:
         return subprocess.Popen(
