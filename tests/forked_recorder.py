@@ -1,8 +1,8 @@
 """A recorder's process that is a fork of the tests' one: it imports nothing again.
 
 All that it does is the same but its start, which takes 10 ms of processor time instead of 250. The
-process as users have it is that of the tests that run commands, and of ``test_recording_recorder``,
-``test_bridge_killed`` and ``faults``.
+process as users have it is that of tests that run commands, and of ``test_recording_recorder``,
+``test_realtime``, ``test_bridge_killed`` and ``faults``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from os import fork  # which a test may take away from the bridge
 from typing import NoReturn
 
 from hapticbridge.recording import recorder_process
@@ -26,7 +27,7 @@ class ForkedRecorder:
         below, given = os.pipe()
         answered, above = os.pipe()
         self.returncode: int | None = None
-        self.pid = os.fork()
+        self.pid = fork()
         if self.pid == 0:
             _record(below, above)
         os.close(below)

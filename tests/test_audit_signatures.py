@@ -464,9 +464,9 @@ def test_a_file_that_lost_its_end_says_so_through_repairs_and_exports(
         whole = json.loads(out.with_name("piece.csv.json").read_text())
         assert whole["meta"]["incomplete"] == report.cut
     page = tmp_path / "page.html"
-    code, out, _ = call("audit", first, "--report", page)
+    code, printed, _ = call("audit", first, "--report", page)
     assert code == 0
-    assert audit(first).cut in " ".join(out.split())
+    assert audit(first).cut in " ".join(printed.split())
     assert "had lost its end and was repaired" in page.read_text()
     assert "only a key would prove" in page.read_text()
     export(bench.run, "csv", tmp_path / "piece.csv", overwrite=True)

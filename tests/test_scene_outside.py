@@ -214,8 +214,9 @@ BEYOND_ITS_LIMIT = """<mujoco>
 
 def started(folder: Path, text: str, **options: Any) -> hb.Bridge:
     scene = hb.load_scene(scene_file(folder, text), as_is=options.pop("as_is", False))
-    device, file = options.pop("device", "simulated"), folder / "run.mcap"
-    return hb.Bridge(scene, device, clock=hb.SimulatedClock(), recording=file, **options)
+    device = options.pop("device", "simulated")
+    options.setdefault("recording", folder / "run.mcap")
+    return hb.Bridge(scene, device, clock=hb.SimulatedClock(), **options)
 
 
 def test_start_beyond_a_limit_pushes_nothing_with_rigid_limits_alone(tmp_path: Path) -> None:
@@ -417,7 +418,7 @@ _STRETCHED = {
 
 
 @pytest.mark.parametrize("kind", _STRETCHED)
-@pytest.mark.parametrize("solref", ["0.02 1", "0.002 1", "-20000 -50"])
+@pytest.mark.parametrize("solref", ["0.02 1", "-20000 -50"])
 def test_error_at_the_start_creates_no_energy_with_rigid_constraints_alone(
     tmp_path: Path, kind: str, solref: str
 ) -> None:
@@ -428,7 +429,7 @@ def test_error_at_the_start_creates_no_energy_with_rigid_constraints_alone(
         assert bridge.run(duration=0.5).environment == "strict"
     assert hb.audit(tmp_path / "run.mcap").resimulation == "bit for bit"
     # MuJoCo's own constraint pulls the error together, which no port pays
-    with started(tmp_path, text, contact="scene") as bridge:
+    with started(tmp_path, text, contact="scene", recording=None) as bridge:
         with suppress(hb.SafetyTrip):
             bridge.run(duration=0.5)
         assert bridge.ledger.first_active is not None
