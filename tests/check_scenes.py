@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,6 +187,12 @@ KEY = f'<key name="home" qpos="{START}"/>'
 
 def case_of(scene: Path, **options: object) -> SceneUnderCheck:
     return open_case(read_scene(scene), **options)  # type: ignore[arg-type] # by the test
+
+
+@functools.cache
+def shipped_case(name: str) -> SceneUnderCheck:
+    """Returns a shipped scene, observed once for all tests that look at it."""
+    return case_of(scene_path(name))
 
 
 def faults_of(scene: Path, **options: object) -> tuple[Fault, ...]:

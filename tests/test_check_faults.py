@@ -21,6 +21,7 @@ from check_scenes import (
     kinds,
     line_of,
     peg_with,
+    shipped_case,
     written,
 )
 from outside_scenes import hand_rows, mjcf
@@ -109,11 +110,11 @@ def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", scene_names())
 def test_shipped_scene_has_no_fault(name: str) -> None:
-    assert faults_of(scene_path(name)) == ()
+    assert find_faults(shipped_case(name)) == ()
 
 
 def test_boxes_are_named_unless_the_run_keeps_their_points() -> None:
-    case = case_of(scene_path("planar_peg"))
+    case = shipped_case("planar_peg")
     assert not tuple(shape_faults(case))
     (fault,) = shape_faults(replace(case, contact="scene"))
     assert fault.kind == "box edges"

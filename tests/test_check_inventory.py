@@ -7,10 +7,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, written
+from check_scenes import GOOD_CONTACT, GOOD_OPTION, bench, case_of, shipped_case, written
 from outside_scenes import mjcf
 
 from hapticbridge.check import inventory
+from hapticbridge.check.case import SceneUnderCheck
 from hapticbridge.check.inventory import Inventory, take_inventory
 from hapticbridge.check.source_map import Places
 from hapticbridge.scene import read_scene, scene_names, scene_path
@@ -18,14 +19,17 @@ from hapticbridge.scene.contacts import meeting_pairs
 
 
 def inventory_of(scene: Path, **options: object) -> Inventory:
-    case = case_of(scene, **options)
+    return inventory_in(case_of(scene, **options))
+
+
+def inventory_in(case: SceneUnderCheck) -> Inventory:
     return take_inventory(case.model, case.scene.grip, case.places, case.observation)
 
 
 @pytest.mark.parametrize("name", scene_names())
 def test_counts_are_those_of_the_model_without_the_bridge(name: str) -> None:
-    path = scene_path(name)
-    plain, counted = mujoco.MjModel.from_xml_path(str(path)), inventory_of(path)
+    plain = mujoco.MjModel.from_xml_path(str(scene_path(name)))
+    counted = inventory_in(shipped_case(name))
     assert (counted.bodies, counted.degrees_of_freedom) == (plain.nbody - 1, plain.nv)
     assert (sum(counted.geoms.values()), counted.actuators) == (plain.ngeom, plain.nactuator)
     assert (counted.equalities, counted.tendons) == (plain.neq, plain.ntendon)
@@ -208,7 +212,7 @@ def test_geoms_without_a_name_in_an_included_file_are_told_apart(tmp_path: Path)
 
 def test_places_of_a_repeated_element_are_the_line_that_repeats_it() -> None:
     source = read_scene("round_peg")
-    places = Places(source, case_of(scene_path("round_peg")).model)
+    places = Places(source, shipped_case("round_peg").model)
     text = source.path.read_text(encoding="utf-8").splitlines()
     assert '<geom name="sector"' in text[places.geom(5).line - 1]
     assert places.geom(5).element.startswith("geom 'sector_")
