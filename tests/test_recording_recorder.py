@@ -260,7 +260,7 @@ print('{"ready": true}', flush=True)
 for _ in range(24):
     os.read(0, 10000)
     time.sleep(0.05)
-while b'"close"' not in os.read(0, 100000):
+while (text := os.read(0, 100000)) and b'"close"' not in text:
     pass
 print('{"closed": true}', flush=True)
 """
