@@ -19,7 +19,7 @@ from cli_cases import Called, one_sentence
 
 from hapticbridge.cli import main
 from hapticbridge.cli.main import COMMANDS, command_class
-from hapticbridge.signals import leaving_on_signals
+from hapticbridge.signals import StopSignal, interrupting_on_signals, leaving_on_signals
 
 HEAVY = frozenset(
     {"numpy", "mujoco", "numba", "llvmlite", "scipy", "matplotlib", "tyro", "rich", "mcap"}
@@ -277,3 +277,14 @@ def test_help_into_a_reader_that_went_away_ends_without_a_traceback() -> None:
     _, told = process.communicate(timeout=120)
     assert process.returncode == 1
     assert told == b""
+
+
+def test_a_second_signal_does_not_interrupt_the_release_that_the_first_one_began() -> None:
+    released = False
+    with pytest.raises(StopSignal), interrupting_on_signals():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            released = True
+    assert released

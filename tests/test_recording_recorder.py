@@ -251,6 +251,29 @@ def test_a_recorder_that_stands_still_is_left_to_finish(
     assert not recording.is_cut
 
 
+def test_a_recorder_that_is_only_slow_is_waited_for(
+    ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = """
+import os, time
+print('{"ready": true}', flush=True)
+for _ in range(24):
+    os.read(0, 10000)
+    time.sleep(0.05)
+while (text := os.read(0, 100000)) and b'"close"' not in text:
+    pass
+print('{"closed": true}', flush=True)
+"""
+    monkeypatch.setattr(recorder_module, "STANDSTILL", 0.6)
+    monkeypatch.setattr(recorder_module, "_BOOTSTRAP", slow)
+    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder.wait_until_ready()
+    for number in range(3000):
+        recorder.event({"event": "mark", "text": "x" * 100}, number)
+    recorder.close()
+    assert not recorder.is_left
+
+
 def test_a_recorder_without_a_file_that_stands_still_is_ended(
     ring: Ring, monkeypatch: pytest.MonkeyPatch
 ) -> None:

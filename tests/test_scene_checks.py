@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from audit_cases import recorded
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from outside_scenes import FREE_TOOL, HINGE_TOOL, mjcf, refusal, refusal_of, scene_file
@@ -326,6 +327,13 @@ def test_start_is_refused_exactly_beyond_tenth_of_millimetre(tmp_path: Path, dep
         assert "starts in penetration" in refusal(path, as_is=True)
     elif depth < 0.9999e-4:
         load_scene(path, as_is=True)
+
+
+def test_tool_is_refused_where_the_audit_would_take_rounding_for_tampering(tmp_path: Path) -> None:
+    run = tmp_path / "run.mcap"
+    recorded(run, scene_file(tmp_path, resting(999.0)), duration=0.5)
+    assert hb.audit(run).verdict == "passive"
+    assert "the tool starts 1001 m from the origin" in refusal_of(tmp_path, resting(1001.0))
 
 
 def test_start_is_judged_at_keyframe_home(tmp_path: Path) -> None:

@@ -244,8 +244,13 @@ def _check_coupling_actuator(model: mujoco.MjModel, name: str) -> None:
         )
 
 
-def check_start(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Raises SceneError for a start that is not finite.
+FARTHEST = 1e3
+"""Largest distance in m of the tool from the origin. At 10 km and 8000 N/m rounding puts wrenches
+off by more than the 1e-9 N that the audit takes for tampering."""
+
+
+def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+    """Raises SceneError for a start that is not finite, or a tool beyond ``FARTHEST``.
 
     ``data`` must be at the start, after ``mj_forward``.
     """
@@ -255,6 +260,12 @@ def check_start(model: mujoco.MjModel, data: mujoco.MjData) -> None:
                 f"the scene's start is not finite, or beyond {mujoco.mjMAXVAL:g}, in {name}; check "
                 "keyframe 'home' and qpos0"
             )
+    distance = float(np.linalg.norm(data.site(grip).xpos))
+    if distance > FARTHEST:
+        raise SceneError(
+            f"the tool starts {distance:.4g} m from the origin; beyond {FARTHEST:g} m positions "
+            "round too coarsely to be audited; move the scene to the origin"
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -251,7 +251,7 @@ def compile_scene(
         scene.reset()
         scene.changes += limit_motors_alone(model, scene.data, grip, as_is=as_is)
     if checks_start:
-        check_start(model, scene.data)
+        check_start(model, scene.data, grip)
     if as_is:
         refuse_overlap(model, scene.data, grip)
     else:
