@@ -2,7 +2,7 @@
 
 All that it does is the same but its start, which takes 10 ms of processor time instead of 250. The
 process as users have it is that of tests that run commands, and of ``test_recording_recorder``,
-``test_realtime``, ``test_bridge_killed`` and ``faults``.
+``test_realtime`` and ``test_bridge_killed``.
 """
 
 from __future__ import annotations

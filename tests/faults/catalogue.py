@@ -26,6 +26,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.guard import Limits
+from hapticbridge.recording.recorder import recorder_process
 from hapticbridge.recording.ring import HEAD, TAIL
 from hapticbridge.theory.sampled_loop import WorstHand
 from hapticbridge.view.window import Address, Window
@@ -313,6 +314,9 @@ run()
 """A recorder whose writes do not return until the file GO exists."""
 
 
+RECORDER = recorder_process.__module__
+
+
 def _stalled_disk(rig: Rig) -> None:
     """From the cause on the recorder's writes do not return until the bridge has ended."""
     go = rig.folder / "go"
@@ -320,7 +324,9 @@ def _stalled_disk(rig: Rig) -> None:
 
     def around(stack: ExitStack) -> None:
         bootstrap = STALLING.replace("GO", str(go))
-        stack.enter_context(patch("hapticbridge.recording.recorder._BOOTSTRAP", bootstrap))
+        stack.enter_context(patch(f"{RECORDER}._BOOTSTRAP", bootstrap))
+        # a process of its own, although the recorders of tests are forks
+        stack.enter_context(patch(f"{RECORDER}.recorder_process", recorder_process))
 
     def wake() -> None:
         go.touch()
