@@ -28,7 +28,7 @@ settings.register_profile("hapticbridge", deadline=None)
 settings.load_profile("hapticbridge")
 
 
-PROCESSES = ("test_bridge_killed", "test_realtime", "test_recording_recorder")
+PROCESSES = ("test_bridge_killed", "test_cli_run", "test_realtime", "test_recording_recorder")
 """Modules whose recorders are processes as users have them."""
 
 

@@ -1,8 +1,8 @@
 """A recorder's process that is a fork of the tests' one: it imports nothing again.
 
 All that it does is the same but its start, which takes 10 ms of processor time instead of 250. The
-process as users have it is that of tests that run commands, and of ``test_recording_recorder``,
-``test_realtime`` and ``test_bridge_killed``.
+process as users have it is that of tests that run commands in processes of their own, and of
+``test_recording_recorder``, ``test_realtime``, ``test_cli_run`` and ``test_bridge_killed``.
 """
 
 from __future__ import annotations
