@@ -32,7 +32,7 @@ from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.seal import Signer
-from hapticbridge.recording.writer import check_contents
+from hapticbridge.recording.writer import check_contents, is_being_recorded
 from hapticbridge.signals import deferring_stops
 
 # Second reader of a run
@@ -399,6 +399,16 @@ KEPT_EVENTS = 4096
 RING_PATIENCE = 30.0
 """Longest wait in s for space in the ring while the recorder takes no record, in simulated time."""
 
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Returns values that change when a file is opened for a recording; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
 _ENDED = "the recorder ended during the run; the recording stops there"
 _FULL = "the disk is full; the recording ends here and is whole"
 
@@ -452,6 +462,7 @@ class RecordStream:
         self.recorder: Recorder | None = None
         self.lost = self.dropped = 0
         self._taken, self._taken_at = -1, 0.0
+        self._stamp_before: tuple[int, int, int] | None = None
         self._events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
 
     @property
@@ -466,6 +477,7 @@ class RecordStream:
             RecordingError: The process cannot be started, or the file cannot be written.
         """
         if self._is_read:
+            self._stamp_before = None if self._path is None else _stamp(self._path)
             self.recorder = Recorder(
                 self._ring, self._path, metadata, attachments, live=self._is_live
             )
@@ -555,8 +567,11 @@ class RecordStream:
 
     def _discard(self, recorder: Recorder) -> None:
         recorder.abort()
-        if self._path is not None:
-            remove_file(self._path)
+        path = self._path
+        # else the recorder never opened it: it holds an earlier run, or that of another bridge
+        is_opened = path is not None and _stamp(path) != self._stamp_before
+        if path is not None and is_opened and not is_being_recorded(path):
+            remove_file(path)
 
     def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:

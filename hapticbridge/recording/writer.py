@@ -89,6 +89,21 @@ class _Entries:
 if sys.platform != "win32":
     import fcntl
 
+
+def is_being_recorded(path: Path) -> bool:
+    """Returns whether a bridge is recording to a file."""
+    if sys.platform == "win32" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 RESERVE = 4 << 20
 """Space in bytes reserved beyond the file's end. Records at 1 kHz take 0.4 MB/s before compression,
 and the loop checks its recorder ten times a second. It suffices for 10 kHz and for the index of
