@@ -295,3 +295,20 @@ def test_a_run_that_never_began_leaves_a_file_alone_that_its_recorder_did_not_op
             recorded(path, "point_mass", duration=0.01)
         assert path.read_bytes() == before
     assert not read_recording(path).is_cut
+
+
+def test_a_run_whose_view_fails_after_the_file_was_opened_leaves_no_file(tmp_path: Path) -> None:
+    class Blind:
+        def start(self, *_: object) -> None:
+            assert path.exists()
+            raise HapticBridgeError("no page")
+
+        def event(self, _: object) -> None: ...
+
+        def close(self) -> None: ...
+
+    path, device = tmp_path / "run.mcap", ScriptedDevice(still)
+    bridge = fast("point_mass", device, recording=path, observer=Blind())
+    with pytest.raises(HapticBridgeError, match="no page"), bridge:
+        pass
+    assert device.is_closed and not path.exists()
