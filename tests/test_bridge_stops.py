@@ -27,6 +27,7 @@ from hapticbridge.errors import (
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as stream_module
+from hapticbridge.recording.writer import RecordingWriter
 
 PATIENCE = 30.0
 
@@ -269,3 +270,45 @@ def test_a_recorder_that_takes_no_record_ends_a_simulated_run(
         assert not device.writes[-1].any()
     assert recorder is not None
     os.kill(recorder.pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("is_recorded_to", [True, False])
+def test_a_run_that_never_began_leaves_a_file_alone_that_its_recorder_did_not_open(
+    is_recorded_to: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    if is_recorded_to:
+        other = RecordingWriter(path, {"by": "another bridge"}, (), 0)
+        with pytest.raises(RecordingError, match="another bridge is recording to it"):
+            recorded(path, "point_mass", duration=0.01)
+        other.close()
+    else:
+        recorded(path, "point_mass", duration=0.01)
+        before = path.read_bytes()
+        monkeypatch.setattr(stream_module, "_BOOTSTRAP", "input()")
+
+        def interrupted(_recorder: Recorder) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(Recorder, "wait_until_ready", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            recorded(path, "point_mass", duration=0.01)
+        assert path.read_bytes() == before
+    assert not read_recording(path).is_cut
+
+
+def test_a_run_whose_view_fails_after_the_file_was_opened_leaves_no_file(tmp_path: Path) -> None:
+    class Blind:
+        def start(self, *_: object) -> None:
+            assert path.exists()
+            raise HapticBridgeError("no page")
+
+        def event(self, _: object) -> None: ...
+
+        def close(self) -> None: ...
+
+    path, device = tmp_path / "run.mcap", ScriptedDevice(still)
+    bridge = fast("point_mass", device, recording=path, observer=Blind())
+    with pytest.raises(HapticBridgeError, match="no page"), bridge:
+        pass
+    assert device.is_closed and not path.exists()

@@ -254,10 +254,13 @@ def test_file_no_recording_is_refused(tmp_path: Path, content: bytes, reason: st
 def test_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
     path, meta, files = tmp_path / "run.mcap", META, FILES
     wrong: Any = {"a": 3}
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     for place, about, attached, words in (
         (tmp_path / "none" / "run.mcap", meta, files, r"the folder .* does not exist"),
         (tmp_path, meta, files, "Is a directory"),
         (Path("/dev/full"), meta, files, "No space left"),
+        (pipe, meta, files, "No such device or address"),
         (path, meta, (*files, files[2]), "two attachments are named 'empty'"),
         (path, {"a": "\udc80"}, files, "valid Unicode"),
         (path, wrong, files, "must be text, not 3"),

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE, TickFlag
-from hapticbridge.recording import Attachment, Recorder, Ring, read_recording
+from hapticbridge.recording import TAIL, Attachment, Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as recorder_module
 from hapticbridge.recording.recorder_process import LiveLine, RunState
 
@@ -272,6 +273,25 @@ print('{"closed": true}', flush=True)
         recorder.event({"event": "mark", "text": "x" * 100}, number)
     recorder.close()
     assert not recorder.is_left
+
+
+def test_a_recorder_that_takes_records_for_ever_is_left_too(
+    ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder.wait_until_ready()
+    os.kill(recorder.pid, signal.SIGSTOP)
+    monkeypatch.setattr(recorder_module, "LONGEST_CLOSE", 0.1)
+    seconds = iter(np.arange(0.0, 10.0, recorder_module.LONGEST_CLOSE / 4))
+
+    def later() -> float:
+        ring.cursors[TAIL] += 1  # a sign of life
+        return float(next(seconds))
+
+    monkeypatch.setattr(recorder_module, "time", SimpleNamespace(monotonic=later))
+    with pytest.raises(RecordingError, match=r"has worked for 0\.1 s and is left to finish"):
+        recorder.close()
+    os.kill(recorder.pid, signal.SIGKILL)
 
 
 def test_a_recorder_without_a_file_that_stands_still_is_ended(

@@ -66,7 +66,7 @@ def test_token_opens_and_nothing_else_does(way: str) -> None:
     assert refusal(address.token) == ""
     shown = f"/?token={address.token}", {"host": "127.0.0.1:80", "Upgrade": "websocket"}
     assert "token" in address.refusal(*shown)
-    for wrong in ("", address.token[:-1], address.token + "x", "ü", address.token.swapcase()):
+    for wrong in ("", address.token[:-1], address.token.swapcase(), "ü", "\udcff", "€"):
         assert "token" in refusal(wrong)
     assert "token" in address.refusal("/", {"host": "localhost"})
     assert "token" in address.refusal("//[", {"host": "localhost"})  # not a path

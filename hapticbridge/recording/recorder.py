@@ -32,7 +32,7 @@ from hapticbridge.recording.reader import read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.seal import Signer
-from hapticbridge.recording.writer import check_contents
+from hapticbridge.recording.writer import check_contents, is_being_recorded
 from hapticbridge.signals import deferring_stops
 
 # Second reader of a run
@@ -244,8 +244,8 @@ class Recorder:
         end = {"close": True, "seed": "" if signer is None else signer.seed.hex()}
         self._outbox += json.dumps(end).encode() + b"\n"
         answer = self._last_answer()
-        if answer is None:
-            self._leave()
+        if "left" in answer:
+            self._leave(answer["left"])
         elif "closed" in answer:
             self._reap()
         else:
@@ -257,8 +257,8 @@ class Recorder:
         self._process.kill()
         self._reap()
 
-    def _last_answer(self) -> dict[str, Any] | None:
-        """Returns the answer with which the process ends; None if it stands still."""
+    def _last_answer(self) -> dict[str, Any]:
+        """Returns the answer with which the process ends; ``left``, the reason, if none comes."""
         began = heard = time.monotonic()
         before = -1, -1
         while True:
@@ -270,10 +270,12 @@ class Recorder:
             now, state = time.monotonic(), (int(self._cursors[TAIL]), len(self._outbox))
             if state != before:
                 before, heard = state, now
-            if now > min(heard + STANDSTILL, began + LONGEST_CLOSE):
-                return None
+            if now > heard + STANDSTILL:
+                return {"left": f"stood still for {STANDSTILL:g} s"}
+            if now > began + LONGEST_CLOSE:
+                return {"left": f"worked for {LONGEST_CLOSE:g} s"}
 
-    def _leave(self) -> None:
+    def _leave(self, reason: str) -> None:
         """Leaves a process that stands still to finish its file, or ends one without a file.
 
         Raises:
@@ -288,7 +290,7 @@ class Recorder:
             self._input.close()  # it ends its input, and so the recording, where the close waited
         pid = self._process.pid
         raise RecordingError(
-            f"the recorder (process {pid}) has stood still for {STANDSTILL:g} s and is left to "
+            f"the recorder (process {pid}) has {reason} and is left to "
             f"finish '{self._path}', which is whole once that process has ended; "
             f"'kill -CONT {pid}' wakes it if it was stopped"
         )
@@ -404,6 +406,16 @@ KEPT_EVENTS = 4096
 RING_PATIENCE = 30.0
 """Longest wait in s for space in the ring while the recorder takes no record, in simulated time."""
 
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Returns values that change when a file is opened for a recording; None without a file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
 _ENDED = "the recorder ended during the run; the recording stops there"
 _FULL = "the disk is full; the recording ends here and is whole"
 
@@ -457,6 +469,7 @@ class RecordStream:
         self.recorder: Recorder | None = None
         self.lost = self.dropped = 0
         self._taken, self._taken_at = -1, 0.0
+        self._stamp_before: tuple[int, int, int] | None = None
         self._events: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
 
     @property
@@ -471,6 +484,7 @@ class RecordStream:
             RecordingError: The process cannot be started, or the file cannot be written.
         """
         if self._is_read:
+            self._stamp_before = None if self._path is None else _stamp(self._path)
             self.recorder = Recorder(
                 self._ring, self._path, metadata, attachments, live=self._is_live
             )
@@ -560,8 +574,11 @@ class RecordStream:
 
     def _discard(self, recorder: Recorder) -> None:
         recorder.abort()
-        if self._path is not None:
-            remove_file(self._path)
+        path = self._path
+        # else the recorder never opened it: it holds an earlier run, or that of another bridge
+        is_opened = path is not None and _stamp(path) != self._stamp_before
+        if path is not None and is_opened and not is_being_recorded(path):
+            remove_file(path)
 
     def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
         try:

@@ -89,6 +89,21 @@ class _Entries:
 if sys.platform != "win32":
     import fcntl
 
+
+def is_being_recorded(path: Path) -> bool:
+    """Returns whether a bridge is recording to a file."""
+    if sys.platform == "win32" or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 RESERVE = 4 << 20
 """Space in bytes reserved beyond the file's end. Records at 1 kHz take 0.4 MB/s before compression,
 and the loop checks its recorder ten times a second. It suffices for 10 kHz and for the index of
@@ -118,7 +133,9 @@ class Output:
         # lock before truncating: another bridge may be recording to this file
         flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
         flags |= os.O_EXCL if is_new else 0
+        flags |= getattr(os, "O_NONBLOCK", 0)  # a pipe without a reader is an error at once
         self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
+        os.set_blocking(self._file.fileno(), True)
         try:
             if sys.platform != "win32":
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -122,7 +122,7 @@ def _cookie_name(host: str) -> str:
 
 
 def _are_equal(shown: str, token: str) -> bool:
-    return hmac.compare_digest(shown.encode(), token.encode())
+    return hmac.compare_digest(shown.encode(errors="surrogateescape"), token.encode())
 
 
 def check_view() -> None:
