@@ -6,6 +6,7 @@ import ctypes
 import errno
 import io
 import json
+import os
 import resource
 import shutil
 import struct
