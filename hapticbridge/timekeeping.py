@@ -38,7 +38,7 @@ larger one can be felt."""
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
 
-SWUNG = "its force came late or reversed"
+SWUNG = "its force came late, reversed or in steps"
 """Words for what the watch found (``kernel.swing_watch``)."""
 
 
@@ -84,8 +84,9 @@ def watch_sentence(flags: int) -> str:
         )
     if flags & int(TickFlag.SWINGING):
         return (
-            "the force was lowered because the device answered late and swung: lower "
-            "--stiffness, and measure the device's delay ('hapticbridge identify')"
+            "the force was lowered because the device answered late, or in coarse steps, and "
+            "swung: lower --stiffness, and measure the device's delay and resolution "
+            "('hapticbridge identify')"
         )
     return ""
 

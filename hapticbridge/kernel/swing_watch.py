@@ -18,11 +18,13 @@ above 4 Hz, over 0.3 s, with b the device's damping and δp the motion in a bloc
     E_s = Σ (w_{k−s}·δp_k − b ‖δp_k‖²/t),    E_0 = Σ w_k·δp_k
 
 Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5 N m, in proportion:
-    reversed or exchanged: c <= −0.6 with p <= 0.2, or x >= 0.6 with c < 0.6, or x >= 0.55 with E_s
-    >= E, for 12 ms. The force is taken away.
+    reversed or exchanged: c <= −0.6 with p <= 0.2, or x >= 0.6 with c and p < 0.6, or x >= 0.55
+    with E_s >= E, for 12 ms. The force is taken away.
     late: p <= −0.4 with E_s >= E/4, or p <= −0.3 with E_s >= E, for 12 ms; or c <= 0 with c_s >=
     0.4 for 12 ms. The greatest ratio r of the lever between device and handle is halved, hence
     the stiffness quartered; again for each E_s >= E.
+    coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
+    ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
 E_s is the largest one for 4, 10, 20 and 40 ms, 0 where the account sees E_0 > E_s/4.
 
@@ -41,6 +43,9 @@ device 2 ms late, which is clean, −0.36 where E_s >= E/4 and −0.28 where E_s
 0.2 mm, random hands in a rattling peg and 5 N. Faults reach p = −0.95, c = −0.99, x = 0.99 and c_s
 = 0.9. Work alone cannot tell them apart: E_s of a firm hand is up to 200 E.
 
+Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
+that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
+
 Limits of the method: a motor that holds for 60 ms gives two fingers up to 0.4 J within one hold,
 before a lower force could reach it, and 0.8 J where two throws were needed. A hand stronger than
 any force, as a robot's, whose speed jumps is taken for a late device. A device with prescribed
@@ -54,9 +59,9 @@ import math
 import numpy as np
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import PROBED, RUNS_AWAY, SWINGING, Part, State
+from hapticbridge.kernel.codes import PROBED, RUNS_AWAY, STALE_SAMPLE, SWINGING, Part, State
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import Vector
+from hapticbridge.pose import Vector, norm
 
 BLOCK = 0.004
 """Length of a block in s, over which wrench and velocity are averaged. Longer blocks miss swings of
@@ -89,6 +94,10 @@ LATE_AT_WORK, TURNED_AT_WORK = -0.3, 0.55
 
 BLOCKS = 3
 """Blocks in a row for a finding."""
+
+STEPS, STEP = 3.0, 0.5
+"""Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
+lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -157,6 +166,8 @@ WATCH_DTYPE = np.dtype(
         ("believed", "<f8", 2),
         ("delayed", "<f8", 2 * len(LAGS)),
         ("gained", "<f8", 2),
+        ("still", "<i8", 2),
+        ("steps", "<f8", 2),
         ("counts", "<i8", 8),
     ]
 )
@@ -170,7 +181,8 @@ allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_e
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
 ``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and Σ
-W². ``counts`` are blocks in a row of late, reversed, exchanged and answered late."""
+W². ``still`` counts the equal samples before this one, and ``steps`` the coarse steps of late;
+``counts`` are blocks in a row of late, reversed, exchanged and answered late."""
 
 
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
@@ -231,10 +243,28 @@ def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
             wrench[3 + i] += w[3 + i]
             motion[i] += part * moved[i]
             motion[3 + i] += part * turned[i]
+    scale, force_scale = s.run.scale, s.run.force_scale
+    _count_step(s, 0, moved, interval, force_scale * scale * s.coupling.stiffness)
+    _count_step(s, 1, turned, interval, force_scale / scale * s.coupling.rotational_stiffness)
     watch.ticks += 1
     if watch.ticks == watch.block_ticks:
         watch.ticks = 0
         _close_block(s)
+
+
+@compiled
+def _count_step(s: State, kind: int, motion: Vector, interval: float, stiffness: float) -> None:
+    """Counts a coarse step; ``stiffness`` is the coupling's at the device in N/m or N m/rad."""
+    watch, still = s.watch, s.watch.still
+    if s.loop.external_flags & STALE_SAMPLE:
+        return
+    if motion == (0.0, 0.0, 0.0):
+        still[kind] += 1
+        return
+    was_still = still[kind] >= max(watch.block_ticks, 2) and interval < 2.0 * s.run.period
+    still[kind] = 0
+    if was_still and s.guard.share * stiffness * norm(motion) >= STEP * watch.limits[kind]:
+        watch.steps[kind] += 1.0
 
 
 @compiled
@@ -258,7 +288,7 @@ def _close_block(s: State) -> None:
             watch.counts[i] = 0
         for i in range(2 * ANSWERS):
             watch.late_along[i] = 0.0
-        watch.believed[0] = watch.believed[1] = 0.0
+        watch.believed[0] = watch.believed[1] = watch.steps[0] = watch.steps[1] = 0.0
     elif verdict != 0 and watch.blocks >= watch.rest_end:
         watch.probe_end = watch.blocks + watch.probe_blocks
         watch.rest_end = watch.probe_end + watch.rest
@@ -308,6 +338,7 @@ def _add_block(s: State, kind: int) -> None:
     for d in range(len(LAGS)):
         watch.delayed[len(LAGS) * kind + d] *= kept_work
     watch.believed[kind] *= kept_work
+    watch.steps[kind] *= kept_work
     wrench_square = speed_square = change_square = whole_square = power = along = 0.0
     for i in range(3):
         at = first + i
@@ -411,15 +442,17 @@ def _verdict(s: State, kind: int) -> int:
     counts[at] = counts[at] + 1 if is_late else 0
     is_reversed = along <= REVERSED and power <= FORWARD
     counts[at + 1] = counts[at + 1] + 1 if is_reversed else 0
-    is_exchanged = across >= EXCHANGED and along < EXCHANGED
+    is_exchanged = across >= EXCHANGED and max(along, power) < EXCHANGED
     is_exchanged = is_exchanged or (across >= TURNED_AT_WORK and is_working and is_known)
     counts[at + 2] = counts[at + 2] + 1 if is_exchanged else 0
-    is_answered = along <= 0.0 and _late_answer(watch, kind, least) >= ANSWERED
+    is_answered = along <= 0.0 and power < EXCHANGED
+    is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
-    if counts[at] >= BLOCKS or counts[at + 3] >= BLOCKS or (has_swung and is_working):
+    is_coarse = watch.steps[kind] >= STEPS
+    if is_coarse or max(counts[at], counts[at + 3]) >= BLOCKS or (has_swung and is_working):
         return SWINGING
     is_suspicious = late >= MUCH * enough or watch.gained[kind] >= watch.gain[kind]
     return PROBED if is_suspicious else 0
