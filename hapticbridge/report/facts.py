@@ -16,7 +16,6 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_si, format_wrenches
 
 Facts = list[tuple[str, str]]
