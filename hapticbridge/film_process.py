@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
@@ -146,7 +147,7 @@ class Stage:
             reason = "it holds no tick"
         if reason:
             raise RecordingError(f"'{opened.path}' cannot be drawn: {reason}")
-        self.parameters: RunParameters = parameters_of(self.recording.meta)
+        self.parameters: RunParameters = AuditedRun.of(self.recording).parameters
         self._run = Resimulator(self.recording, self.parameters)
         if on_compiled is not None:
             on_compiled()

@@ -31,8 +31,8 @@ class TickFlag(IntFlag):
         REANCHORED: The handle slipped, or followed the device in part: its pose belongs to the
             device's present pose from this tick on.
         MIDPOINT: The coupling was lossless in this tick: its torque follows the midpoint rule.
-        SWINGING: The device's force comes late and swings; the force was lowered before this tick
-            and stays lower.
+        SWINGING: The device's force comes late, or its samples in coarse steps, and it swings; the
+            force was lowered before this tick and stays lower.
         RUNS_AWAY: The device did not move as its force pushed, as with a reversed axis; the force
             was taken away before this tick.
         PROBED: The force is lowered for a moment to see whether the device follows it, or returns.

@@ -38,7 +38,7 @@ larger one can be felt."""
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
 
-SWUNG = "its force came late or reversed"
+SWUNG = "its force came late, reversed or in steps"
 """Words for what the watch found (``kernel.swing_watch``)."""
 
 
@@ -84,8 +84,9 @@ def watch_sentence(flags: int) -> str:
         )
     if flags & int(TickFlag.SWINGING):
         return (
-            "the force was lowered because the device answered late and swung: lower "
-            "--stiffness, and measure the device's delay ('hapticbridge identify')"
+            "the force was lowered because the device answered late, or in coarse steps, and "
+            "swung: lower --stiffness, and measure the device's delay and resolution "
+            "('hapticbridge identify')"
         )
     return ""
 
@@ -158,19 +159,26 @@ class Timekeeping:
 
     def device_words(self, verdict: bool | None) -> str:
         """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
-        count = self.law_evaluations
-        bound = "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
         if verdict:
-            return f"device certified{self.clause}: b >= {bound}"
+            return f"device certified{self.clause}: b >= {self._bound}"
         if verdict is None:
             return "device not judged: nothing proves that it bears the coupling"
+        return f"device not certified: {self.refutation or f'b < {self._bound}'}"
+
+    @property
+    def refutation(self) -> str:
+        """Reason in the run itself why its device is not certified, in a clause; or empty."""
         if self.is_kept is False:
-            return f"device not certified: {NOT_KEPT}"
+            return NOT_KEPT
         if self.watch:
-            return f"device not certified: {SWUNG}"
-        if self.has_tripped:
-            return "device not certified: the guard stopped the run"
-        return f"device not certified: b < {bound}"
+            return SWUNG
+        is_cause = self.has_tripped and self.is_kept is not None
+        return "the guard stopped the run" if is_cause else ""
+
+    @property
+    def _bound(self) -> str:
+        count = self.law_evaluations
+        return "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
 
     @property
     def words(self) -> str:

@@ -8,12 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults.catalogue import FINGERS
+from numpy.typing import NDArray
 from random_hands import random_motion
 from swing_cases import GRIPS, VERY_FIRM, alarms, shakes, taps
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
-from hapticbridge.device import AXES, DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice
+from hapticbridge.device import (
+    AXES,
+    DEFAULT_HAND,
+    DeviceInfo,
+    Motion,
+    SimulatedDevice,
+    TrajectoryDevice,
+)
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
 from hapticbridge.scene import scene_names
@@ -74,6 +82,41 @@ def test_a_probe_lowers_the_force_for_a_moment_and_is_no_alarm(tmp_path: Path) -
     report = audit(path)
     assert report.verdict == summary.verdict
     assert report.resimulation == "bit for bit"
+
+
+@pytest.mark.parametrize("limit", [2.0, 10.0])
+@pytest.mark.parametrize("step", [2e-4, 4e-3])
+def test_steps_of_an_encoder_are_an_alarm_if_the_force_swings_by_half_its_limit(
+    step: float, limit: float
+) -> None:
+    """2400 N/m make 0.5 N of 0.2 mm and 9.6 N of 4 mm."""
+    device = SimulatedDevice(path=taps(2.0, 1e-2, 1.0), hand=DEFAULT_HAND, resolution=step)
+    limits = Limits(force=limit, torque=0.5)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), limits=limits) as bridge:
+        assert bridge.setup.coupling.stiffness == 2400.0
+        summary = bridge.run(1.0)
+    assert ("in coarse steps" in summary.timekeeping.fault) == (step == 4e-3)
+
+
+def test_motion_that_lost_samples_hide_is_no_coarse_step() -> None:
+    """A sample in five is new: fast motion arrives in steps of 6 mm, and none is a finding."""
+    device = SimulatedDevice(path=shakes("virtual_wall", 8.0, 0.03), hand=GRIPS["firm"])
+    inner, ticks = device.read, iter(range(1000))
+
+    def read(sample: NDArray[np.void]) -> int:
+        last = sample[0].copy()
+        inner(sample)
+        if next(ticks) % 5 == 0:
+            return 0
+        sample[0] = last
+        return int(TickFlag.STALE_SAMPLE)
+
+    device.read = read  # type: ignore[method-assign]
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(1.0)
+        moved = np.diff(bridge.latest_records(1000)["device_position"][:, 0])
+    assert np.abs(moved).max() > 4e-3
+    assert not summary.timekeeping.watch
 
 
 class LateDevice:

@@ -276,7 +276,7 @@ def verdict_on(
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
         kept = facts.get("timekeeping")
         doubt = "" if kept is None else kept.fault
-        if facts["certified"] is False and not doubt:
+        if facts["certified"] is False and not (kept and kept.refutation):
             doubt = "the device has less damping than the coupling needs"
         notes = (found["reason"], doubt, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
+from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.certificate import (
@@ -317,7 +318,7 @@ def touched_pairs(
     ticks, total = evidence.ticks, float(gained.sum())
     found: defaultdict[frozenset[int], float] = defaultdict(float)
     try:
-        run = Resimulator(evidence.recording, evidence.parameters)
+        run = Resimulator(evidence.recording, AuditedRun.of(evidence.recording).parameters)
         for begin in range(0, window.start, BLOCK):
             run.add(ticks[begin : min(begin + BLOCK, window.start)])
         for tick, energy in zip(range(window.start, window.stop), gained.tolist(), strict=True):

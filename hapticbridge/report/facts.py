@@ -16,7 +16,6 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.timekeeping import NOT_KEPT
 from hapticbridge.units import format_si, format_wrenches
 
 Facts = list[tuple[str, str]]
@@ -173,8 +172,10 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     ]
     kept = report.timekeeping
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
-    words = NOT_KEPT if kept is not None and kept.fault else borne[report.certified]
-    facts.append(("device condition", words + (kept.clause if kept and report.certified else "")))
+    words = borne[report.certified]
+    if kept is not None and report.certified is not None:
+        words = words + kept.clause if report.certified else kept.refutation or words
+    facts.append(("device condition", words))
     if kept is not None and kept.remark:
         facts.append(("time kept", kept.remark))
     if report.slack_share:

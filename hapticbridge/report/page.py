@@ -129,7 +129,7 @@ def _device_notes(report: AuditReport) -> list[str]:
         return [f"The device bears this coupling, in any hand{clause}."]
     if report.certified is None:
         return ["It is not known if the device bears this coupling in any hand."]
-    if kept is not None and kept.fault:  # the reason has the numbers
+    if kept is not None and kept.refutation:  # the reason has the numbers
         return ["The device is not certified. This run stayed passive; another one need not."]
     return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "

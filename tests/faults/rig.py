@@ -228,8 +228,8 @@ class Outcome:
         is_finite: Whether all of it was.
         energy: Largest energy given to the hand beyond what it had put in, in J.
         zero_after: Ticks from the cause to the first zero wrench; None where none came.
-        found_after: Ticks from ``FELT`` to the tick in which the watch lowers the force; None where
-            it does not.
+        found_after: Ticks from ``FELT``, without which from the cause, to the tick in which the
+            watch lowers the force; None where it does not.
         last_is_zero: Whether the last write was zero.
         error: What was raised, or nothing.
         ticks: Ticks that were done, and ``rows`` records of them in the file.
@@ -268,7 +268,7 @@ class Outcome:
         recording = read_recording(path)
         flags = recording.ticks["flags"]
         found = np.flatnonzero(flags & int(WATCHED))
-        felt = np.flatnonzero(np.append(given > FELT, True))
+        felt = np.append(np.flatnonzero(given > FELT), cause)
         return cls(
             largest_force=float(np.max(forces)),
             is_finite=bool(np.isfinite(wrenches).all()),
