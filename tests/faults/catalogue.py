@@ -695,7 +695,6 @@ FAULTS = (
         corrupting(_coarse),
         "lowers",
         "coarse steps",
-        UNWATCHED,
         within=300,
     ),
     *UNSEEN,
