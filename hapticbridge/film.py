@@ -219,33 +219,37 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
     what = f"the scene of '{job['recording']}'"
     is_ready = False
     try:
-        with process:
-            watch.allow(PATIENCE)
-            print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
-            for answer in _answers(cast(IO[str], process.stdout)):
-                if "ready" in answer:
-                    is_ready = True
-                elif "seconds" in answer:
-                    watch.allow(PATIENCE + SHARE * answer["seconds"])
-                elif "frame" in answer and progress is not None:
-                    progress(answer["frame"], answer["frames"])
-                elif "error" in answer:
-                    raise RecordingError(answer["error"])
-                elif "failure" in answer:
-                    raise ForeignSceneError(f"{what} {answer['failure']}")
-                elif "done" in answer:
-                    return True
+        watch.allow(PATIENCE)
+        print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
+        for answer in _answers(cast(IO[str], process.stdout)):
+            if "ready" in answer:
+                is_ready = True
+            elif "seconds" in answer:
+                watch.allow(PATIENCE + SHARE * answer["seconds"])
+            elif "frame" in answer and progress is not None:
+                progress(answer["frame"], answer["frames"])
+            elif "error" in answer:
+                raise RecordingError(answer["error"])
+            elif "failure" in answer:
+                raise ForeignSceneError(f"{what} {answer['failure']}")
+            elif "done" in answer:
+                return True
+        status = process.wait(PATIENCE)  # its answers have ended
     except BrokenPipeError:
         return False  # the process ended before it read the job
     else:
         if is_ready:
-            end = "takes too long to draw" if watch.is_over else death(process.returncode)
+            end = "takes too long to draw" if watch.is_over else death(status)
             raise ForeignSceneError(f"{what} {end}")
         return False
     finally:
+        # not by ``with process``, which waits for its end after any signal but Ctrl-C
         watch.cancel()
         process.kill()
-        process.wait(PATIENCE)  # Ctrl-C can leave Popen without waiting for the process
+        for stream in (process.stdin, process.stdout):
+            with contextlib.suppress(OSError):
+                cast(IO[str], stream).close()
+        process.wait(PATIENCE)
 
 
 class _Watch:

@@ -96,12 +96,13 @@ class Interrupts:
     """Stop signals as exceptions, until a run takes them over.
 
     Code in C may swallow the exception of a signal, such as a callback of the importer or of the
-    compiler; ``check`` raises it again.
+    compiler. ``check`` raises it again, and so does a timer after ``RELEASE_TIME``.
     """
 
     def __init__(self) -> None:
         self.number = 0
         self._raised_at = -math.inf
+        self._again: threading.Timer | None = None
         self._taker: Callable[[str], None] | None = None
 
     def heed(self, name: str) -> None:
@@ -113,7 +114,23 @@ class Interrupts:
         now = time.monotonic()
         if now - self._raised_at > RELEASE_TIME:
             self._raised_at = now
+            self.end()
+            thread = threading.get_ident()
+            self._again = threading.Timer(1.01 * RELEASE_TIME, self._repeat, (thread,))
+            self._again.daemon = True
+            self._again.start()
             raise StopSignal(self.number)
+
+    def _repeat(self, thread: int) -> None:
+        if hasattr(signal, "pthread_kill"):  # it also ends a wait of that thread
+            signal.pthread_kill(thread, self.number)
+        else:
+            signal.raise_signal(self.number)
+
+    def end(self) -> None:
+        """Notes that the exception has arrived."""
+        if self._again is not None:
+            self._again.cancel()
 
     def check(self) -> None:
         """Raises ``StopSignal`` if a signal came, whatever became of its exception."""
@@ -153,6 +170,7 @@ def interrupting_on_signals(numbers: Sequence[int] = STOP_SIGNALS) -> Iterator[I
             interrupts.check()
             raise
         finally:
+            interrupts.end()
             sys.unraisablehook = usual
 
 

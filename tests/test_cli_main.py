@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import inspect
 import os
@@ -9,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -71,6 +73,7 @@ NOT_FOR_A_RUN = frozenset(
 
 LOADED = """
 import sys
+import threading
 from hapticbridge.cli import main
 try:
     code = main(sys.argv[1:])
@@ -288,3 +291,11 @@ def test_a_second_signal_does_not_interrupt_the_release_that_the_first_one_began
             signal.raise_signal(signal.SIGINT)
             released = True
     assert released
+
+
+def test_a_signal_that_a_library_swallowed_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hapticbridge.signals.RELEASE_TIME", 0.1)
+    with pytest.raises(StopSignal), interrupting_on_signals():
+        with contextlib.suppress(StopSignal):
+            signal.raise_signal(signal.SIGTERM)
+        threading.Event().wait(60.0)

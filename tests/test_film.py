@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,7 @@ from hapticbridge.film import Shot, draw, still
 from hapticbridge.film_process import Stage, film_ticks, force_colour, write_film
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.recording import read_recording
+from hapticbridge.signals import StopSignal, interrupting_on_signals
 
 SCENE = """<mujoco model="two">
   <option timestep="0.001" integrator="discrete" gravity="0 0 0"/>
@@ -200,3 +204,17 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
     monkeypatch.setenv("MUJOCO_GL", "disable")
     with pytest.raises(HapticBridgeError, match="MUJOCO_GL=disable does not work"):
         still(sway, Shot())
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_a_signal_ends_the_drawing_at_once(
+    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("hapticbridge.film._BOOTSTRAP", "import time; time.sleep(60)")
+    main, number = threading.get_ident(), signal.Signals[name]
+    timer = threading.Timer(0.3, signal.pthread_kill, (main, number))
+    began = time.monotonic()
+    with pytest.raises(StopSignal), interrupting_on_signals():
+        timer.start()
+        draw(sway, tmp_path / "sway.png", Shot())
+    assert time.monotonic() - began < 30.0

@@ -63,7 +63,6 @@ REASONS = {
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
-    "film.py: with process": "a timer kills the process that draws",
     "film.py: lines.readline(LONGEST_LINE)": "a timer kills the process that draws",
     "film_process.py: sys.stdin.readline()": "the caller's end closes it",
     "confinement.py: os.waitpid(self._child, 0)": "it was killed",
