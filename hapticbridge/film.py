@@ -30,7 +30,7 @@ ENDINGS = (".mp4", ".png")
 """Endings of the files that ``draw`` writes: a film, a picture."""
 
 PATIENCE = 120.0
-"""Longest wait for a renderer in s. A machine that compiles the code first needs half a minute."""
+"""Longest wait for a renderer in s. A machine that compiles the code first needs a minute."""
 
 LONGEST_LINE = 1 << 16
 """Characters of an answer of the drawing process. A longer line is no answer, and would take this

@@ -38,7 +38,7 @@ def cache_folder() -> Path | None:
     fault = machine_code.fault_of(folder)
     if fault:
         warnings.warn(
-            f"machine code is not kept, so every start compiles for half a minute: {fault}",
+            f"machine code is not kept, so every start compiles for a minute: {fault}",
             stacklevel=2,
         )
     return None if fault else folder

@@ -175,7 +175,7 @@ class Audit:
             if self.trust is not None:
                 raise RecordingError("--trust judges the recording, --what-if other runs: one each")
             return self._ask(files[0])
-        first = "the first audit on a machine compiles for about 20 s"
+        first = "the first audit on a machine compiles for up to a minute"
         with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
             report = audit(
                 files[0],

@@ -435,7 +435,7 @@ class Run:
             window.on_command = partial(bridge.command, by="view")
         if not self.as_json:
             announce(bridge.setup, is_method_chosen=self.method is not None)
-        with err.status("preparing (the first run on a machine compiles for about 20 s) …"):
+        with err.status("preparing (the first run on a machine compiles for about a minute) …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
