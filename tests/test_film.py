@@ -12,9 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import recorded, rewritten
+from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, rewritten
 from cli_cases import Called
 from PIL import Image
+from report_runs import circling
 
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, draw, still
@@ -142,6 +143,18 @@ def test_stage_stands_where_a_second_run_of_the_scene_does(sway: Path) -> None:
         assert stage.row["tick"][0] == tick
     handle = stage.data.mocap_pos[stage.model.body(HANDLE).mocapid[0]]
     np.testing.assert_allclose(handle, stage.row["handle_position"][0], atol=1e-12)
+
+
+def test_a_late_run_is_drawn_with_the_damping_of_its_device(tmp_path: Path) -> None:
+    # after a late sample the handle slips, and that slip depends on the device's damping
+    path = tmp_path / "late.mcap"
+    clock = SlowClock(dict.fromkeys(range(20, 200, 3), 4))
+    device = ScriptedDevice(circling, damping=1.3)
+    recorded(path, "point_mass", device, COUPLING, duration=0.4, clock=clock)
+    last = read_recording(path).ticks[-1]
+    stage = Stage(path)
+    stage.show(int(last["tick"]))
+    np.testing.assert_allclose(stage.data.site("grip").xpos, last["tool_position"], atol=1e-12)
 
 
 def test_coupling_is_drawn_from_tool_to_handle_in_the_colour_of_its_force(sway: Path) -> None:
