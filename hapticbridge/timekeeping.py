@@ -214,8 +214,7 @@ class Timekeeping:
     @property
     def remedy(self) -> str:
         """Changes that help a run to keep its time."""
-        request = "" if self.is_realtime else "--realtime, "
-        return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
+        return _remedy(is_realtime=self.is_realtime)
 
     @property
     def hint(self) -> str:
@@ -251,6 +250,11 @@ class Timekeeping:
         return f"{NOT_KEPT}: {found}; try {self.remedy}"
 
 
+def _remedy(*, is_realtime: bool) -> str:
+    request = "" if is_realtime else "--realtime, "
+    return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
+
+
 def _at_times(
     condition: DampingCondition, parameters: RunParameters, share: float, times: RunTimes
 ) -> DampingCondition:
@@ -266,6 +270,6 @@ def _at_times(
         needed += (
             DELAY_PRICE * half * half / condition.needed * times.mean_delay / parameters.period
         )
-    return DampingCondition(
-        condition.axis, needed, condition.available, condition.remedy, condition.delay
-    )
+    is_times_fault = condition.holds is not False
+    remedy = _remedy(is_realtime=times.is_realtime) if is_times_fault else condition.remedy
+    return DampingCondition(condition.axis, needed, condition.available, remedy, condition.delay)

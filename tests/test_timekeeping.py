@@ -203,6 +203,7 @@ def test_a_run_at_a_fifth_of_its_rate_names_what_it_needed(tmp_path: Path) -> No
     assert kept.conditions[0].needed == pytest.approx(1.7 / kept.share, rel=1e-3)
     assert is_certified(kept.conditions) is False
     assert kept.fault.startswith(f"the run did not keep its time: at {kept.rate:.4g} Hz")
+    assert kept.fault.endswith(kept.conditions[0].remedy)
 
 
 def test_short_delays_are_judged_by_what_they_gave(tmp_path: Path) -> None:
