@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -285,7 +287,11 @@ def test_a_run_that_never_began_leaves_a_file_alone_that_its_recorder_did_not_op
     else:
         recorded(path, "point_mass", duration=0.01)
         before = path.read_bytes()
-        monkeypatch.setattr(stream_module, "_BOOTSTRAP", "input()")
+        stalled = [sys.executable, "-c", "input()"]
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "bufsize": 0}
+        monkeypatch.setattr(
+            stream_module, "recorder_process", lambda: subprocess.Popen(stalled, **pipes)
+        )
 
         def interrupted(_recorder: Recorder) -> None:
             raise KeyboardInterrupt
