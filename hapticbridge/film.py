@@ -243,7 +243,7 @@ def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) ->
             raise ForeignSceneError(f"{what} {end}")
         return False
     finally:
-        # not by ``with process``, which waits for its end after any signal but Ctrl-C
+        # not by ``with process``, which after a ``StopSignal`` waits until the drawing is done
         watch.cancel()
         process.kill()
         for stream in (process.stdin, process.stdout):

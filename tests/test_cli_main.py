@@ -73,7 +73,6 @@ NOT_FOR_A_RUN = frozenset(
 
 LOADED = """
 import sys
-import threading
 from hapticbridge.cli import main
 try:
     code = main(sys.argv[1:])

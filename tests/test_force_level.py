@@ -14,7 +14,7 @@ import hapticbridge as hb
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import OK
 
-ATTACKS = 150
+ATTACKS = 300
 
 
 @pytest.mark.parametrize("start", range(0, ATTACKS, 50))

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import Motion, TrajectoryDevice
+from hapticbridge.scene import scene_names
 from hapticbridge.scene.parameters import apply_parameters
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
@@ -39,6 +40,17 @@ def test_task_in_the_bridge_ends_as_without_the_package(name: str, tmp_path: Pat
     assert hb.audit(file).verdict == "passive"
     # but for the load that the bridge's handle carries from the start: what follows is true of both
     assert ended == pytest.approx(reference.run_of_own_path(name).joints[-1], abs=3e-4)
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_own_path_followed_exactly_creates_no_energy_and_stays_sharp(name: str) -> None:
+    deepest: list[float] = []
+    device = f"trajectory:{reference.MODELS / name / name}.csv"
+    with hb.Bridge(name, device, clock=hb.SimulatedClock()) as bridge:
+        data = bridge.scene.data
+        summary = bridge.run(on_tick=lambda _: deepest.append(-data.contact.dist.min(initial=0.0)))
+    assert (summary.environment, summary.ticks) == ("strict", 8001)
+    assert max(deepest) < 20e-6
 
 
 # --- drawer ---------------------------------------------------------------------------------------
