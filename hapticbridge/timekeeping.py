@@ -22,7 +22,7 @@ rate. The second bounds what a delay gave, for any hand.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from hapticbridge.certificate import DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
@@ -270,6 +270,7 @@ def _at_times(
         needed += (
             DELAY_PRICE * half * half / condition.needed * times.mean_delay / parameters.period
         )
-    is_times_fault = condition.holds is not False
-    remedy = _remedy(is_realtime=times.is_realtime) if is_times_fault else condition.remedy
-    return DampingCondition(condition.axis, needed, condition.available, remedy, condition.delay)
+    at_times = replace(condition, needed=needed)
+    if at_times.holds is False and condition.holds is not False:
+        return replace(at_times, remedy=_remedy(is_realtime=times.is_realtime))
+    return at_times
