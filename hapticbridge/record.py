@@ -84,6 +84,8 @@ TICK_DTYPE = np.dtype(
         ("injected_rotational_damping", "<f8"),
         ("share", "<f8"),
         ("contact_tank", "<f8"),
+        ("scene_step", "<i8"),
+        ("scene_tank", "<f8"),
     ]
 )
 """One record. Row k holds the sample read in tick k, the wrench computed from it, and the energies
@@ -94,9 +96,11 @@ and ``injected_rotational_damping`` in N m s/rad are the passivity controller's 
 of that kind. ``share`` is the ratio of the lever between device and handle, 0 to 1: the share of
 the wrench that was sent, and of the device's motion to the next sample that the handle makes.
 ``contact_tank`` is the energy in J that may pay for the depenetration of rigid contacts
-(``kernel.rigid_contact``)."""
+(``kernel.rigid_contact``). ``scene_step`` counts the steps shown so far of a scene that is slower
+than the loop, and ``scene_tank`` is the energy in J that the hand has given and that scene has not
+yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
-LATER_FIELDS = ("share", "contact_tank")
+LATER_FIELDS = ("share", "contact_tank", "scene_step", "scene_tank")
 """Fields that recordings of earlier versions lack; such a recording is read without them.
 
 To add a field:
@@ -156,6 +160,7 @@ UNITS = {
     "environment_energy": "J",
     "device_energy": "J",
     "contact_tank": "J",
+    "scene_tank": "J",
     "injected_damping": "N s/m",
     "injected_rotational_damping": "N m s/rad",
 }

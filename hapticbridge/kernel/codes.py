@@ -58,6 +58,7 @@ class Scheme(IntEnum):
         MASSLESS: The tool has no mass and is placed at the handle; there is no coupling.
         MIDPOINT: The actuators apply half of it implicitly, and the other half is carried over
             from the previous step (``kernel.lossless``).
+        SHOWN: The tool is shown at a pose that comes from a slower loop (``kernel.shown_tool``).
     """
 
     IMPLICIT = 0
@@ -65,6 +66,7 @@ class Scheme(IntEnum):
     WELD = 2
     MASSLESS = 3
     MIDPOINT = 4
+    SHOWN = 5
 
     @property
     def properties(self) -> SchemeProperties:
@@ -108,6 +110,9 @@ _PROPERTIES = {
     ),
     Scheme.MIDPOINT: SchemeProperties(
         one_substep="a lossless coupling carries half of a tick's wrench over to the next"
+    ),
+    Scheme.SHOWN: SchemeProperties(
+        may_split=False, one_substep="the scene steps in a loop of its own"
     ),
 }
 

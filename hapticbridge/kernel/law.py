@@ -113,7 +113,8 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     """Returns the gains g in N/m and g_r in N m/rad of slack = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖².
 
     δx_k and δφ_k are the tool's motion in tick k, in m and rad. Without a coupling law (a weld, a
-    tool without mass) both gains are 0, because the proof of a slack needs a law. With one
+    tool without mass) both gains are 0, because the proof of a slack needs a law; also for a tool
+    that is shown between the steps of a slower scene, whose account is exact. With one
     evaluation of the law per tick g = K + B'/T.
 
     With n > 1 evaluations g = ½ (K/n + B'/T), which is the ``SLACK_SHARE`` of each evaluation's
@@ -121,7 +122,7 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     sum of all δx_i. For a given sum the slack is least if all δx_i are equal, so that g bounds it
     from below.
     """
-    if not parameters.has_law:
+    if not parameters.has_law or parameters.scene_ticks:
         return 0.0, 0.0
     coupling = parameters.coupling
     share = 1.0 if parameters.law_evaluations == 1 else SLACK_SHARE
@@ -210,7 +211,7 @@ def command_handle_velocity(s: State, orientation: Quaternion) -> None:
 
 
 @compiled
-def _spring_energy(stiffness: float, length: float, limit: float) -> float:
+def spring_energy(stiffness: float, length: float, limit: float) -> float:
     """Returns ∫ min(K e, F) de, the energy of a spring whose force is limited to F."""
     elastic = min(length, limit / stiffness) if stiffness > 0.0 else 0.0
     return 0.5 * stiffness * elastic * elastic + min(stiffness * length, limit) * (length - elastic)
@@ -260,7 +261,7 @@ def _applied(s: State, axis: int, share: float) -> float:
 
 
 @compiled
-def _spring_length(stiffness: float, energy: float, limit: float) -> float:
+def spring_length(stiffness: float, energy: float, limit: float) -> float:
     """Returns the length at which a spring of limited force holds an energy."""
     elastic = 0.5 * limit * limit / stiffness if stiffness > 0.0 else 0.0
     if energy <= elastic:
@@ -284,8 +285,8 @@ def pulled(s: State) -> tuple[Vector, Vector]:
 
 
 @compiled
-def _within(v: Vector, length: float) -> Vector:
-    """Returns a vector, shortened to a largest length."""
+def within(v: Vector, length: float) -> Vector:
+    """Returns a vector, shortened to a largest length >= 0."""
     size = norm(v)
     return scaled(length / size, v) if size > length else v
 
@@ -297,7 +298,7 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
     x, y, z = device_from_scene(axes, v)
     k = s.coupling.lacks_motor
     part = scene_from_device(axes, (x * k[first], y * k[first + 1], z * k[first + 2]))
-    return add(v, subtract(_within(part, length), part))
+    return add(v, subtract(within(part, length), part))
 
 
 @compiled
@@ -345,10 +346,10 @@ def charge_lateness(s: State, interval: float) -> None:
 @compiled
 def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[float, float]:
     """Returns the length at which a spring has paid what it owes, and what is left to pay."""
-    energy = _spring_energy(stiffness, length, limit)
+    energy = spring_energy(stiffness, length, limit)
     if stiffness <= 0.0 or owed <= 0.0:
         return np.inf, 0.0
-    return _spring_length(stiffness, max(energy - owed, 0.0), limit), max(owed - energy, 0.0)
+    return spring_length(stiffness, max(energy - owed, 0.0), limit), max(owed - energy, 0.0)
 
 
 @compiled
@@ -386,15 +387,15 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
         length, k.owed[0] = _paid(k.stiffness, norm(stretch), s.level.level[0], k.owed[0])
         angle, k.owed[1] = _paid(k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1])
         max_stretch, max_twist = min(max_stretch, length), min(max_twist, angle)
-    new, new_twist = _within(stretch, max_stretch), _within(twist, max_twist)
+    new, new_twist = within(stretch, max_stretch), within(twist, max_twist)
     if k.lacks_motors:
         new = _held(s, new, 0, k.hold[0] / k.stiffness)
         if k.rotational_stiffness > 0.0:
             new_twist = _held(s, new_twist, 3, k.hold[1] / k.rotational_stiffness)
     if s.guard.share == 0.0:
-        new = _within(new, k.idle[0] / k.stiffness)
+        new = within(new, k.idle[0] / k.stiffness)
         if k.rotational_stiffness > 0.0:
-            new_twist = _within(new_twist, k.idle[1] / k.rotational_stiffness)
+            new_twist = within(new_twist, k.idle[1] / k.rotational_stiffness)
     if new == stretch and new_twist == twist:
         return False
     slip_handle(s.pose, subtract(new, stretch), subtract(new_twist, twist))
@@ -410,8 +411,8 @@ def retune(s: State) -> tuple[float, float]:
     """
     k, goal, left = s.coupling, s.coupling.tuning_goal, s.coupling.tuning_ticks
     stretch, twist = pulled(s)
-    energy = _spring_energy(k.stiffness, norm(stretch), s.level.level[0])
-    energy_r = _spring_energy(k.rotational_stiffness, norm(twist), s.level.level[1])
+    energy = spring_energy(k.stiffness, norm(stretch), s.level.level[0])
+    energy_r = spring_energy(k.rotational_stiffness, norm(twist), s.level.level[1])
     stiffness, rotational = k.stiffness, k.rotational_stiffness
     share = 1.0 / left
     k.stiffness += share * (goal[0] - k.stiffness)
@@ -433,7 +434,7 @@ def retune(s: State) -> tuple[float, float]:
 
     length = angle = np.inf
     if k.stiffness > stiffness:
-        length = _spring_length(k.stiffness, energy, s.level.level[0])
+        length = spring_length(k.stiffness, energy, s.level.level[0])
     if k.rotational_stiffness > rotational:
-        angle = _spring_length(k.rotational_stiffness, energy_r, s.level.level[1])
+        angle = spring_length(k.rotational_stiffness, energy_r, s.level.level[1])
     return length, angle

@@ -434,6 +434,13 @@ def refresh_energies(s: State) -> None:
 
 
 @compiled
+def take_scene_energies(energy: Part, scene: Part) -> None:
+    """Takes storage and the works of the scene's own ports from another account of the scene."""
+    energy.kinetic, energy.potential = scene.kinetic, scene.potential
+    energy.actuator_work, energy.external_work = scene.actuator_work, scene.external_work
+
+
+@compiled
 def set_kinetic_energy(energy: Part, kinetic: float) -> None:
     """Replaces the kinetic energy by that of the velocity which a method balances."""
     energy.kinetic = kinetic
@@ -498,6 +505,7 @@ def close_balance(s: State) -> bool:
     energy.slack += 0.5 * s.coupling.slack_rotational_stiffness * dot(turned, turned)
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
+    created -= max(-s.shown.tank, 0.0)  # lent to a slower scene, which gives it back first
     energy.environment_energy = created
     allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput)
     if s.run.watches_device:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -205,6 +205,9 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
         raise HapticBridgeError(f"substeps is {substeps!r}; {reason}, so it must be 1")
 
 
+_SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
 TANK_STRETCH = 1e-3
 """Stretch c in m of the coupling whose energy is the cap of the tank of rigid contacts. Dissipation
 of a long time then pays for no more than the hand stores in the coupling within a millimetre. A
@@ -242,6 +245,8 @@ class RunParameters:
         guarding: Limits and thresholds of the guard.
         is_rigid: True if contacts are rigid (``kernel.rigid_contact``), False for those of the
             scene.
+        scene_ticks: Ticks per step of a scene that is slower than the loop
+            (``kernel.shown_tool``); 0 for a scene that steps in every tick.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -267,6 +272,7 @@ class RunParameters:
     device_rotational_damping: float | None = None
     guarding: GuardParameters = UNGUARDED
     is_rigid: bool = False
+    scene_ticks: int = 0
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)
@@ -311,6 +317,27 @@ class RunParameters:
     def tank_cap(self) -> float:
         """Largest energy in J that may pay for the depenetration of rigid contacts, ½ K c²."""
         return 0.5 * self.coupling.stiffness * TANK_STRETCH**2
+
+    @property
+    def of_scene(self) -> RunParameters:
+        """Parameters of a slower scene's own loop; its device is the handle."""
+        return replace(
+            self,
+            period=self.scene_ticks * self.period,
+            scene_ticks=0,
+            scale=1.0,
+            force_scale=1.0,
+            axes=_SAME_AXES,
+            force_limit=self.force_limit / self.force_scale,
+            torque_limit=self.torque_limit * self.scale / self.force_scale,
+            ramp_ticks=0,
+            device_origin=_NO_POSE,
+            handle_origin=_NO_POSE,
+            device_start=_NO_POSE,
+            device_damping=None,
+            device_rotational_damping=None,
+            guarding=UNGUARDED,
+        )
 
     @property
     def properties(self) -> SchemeProperties:

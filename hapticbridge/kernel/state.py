@@ -1,4 +1,4 @@
-"""The kernel's state, bound to a model and its data: fourteen sub-records, each with one writer.
+"""The kernel's state, bound to a model and its data: fifteen sub-records, each with one writer.
 
 One structured array of one element crosses from Python into the compiled functions: unpacking one
 array costs 0.1 µs, unpacking forty would cost more than MuJoCo's step. Numba hands its sub-records
@@ -19,12 +19,14 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
 | contact     | tank and share of rigid contacts                  | rigid_contact                 |
+| shown       | shown pose of a slower scene's tool, its tank      | shown_tool                    |
 | timing      | delay of the force, energy that it may have given | timing                        |
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import cast
 
 import mujoco
@@ -67,6 +69,12 @@ from hapticbridge.kernel.passivity_controller import (
     observe_reset,
 )
 from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_model
+from hapticbridge.kernel.shown_tool import (
+    SHOWN_DTYPE,
+    bind_shown,
+    start_shown,
+    tool_geoms,
+)
 from hapticbridge.kernel.springs import SPRINGS_DTYPE, restore_springs
 from hapticbridge.kernel.swing_watch import WATCH_DTYPE, bind_watch
 from hapticbridge.kernel.tick import LOOP_DTYPE, between_halves, discard_wrench, pause
@@ -139,6 +147,7 @@ STATE_DTYPE = np.dtype(
         ("lossless", LOSSLESS_DTYPE),
         ("springs", SPRINGS_DTYPE),
         ("contact", RIGID_DTYPE),
+        ("shown", SHOWN_DTYPE),
         ("timing", TIMING_DTYPE),
     ]
 )
@@ -198,6 +207,8 @@ class BoundKernel:
         ``kernel.tick.advance`` calls the C functions with equal results to the bit.
         """
         plain: MujocoStep = mujoco.mj_step
+        if self._record["shown"]["is_shown"]:
+            raise SceneError("a shown tool has no step of its own")
         if self._record["run"]["scheme"] == Scheme.MASSLESS:
             plain = mujoco.mj_fwdPosition
         if not self._record["contact"]["is_rigid"]:
@@ -281,7 +292,9 @@ class BoundKernel:
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size
-        if parameters.scheme == Scheme.MIDPOINT:
+        else:
+            self._own({"geom_is_tool": tool_geoms(model, grip)})
+        if parameters.scheme == Scheme.MIDPOINT and not parameters.scene_ticks:
             body = int(model.site_bodyid[grip])
             arrays = bind_lossless(self._record, model, data, body, first)
             self._owned |= arrays
@@ -299,6 +312,8 @@ class BoundKernel:
         for name in _FROM_PARAMETERS:
             run[name] = getattr(parameters, name)
         run["timestep"] = self._model.opt.timestep
+        if parameters.scene_ticks:
+            run["scheme"] = Scheme.SHOWN
         run["device_damping"] = parameters.device_damping or 0.0
         run["device_rotational_damping"] = parameters.device_rotational_damping or 0.0
         run["watches_device"] = not parameters.has_law and parameters.device_damping is not None
@@ -313,13 +328,17 @@ class BoundKernel:
                 parameters.force_limit / parameters.force_scale,
                 parameters.torque_limit * parameters.scale / parameters.force_scale,
             ),
-            is_solved=parameters.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT)
+            is_solved=not parameters.scene_ticks
+            and parameters.scheme in (Scheme.IMPLICIT, Scheme.MIDPOINT)
             and self._model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE,
         )
         bind_guard(s["guard"], parameters)
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
-        self._owned |= bind_contact(s["contact"], self._model, self._data, parameters)
+        bind_shown(s["shown"], parameters)
+        is_rigid = parameters.is_rigid and not parameters.scene_ticks
+        own = replace(parameters, is_rigid=is_rigid)
+        self._owned |= bind_contact(s["contact"], self._model, self._data, own)
 
     def _start(self, parameters: RunParameters) -> None:
         s = self._record
@@ -331,7 +350,9 @@ class BoundKernel:
         else:
             direct(refresh_energies, s)(s)
         start_energies(s["energy"])
-        if parameters.scheme == Scheme.MIDPOINT:
+        if parameters.scene_ticks:
+            direct(start_shown, self.state)(self.state)
+        elif parameters.scheme == Scheme.MIDPOINT:
             direct(note_twist, s)(s)
             direct(restart_lossless, s)  # loads its code ahead of a command; not run here
             self._restore_springs = direct(restore_springs, s)

@@ -97,6 +97,7 @@ from hapticbridge.kernel.passivity_controller import (
     within_energy_limit,
 )
 from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
+from hapticbridge.kernel.shown_tool import hand_over, shown_wrench, take_over
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -210,7 +211,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
         meter_delay(s, max(elapsed, s.run.period), interval)
     else:
         skip_delay(s)
-    if s.mj.nmocap > 1:
+    if s.mj.nmocap > 1 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
         max_stretch, max_twist = retune(s)
@@ -263,8 +264,10 @@ def before_step(
         code = _take_sample(s, sample, row, elapsed)
         if code != OK:
             return code
-    orientation = place_handle(s, substep)
     scheme = s.run.scheme
+    if scheme == Scheme.SHOWN:
+        return OK
+    orientation = place_handle(s, substep)
     if scheme == Scheme.IMPLICIT:
         command_handle_velocity(s, orientation)
     elif scheme == Scheme.MIDPOINT:
@@ -377,7 +380,16 @@ def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
         return limited_wrench_after_step(s, is_last)
     if s.run.scheme == Scheme.MIDPOINT:
         return lossless_wrench(s)
+    if s.run.scheme == Scheme.SHOWN:
+        return shown_wrench(s)
     return compared_wrench(s, is_last)
+
+
+@compiled
+def _has_failed(s: State) -> bool:
+    if s.run.scheme == Scheme.SHOWN:  # another thread may be in MuJoCo's step
+        return bool(s.shown.has_failed)
+    return bool(has_warned(s.mj))
 
 
 @compiled
@@ -397,7 +409,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if s.contact.is_rigid:
         follow_speed(s)
     is_last = substep + 1 == s.run.substeps
-    if scheme != Scheme.MASSLESS:
+    if scheme not in (Scheme.MASSLESS, Scheme.SHOWN):
         meter_ports(s)
     if count == 1 and not is_last:
         end_mocap_moves(s)
@@ -407,6 +419,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if s.contact.is_rigid:
         finish_contacts(s)
     loop.law_work = dot(force, moved) + dot(torque, turned)
+    if scheme == Scheme.SHOWN:
+        loop.law_work = s.shown.work
     if count > 1:
         share = 1.0 / count
         force, torque = scaled(share, force), scaled(share, torque)
@@ -424,13 +438,16 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
     is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
-    if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or has_warned(s.mj):
+    if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or _has_failed(s):
         return _refuse(s)
     _render(s, force, torque)
     if foreseen_excess(s) > s.guard.max_energy:
         _refuse(s)
         return GAVE_ENERGY
-    loop.active_contacts = ints(s.mj.ncon, 1)[0]
+    if scheme == Scheme.SHOWN:
+        loop.active_contacts = s.shown.contacts
+    else:
+        loop.active_contacts = ints(s.mj.ncon, 1)[0]
     if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
         loop.active_contacts = s.lossless.active_contacts
     if s.contact.is_rigid:
@@ -439,7 +456,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
         loop.flags |= CONTACT
-    row[0].solver_iterations = _solver_iterations(s)
+    row[0].solver_iterations = 0 if scheme == Scheme.SHOWN else _solver_iterations(s)
     return OK
 
 
@@ -481,7 +498,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     loop = s.loop
     loop.has_positions = has_positions
     restore_springs(s)
-    if s.run.scheme != Scheme.MASSLESS:
+    if s.run.scheme not in (Scheme.MASSLESS, Scheme.SHOWN):
         refresh_energies(s)
     if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
         loop.has_positions = 0  # it was computed with the springs of the other form
@@ -537,6 +554,7 @@ def _record(s: State, row: NDArray[np.void]) -> None:
     r.injected_rotational_damping = s.observer.injected_rotational_damping
     r.share = s.guard.share
     r.contact_tank = s.contact.tank
+    r.scene_step, r.scene_tank = s.shown.scene_step, s.shown.tank
 
 
 @compiled
@@ -754,6 +772,59 @@ def simulate_recorded(
     for k in range(samples.size):
         state[0].loop.external_flags = external_flags[k]
         if not whole_tick(state, samples[k : k + 1], row, elapsed[k]):
+            return k
+        rows[k] = row[0]
+    return int(samples.size)
+
+
+@compiled
+def take_result(
+    state: NDArray[np.void],
+    scene: NDArray[np.void],
+    given: NDArray[np.void],
+) -> None:
+    """Takes over the step that a slower scene has done, and gives it the handle of now."""
+    if state[0].shown.waits:
+        take_over(state, scene)
+    hand_over(state, given)
+
+
+@compiled_for_threads
+def simulate_shown(
+    states: tuple[NDArray[np.void], NDArray[np.void]],
+    samples: NDArray[np.void],
+    external_flags: NDArray[np.int64],
+    elapsed: NDArray[np.float64],
+    scene_steps: NDArray[np.int64],
+    own: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
+    rows: NDArray[np.void],
+) -> int:
+    """Runs the ticks of a recorded run in front of a slower scene.
+
+    Args:
+        states: The bound states of the loop and of the scene.
+        samples: Device samples, one per tick.
+        external_flags: ``STALE_SAMPLE`` as recorded, one per tick.
+        elapsed: Time between two samples in s, one per tick.
+        scene_steps: ``scene_step`` as recorded, one per tick. A step is taken over where it rises.
+        own: The bound records of loop and scene, and the scene's sample.
+        rows: Receives the records; as long as ``samples``.
+
+    Returns:
+        Count of completed ticks, as for ``simulate``.
+    """
+    state, scene = states
+    row, scene_row, given = own
+    for k in range(samples.size):
+        state[0].loop.external_flags = external_flags[k]
+        if before_step(state, samples[k : k + 1], row, 0, elapsed[k]) != OK:
+            return k
+        waits = state[0].shown.waits
+        if not waits or scene_steps[k] > state[0].shown.scene_step:
+            if waits and not whole_tick(scene, given, scene_row, scene[0].run.period):
+                return k
+            take_result(state, scene, given)
+        if after_step(state, row, 0) != OK:
             return k
         rows[k] = row[0]
     return int(samples.size)

@@ -1,0 +1,345 @@
+"""A scene slower than the loop: the coupling pulls at a pose of the tool that is shown in between.
+
+The scene steps once in T_s = n T, in a loop of its own, with the handle of the moment at which its
+last result was taken over. When the next result arrives, it is older than the handle by T_s or
+more. The loop shows the tool where it is by now,
+
+    y* = x + v q + ½ a q²,    q = t − t_h
+
+with x the newest pose of the scene, v its velocity in m/s, a the change of v over the last steps in
+m/s², t_h the time of the handle that it answers. Rotations have rotation vectors. A surface that
+the tool touches or is near to stops it: a plane through the contact point of the newest step, which
+moves on as fast as the tool has pushed it.
+
+The coupling between handle h and shown pose y gives the tool, when y moves by δy in one tick,
+
+    P = V(h − y + δy) − V(h − y) + f_d·δy
+
+in J. V is the energy of its spring with its force level, f_d = P_F(K e + (B'/T)(δh − δy)) − P_F(K e)
+what its damper adds. Under b >= K T/2 + B', with the fast T, the hand has then put in at least
+Σ P + V, for every motion of y: ‖f_d‖² <= (B'/T) f_d·(δh − δy), so the damper's share is a sum of
+squares (``theory``, and a test with motions at random). The scene took W = Σ f_s·δx, metered in its
+own loop. The tank
+
+    D = Σ P − W
+
+is what the hand has given and the scene has not yet got. The tool is shown at the pose nearest to
+y*, on the way there, with which D does not become negative (passive set-position modulation, Lee &
+Huang 2010), so the hand gets nothing that the scene did not give. D is capped, so that an hour of
+dissipation does not pay for one push.
+
+A result may have taken more than the hand has given by now, W > Σ P, because the hand turned back
+meanwhile. D is then negative: a loan to the scene, −D. Until the scene or the hand has paid it, the
+tool is shown only where that costs nothing, P >= 0. So Σ P >= min W over the time until now, and
+the hand cannot get more than the scene has released. The next handle that the scene is given is
+drawn so near to its tool that the spring holds no more than ``credit`` + D.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.force_level import limited_wrench
+from hapticbridge.kernel.handle import note_tool
+from hapticbridge.kernel.law import law_wrench, spring_energy, spring_length, within
+from hapticbridge.kernel.ledger import take_scene_energies
+from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.pose import (
+    Quaternion,
+    Vector,
+    add,
+    canonical,
+    cross,
+    dot,
+    norm,
+    product,
+    quaternion_exp,
+    quaternion_of,
+    rotation_between,
+    scaled,
+    store_quaternion,
+    store_vector,
+    subtract,
+    vector_of,
+)
+
+PLANES = 16
+"""Largest number of surfaces that stop the shown tool between two steps of the scene."""
+
+LONGEST = 3.0
+"""Time beyond the handle of the newest result, in scene periods, for which the tool's motion is
+foreseen. If the next result is later than that, the tool stays where it is shown."""
+
+HALVINGS = 24
+"""Halvings in the search for the largest motion that the tank pays for; 1e-7 of the motion."""
+
+FASTEST = 1.0
+"""Speed in m/s up to which the tool passes on the coupling's whole force in time."""
+
+SHOWN_DTYPE = np.dtype(
+    [
+        ("is_shown", "<i8"),
+        ("has_failed", "<i8"),
+        ("waits", "<i8"),
+        ("scene_step", "<i8"),
+        ("age", "<i8"),
+        ("held_back", "<i8"),
+        ("contacts", "<i8"),
+        ("planes", "<i8"),
+        ("scene_period", "<f8"),
+        ("lead", "<f8"),
+        ("tank", "<f8"),
+        ("cap", "<f8"),
+        ("credit", "<f8"),
+        ("work", "<f8"),
+        ("scene_work", "<f8"),
+        ("before", "<f8", 7),
+        ("pose", "<f8", 7),
+        ("velocity", "<f8", 6),
+        ("acceleration", "<f8", 6),
+        ("normals", "<f8", 3 * PLANES),
+        ("arms", "<f8", 3 * PLANES),
+        ("gaps", "<f8", PLANES),
+        ("speeds", "<f8", PLANES),
+    ]
+)
+"""Sub-record ``shown``, written by this module alone. ``waits`` is 1 while the scene has a handle,
+``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
+handed over, ``held_back`` those in which the tank was too low for y*. ``lead`` in s is the age of
+the newest result when it was taken over. ``tank`` D, ``cap``, ``credit``, ``work`` P of the present
+tick and ``scene_work`` W in J. ``before`` and ``pose`` are the tool's poses before and after the
+newest step; a plane has a normal away from the surface, the arm from the grip to the contact point,
+the gap at the pose ``before`` in m, and the speed against its normal in m/s."""
+
+
+def bind_shown(shown: Part, parameters: RunParameters) -> None:
+    """Fills in the sub-record; nothing of it is used by a scene that steps in every tick.
+
+    The cap of the tank is F²/K + 2 F v T_s: what two springs at their level hold, and what passes
+    at v = 1 m/s while a result is under way. The credit is F²/(2K), the energy of one of them.
+    """
+    if not parameters.scene_ticks:
+        return
+    force = parameters.force_limit / parameters.force_scale
+    period = parameters.scene_ticks * parameters.period
+    spring = 0.5 * force * force / parameters.coupling.stiffness
+    shown["is_shown"], shown["scene_period"] = 1, period
+    shown["credit"], shown["cap"] = spring, 2.0 * (spring + force * FASTEST * period)
+
+
+def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
+    """Returns 1 for each geom that is rigid with the grip, else 0."""
+    tool = model.body_weldid[model.site_bodyid[grip_site]]
+    is_tool = model.body_weldid[model.geom_bodyid] == tool
+    return np.ascontiguousarray(is_tool, dtype=np.int32)
+
+
+@compiled
+def start_shown(state: NDArray[np.void]) -> None:
+    """Shows the tool at its present pose, at rest."""
+    s = state[0]
+    for numbers in (s.shown.before, s.shown.pose):
+        store_vector(numbers[0:3], vector_of(s.pose.tool_position))
+        store_quaternion(numbers[3:7], quaternion_of(s.pose.tool_quaternion))
+
+
+# From the loop to the scene and back
+
+
+@compiled
+def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
+    """Gives the scene's next step the handle of now, as its sample.
+
+    The handle is drawn toward the scene's tool where their spring holds more than the credit and
+    the tank allow.
+    """
+    s = state[0]
+    pose, given, k, level = s.pose, sample[0], s.coupling, s.level.level
+    s.shown.age, s.shown.waits = 0, 1
+    tool, orientation = vector_of(s.shown.pose), quaternion_of(s.shown.pose[3:7])
+    stretch = subtract(vector_of(pose.handle_position), tool)
+    twist = rotation_between(orientation, quaternion_of(pose.handle_quaternion))
+    energy = spring_energy(k.stiffness, norm(stretch), level[0])
+    energy_r = spring_energy(k.rotational_stiffness, norm(twist), level[1])
+    allowed = max(s.shown.credit + s.shown.tank, 0.0)
+    if energy + energy_r <= allowed:
+        store_vector(given.position, vector_of(pose.handle_position))
+        store_quaternion(given.quaternion, quaternion_of(pose.handle_quaternion))
+        return
+    share = allowed / (energy + energy_r)
+    if energy > 0.0:
+        stretch = within(stretch, spring_length(k.stiffness, share * energy, level[0]))
+    if energy_r > 0.0:
+        twist = within(twist, spring_length(k.rotational_stiffness, share * energy_r, level[1]))
+    store_vector(given.position, add(tool, stretch))
+    store_quaternion(given.quaternion, canonical(product(quaternion_exp(twist), orientation)))
+
+
+@compiled
+def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
+    """Takes over the result of a step of the scene: pose, motion, energies and contacts."""
+    s, scene = state[0], scene_state[0]
+    shown, motion = s.shown, scene.loop.motion
+    rate = 1.0 / shown.scene_period
+    # a blow changes the velocity at once; the next step knows more
+    is_free = shown.contacts == 0 and scene.loop.active_contacts == 0 and shown.scene_step > 0
+    for i in range(6):
+        velocity = rate * motion[i]
+        shown.acceleration[i] = rate * (velocity - shown.velocity[i]) if is_free else 0.0
+        shown.velocity[i] = velocity
+    for i in range(7):
+        shown.before[i] = shown.pose[i]
+    store_vector(shown.pose[0:3], vector_of(scene.pose.tool_position))
+    store_quaternion(shown.pose[3:7], quaternion_of(scene.pose.tool_quaternion))
+    shown.contacts = scene.loop.active_contacts
+    shown.tank -= scene.energy.coupling_work - shown.scene_work
+    shown.scene_work = scene.energy.coupling_work
+    shown.scene_step += 1
+    shown.lead = shown.age * s.run.period
+    take_scene_energies(s.energy, scene.energy)
+    _take_planes(s, scene)
+
+
+@compiled
+def _take_planes(s: State, scene: State) -> None:
+    """Notes the surfaces near the tool, from the contacts of the step's start."""
+    mj, shown = scene.mj, s.shown
+    is_tool = ints(mj.geom_is_tool, mj.ngeom)
+    grip = vector_of(shown.before)
+    moved = subtract(vector_of(shown.pose), grip)
+    turn = rotation_between(quaternion_of(shown.before[3:7]), quaternion_of(shown.pose[3:7]))
+    count = 0
+    for c in range(ints(mj.ncon, 1)[0]):
+        contact = pointer_at(mj.contact) + c * mj.contact_size
+        geoms = ints(contact + mj.contact_geoms, 2)
+        if count == PLANES or geoms[0] < 0 or geoms[1] < 0:
+            continue
+        side = is_tool[geoms[1]] - is_tool[geoms[0]]
+        if side == 0:
+            continue
+        # the normal points from the first geom to the second
+        normal = scaled(float(side), vector_of(floats(contact + mj.contact_frame, 3)))
+        arm = subtract(vector_of(floats(contact + mj.contact_point, 3)), grip)
+        gap = max(floats(contact + mj.contact_distance, 1)[0], 0.0)
+        pushed = max(-gap - dot(normal, add(moved, cross(turn, arm))), 0.0)
+        store_vector(shown.normals[3 * count : 3 * count + 3], normal)
+        store_vector(shown.arms[3 * count : 3 * count + 3], arm)
+        shown.gaps[count] = gap
+        shown.speeds[count] = pushed / shown.scene_period
+        count += 1
+    shown.planes = count
+
+
+# In every tick
+
+
+@compiled
+def _foreseen(s: State) -> tuple[Vector, Quaternion]:
+    """Returns y*, where the tool is by now as far as is known."""
+    shown = s.shown
+    q = min(shown.age * s.run.period + shown.lead, LONGEST * shown.scene_period)
+    v, a, half = shown.velocity, shown.acceleration, 0.5 * q * q
+    step = add(scaled(q, vector_of(v)), scaled(half, vector_of(a)))
+    turn = add(scaled(q, vector_of(v[3:6])), scaled(half, vector_of(a[3:6])))
+    orientation = product(quaternion_exp(turn), quaternion_of(shown.pose[3:7]))
+    position = add(vector_of(shown.pose), step)
+    if shown.planes > 0:
+        position = _outside(shown, position, orientation, q + shown.scene_period)
+    return position, canonical(orientation)
+
+
+@compiled
+def _outside(shown: Part, position: Vector, orientation: Quaternion, time: float) -> Vector:
+    """Returns a position of the tool, moved out of the planes, a time in s after ``before``."""
+    turn = rotation_between(quaternion_of(shown.before[3:7]), orientation)
+    for _ in range(4):
+        moved = subtract(position, vector_of(shown.before))
+        has_moved = False
+        for k in range(shown.planes):
+            normal = vector_of(shown.normals[3 * k : 3 * k + 3])
+            arm = vector_of(shown.arms[3 * k : 3 * k + 3])
+            free = shown.gaps[k] + time * shown.speeds[k]
+            inside = -free - dot(normal, add(moved, cross(turn, arm)))
+            if inside > 0.0:
+                position = add(position, scaled(inside, normal))
+                moved = add(moved, scaled(inside, normal))
+                has_moved = True
+        if not has_moved:
+            break
+    return position
+
+
+@compiled
+def _stored(s: State, position: Vector, orientation: Quaternion) -> float:
+    """Returns V, the energy in J that the coupling's springs hold with the tool at a pose."""
+    k, level = s.coupling, s.level.level
+    stretch = subtract(vector_of(s.pose.handle_position), position)
+    twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
+    energy = spring_energy(k.stiffness, norm(stretch), level[0])
+    return float(energy + spring_energy(k.rotational_stiffness, norm(twist), level[1]))
+
+
+@compiled
+def _shown_at(
+    s: State, share: float, step: Vector, turn: Vector
+) -> tuple[Vector, Quaternion, Vector, Vector, Vector, Vector]:
+    """Returns pose, wrench and motion after a share of a motion from the pose shown last."""
+    moved, turned = scaled(share, step), scaled(share, turn)
+    last = quaternion_of(s.pose.tool_quaternion)
+    position = add(vector_of(s.pose.tool_position), moved)
+    orientation = canonical(product(quaternion_exp(turned), last))
+    handle = vector_of(s.pose.handle_position), quaternion_of(s.pose.handle_quaternion)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    force, torque = limited_wrench(s, force, torque)
+    return position, orientation, force, torque, moved, turned
+
+
+@compiled
+def _given(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
+    """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
+    position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
+    k, level = s.coupling, s.level.level
+    stretch = subtract(vector_of(s.pose.handle_position), position)
+    twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
+    elastic = within(scaled(k.stiffness, stretch), level[0])
+    elastic_r = within(scaled(k.rotational_stiffness, twist), level[1])
+    damped = dot(subtract(force, elastic), moved) + dot(subtract(torque, elastic_r), turned)
+    return float(before - _stored(s, position, orientation) + damped)
+
+
+@compiled
+def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
+    """Shows the tool in the present tick.
+
+    Returns:
+        Force in N and torque in N m on the tool, and its motion in m and rotation vector in rad.
+    """
+    shown, pose = s.shown, s.pose
+    goal, orientation = _foreseen(s)
+    last = quaternion_of(pose.tool_quaternion)
+    step = subtract(goal, vector_of(pose.tool_position))
+    turn = rotation_between(last, orientation)
+    before = _stored(s, vector_of(pose.tool_position), last)
+    share, least = 1.0, -max(shown.tank, 0.0)
+    work = _given(s, before, share, step, turn)
+    if work < least:
+        shown.held_back += 1
+        high, share, work = 1.0, 0.0, 0.0
+        for _ in range(HALVINGS):
+            middle = 0.5 * (share + high)
+            given = _given(s, before, middle, step, turn)
+            if given < least:
+                high = middle
+            else:
+                share, work = middle, given
+    shown.work = work
+    shown.tank = min(shown.tank + work, shown.cap)
+    shown.age += 1
+    position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
+    note_tool(pose, position, orientation)
+    return force, torque, moved, turned
