@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF, OK
+from hapticbridge.kernel.codes import BAD_RESULT, CLUTCHED, FORCE_OFF, OK
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import advance, after_step, before_step
+from hapticbridge.kernel.tick import advance, after_step, before_step, take_result, whole_tick
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import load_scene
@@ -57,6 +57,7 @@ HAND_DTYPE = np.dtype(
         ("most", "<f8"),
         ("saturated", "<i8"),
         ("tick", "<i8"),
+        ("due", "<i8"),
     ]
 )
 
@@ -131,6 +132,7 @@ def _attack(
     sample: NDArray[np.void],
     row: NDArray[np.void],
     hand: NDArray[np.void],
+    scene: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
     habits: NDArray[np.float64],
     rng: Any,
 ) -> int:
@@ -138,7 +140,9 @@ def _attack(
 
     ``habits``: count of axes, kind of hand, b, b_r, limit of force and torque in N and N m that
     only the device applies, buttons, speed in m/s, share of the speed w/b at which it follows,
-    ticks of pushing, waiting and following, and periods by which three samples in ten are late.
+    ticks of pushing, waiting and following, periods by which three samples in ten are late, ticks
+    per step of the scene. ``scene``: state, record and sample of a scene slower than the loop, of
+    which three steps in ten come late.
     """
     s, h = state[0], hand[0]
     period, late = s.run.period, habits[12]
@@ -167,7 +171,16 @@ def _attack(
         code = before_step(state, sample, row, 0, elapsed)
         if code != OK:
             return code
-        advance(state)
+        if habits[13] == 0.0:
+            advance(state)
+        elif h.tick >= h.due:
+            slow, slow_row, given = scene
+            if s.shown.waits and not whole_tick(slow, given, slow_row, slow[0].run.period):
+                return BAD_RESULT
+            take_result(state, slow, given)
+            h.due = h.tick + int(habits[13])
+            if rng.random() < 0.3:
+                h.due += int(habits[13] * rng.random())
         code = after_step(state, row, 0)
         if code != OK:
             return code
@@ -195,6 +208,8 @@ class Attack:
         presses: True if the hand presses buttons and switches the force.
         tunes: True if it changes the coupling.
         late: Periods by which samples are late at most.
+        scene_ticks: Ticks per step of a scene slower than the loop; 0 steps it in every tick.
+        pays: False shows every result of that scene at once, as a bridge must not.
         is_limited_alone: True limits the force on the device alone, as a bridge must not.
     """
 
@@ -209,6 +224,8 @@ class Attack:
     presses: bool = True
     tunes: bool = True
     late: float = 0.0
+    scene_ticks: int = 0
+    pays: bool = True
     is_limited_alone: bool = False
 
     @classmethod
@@ -238,13 +255,14 @@ class Attack:
         mass = 10 ** rng.uniform(-1.5, 0.0)
         values: dict[str, Any] = {"mass": mass} if self.scene in HEAVY else {}
         scene = load_scene(self.scene, **values)
-        prepare(scene, strongest, period, 1, method, warns=False)
+        step = period * max(self.scene_ticks, 1)
+        prepare(scene, strongest, step, 1, method, warns=False)
         start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         parameters = RunParameters(
             grip=scene.grip,
             period=period,
             substeps=1,
-            coupling=method.law_coupling(strongest, period),
+            coupling=method.law_coupling(strongest, step),
             scale=self.scale,
             force_scale=self.force_scale,
             force_limit=1e9 if self.is_limited_alone else limits[0],
@@ -257,11 +275,17 @@ class Attack:
             is_rigid=method.is_rigid,
             device_damping=b,
             device_rotational_damping=b_r,
+            scene_ticks=self.scene_ticks,
             guarding=GuardParameters(
                 clutch=1, fade_ticks=max(round(0.02 / period), 1), has_hand=True
             ),
         )
-        kernel = BoundKernel(scene.model, scene.data, parameters)
+        kernel = slow = BoundKernel(scene.model, scene.data, parameters)
+        if self.scene_ticks:
+            slow = BoundKernel(scene.model, scene.data, parameters.of_scene)
+        if not self.pays:
+            kernel.state["shown"]["tank"] = kernel.state["shown"]["cap"] = 1e9
+        parts = slow.state, slow.row, np.zeros(1, SAMPLE_DTYPE)
         hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)
         hand["quaternion"][0, 0] = 1.0
         times = 10 ** rng.uniform([-2.7, -2.7, -1.5], [-0.7, -0.7, 0.3]) / period
@@ -277,6 +301,7 @@ class Attack:
                 rng.uniform(0.05, 0.6),
                 *np.ceil(times),
                 self.late,
+                self.scene_ticks,
             ]
         )
         draw = np.random.default_rng([self.seed, 2])
@@ -288,10 +313,13 @@ class Attack:
                 kernel.command(int(rng.choice([0, FORCE_OFF, CLUTCHED])))
             if self.tunes and rng.random() < 0.2:
                 wanted = self._coupling(rng, b / gain, b_r / gain_r, rng.uniform(0.1, 1.0))
-                law = method.law_coupling(wanted, period)
-                goal = replace(parameters, coupling=law)
-                kernel.tune(goal, method.gains(law, period), max(round(0.02 / period), 1))
-            code = _attack(kernel.state, sample, kernel.row, hand, habits, draw)
+                law = method.law_coupling(wanted, step)
+                goal, ticks = replace(parameters, coupling=law), max(round(0.02 / period), 1)
+                kernel.tune(goal, method.gains(law, step), ticks)
+                if self.scene_ticks:
+                    ticks = max(round(0.02 / step), 1)
+                    slow.tune(goal.of_scene, method.gains(law, step), ticks)
+            code = _attack(kernel.state, sample, kernel.row, hand, parts, habits, draw)
             if code != OK:
                 break
         return float(hand["most"][0]), int(hand["saturated"][0]), code

@@ -28,7 +28,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import Part, State
+from hapticbridge.kernel.codes import Part, Scheme, State
 from hapticbridge.kernel.handle import (
     device_from_scene,
     scene_from_device,
@@ -430,7 +430,8 @@ def retune(s: State) -> tuple[float, float]:
         for i in range(6):
             k.gains[i] = goal[6 + i]
     k.tuning_ticks = left - 1
-    set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)
+    if s.run.scheme != Scheme.SHOWN:  # then the scene's own loop does it, in its own time
+        set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)
 
     length = angle = np.inf
     if k.stiffness > stiffness:
