@@ -63,7 +63,8 @@ class Bridge:
         scene: A loaded scene, a shipped scene's name, or a path to MJCF.
         device: An open device, or a string for ``open_device``. A device opened from a string is
             closed if the bridge is refused.
-        coupling: Stiffness and damping to be felt; None selects the stiffest safe coupling.
+        coupling: Stiffness and damping to be felt; None selects the stiffest safe coupling, and a
+            mapping such as ``{"damping": 2.0}`` changes gains of it.
         options: Rate, method, workspace, limits, buttons; see ``BridgeOptions``.
         clock: Clock of the run; None is a ``RealClock``. A ``SimulatedClock`` runs as fast as
             possible and equally in every run.
@@ -87,7 +88,7 @@ class Bridge:
         self,
         scene: Scene | str | Path,
         device: Device | str = "simulated",
-        coupling: Coupling | None = None,
+        coupling: Coupling | Mapping[str, float] | None = None,
         options: BridgeOptions = DEFAULT_OPTIONS,
         *,
         clock: Clock | None = None,

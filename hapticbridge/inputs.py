@@ -6,7 +6,7 @@ them, and a re-simulation applies them again at the recorded tick.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -107,12 +107,13 @@ def _numbers(what: str, value: ArrayLike, counts: tuple[int, ...]) -> list[float
     return [float(number) for number in array]
 
 
-def apply_writes(data: mujoco.MjData, writes: Sequence[Sequence[Any]]) -> None:
-    """Applies writes from ``input_writes`` or from a recorded event.
+def applied_writes(data: mujoco.MjData, writes: Sequence[Sequence[Any]]) -> Callable[[], None]:
+    """Returns a function that applies writes from ``input_writes`` or from a recorded event.
 
     Raises:
         SceneError: A write names another field or exceeds it.
     """
+    located = []
     for field, first, numbers in writes:
         if field not in _FIELDS:
             raise SceneError(f"an input names field '{field}'; inputs are {choices(_FIELDS)}")
@@ -121,4 +122,10 @@ def apply_writes(data: mujoco.MjData, writes: Sequence[Sequence[Any]]) -> None:
             raise SceneError(
                 f"an input writes {field}[{first}:{first + len(numbers)}] of {target.size} numbers"
             )
-        target[first : first + len(numbers)] = numbers
+        located.append((target[first : first + len(numbers)], np.array(numbers, np.float64)))
+
+    def apply() -> None:
+        for target, numbers in located:
+            target[:] = numbers
+
+    return apply

@@ -8,7 +8,7 @@ device, and refuses what they cannot do. The live loop and the studies share
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,18 +41,21 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.kernel.parameters import (
+    MAX_SCENE_TICKS,
     UNGUARDED,
     GuardParameters,
     RunParameters,
     checked_substeps,
+    refuse_scene_ticks,
     refuse_substeps,
     rotation_numbers,
 )
 from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.realtime import wants_real_time
+from hapticbridge.realtime import scene_ticks_for, step_time, wants_real_time
 from hapticbridge.rendering import (
     TIPPED,
     Method,
+    at_timestep,
     default_method,
     holding_force,
     method_named,
@@ -133,6 +136,10 @@ _KINDS: dict[str, Any] = {
 }
 
 
+AUTO = "auto"
+"""Rate of the scene that is chosen by what its step takes."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BridgeOptions:
     """Options of a bridge; the defaults suit a device with known damping.
@@ -140,7 +147,12 @@ class BridgeOptions:
     Attributes:
         rate: Ticks per second in Hz, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one, the device receives the mean
-            of their wrenches and needs another damping (``certificate.required_damping``).
+            of their wrenches and needs another damping (``certificate.required_damping``). For a
+            slower scene they are the steps between two of its results.
+        scene_rate: Results of the scene per second in Hz. Below ``rate`` the scene steps in a
+            thread of its own, and the tool is shown between its results (``slow_scene``). The scene
+            then has the nearest period of whole ticks. "auto" steps it in every tick if it can keep
+            the rate on a real clock, measured at its start, else as fast as it can.
         method: Name of the rendering method (``rendering.METHODS``). None selects ``lossless``, or
             ``implicit`` with substeps, because ``lossless`` takes none.
         contact: ``rigid``, strictly passive contacts at the level of velocities
@@ -175,6 +187,7 @@ class BridgeOptions:
 
     rate: float = 1000.0
     substeps: int = 1
+    scene_rate: float | str = AUTO
     method: str | None = None
     contact: str | None = None
     contact_stiffness: float | None = None
@@ -199,6 +212,8 @@ class BridgeOptions:
                     f"{name.replace('_', ' ')} is {shown(value)}; it must be {_WORDS[kind]}"
                 )
         period_of(self.rate)
+        if self.scene_rate != AUTO:
+            refuse_scene_ticks(self.rendering_method.scheme, self.scene_ticks)
         refuse_substeps(self.rendering_method.scheme, checked_substeps(self.substeps))
         if self.controller is not None and self.controller not in CONTROLLERS:
             raise DeviceError(
@@ -211,6 +226,23 @@ class BridgeOptions:
             raise DeviceError(
                 f"clutch and dead-man are both button {self.clutch}; they exclude each other"
             )
+
+    @property
+    def scene_ticks(self) -> int:
+        """Ticks between two results of the scene; 0 for every tick, also with "auto".
+
+        Raises:
+            HapticBridgeError: The scene's rate is out of range.
+        """
+        if self.scene_rate == AUTO:
+            return 0
+        if not is_number(self.scene_rate) or not 0 < float(self.scene_rate) <= self.rate:
+            raise HapticBridgeError(
+                f"scene rate is {shown(self.scene_rate)}; it must be 'auto', or a number of Hz > 0 "
+                f"and at most the rate, {self.rate:g}"
+            )
+        ticks = round(min(self.rate / float(self.scene_rate), MAX_SCENE_TICKS + 1))
+        return 0 if ticks < 2 else ticks
 
     @property
     def rendering_method(self) -> Method:
@@ -231,6 +263,7 @@ class OptionChanges(TypedDict, total=False):
 
     rate: float
     substeps: int
+    scene_rate: float | str
     method: str | None
     contact: str | None
     contact_stiffness: float | None
@@ -285,7 +318,8 @@ class RunSetup:
         method: The rendering method.
         period: T in s.
         info: The device's data sheet.
-        substeps: MuJoCo steps per tick.
+        substeps: MuJoCo steps per tick, or between two results of a slower scene.
+        scene_ticks: Ticks between two results of a slower scene; 0 if it steps in every tick.
         workspace: Map from the device's frame to the scene's.
         limits: Limits of the wrench.
         guard: Guard parameters.
@@ -302,6 +336,7 @@ class RunSetup:
     period: float
     info: DeviceInfo = PRESCRIBED_MOTION
     substeps: int = 1
+    scene_ticks: int = 0
     workspace: Workspace = SAME_FRAME
     limits: Limits = UNLIMITED
     guard: GuardParameters = UNGUARDED
@@ -316,7 +351,7 @@ class RunSetup:
         cls,
         scene: Scene,
         info: DeviceInfo,
-        coupling: Coupling | None,
+        coupling: Coupling | Mapping[str, float] | None,
         options: BridgeOptions,
         clock: Clock,
         *,
@@ -329,7 +364,8 @@ class RunSetup:
             info: The device's data sheet.
             coupling: Requested K and B. None selects the stiffest safe coupling for the device's
                 damping: 80 % of the bound, with a quarter of b as damping, less where substeps need
-                it. Unknown damping is replaced by ``certificate.assumed_damping``.
+                it. Unknown damping is replaced by ``certificate.assumed_damping``. A mapping
+                replaces gains of that coupling.
             options: The user's options.
             clock: Clock of the run.
             is_recorded: True if the run is recorded.
@@ -342,15 +378,28 @@ class RunSetup:
             period_of(options.rate),
             options.substeps,
         )
-        scales, law_evaluations = options.workspace.scales, method.law_evaluations(substeps)
+        is_real_clock = clock.name == RealClock.name
+        ticks = options.scene_ticks
+        if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:
+            ticks = scene_ticks_for(substeps * step_time(scene, method), period)
+        scales, law_evaluations = (
+            options.workspace.scales,
+            1 if ticks else method.law_evaluations(substeps),
+        )
         if options.mark is not None and not is_recorded:
             raise RecordingError(
                 f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
                 " name a file to record to"
             )
         refuse_simulated_time(info, clock)
-        requested = coupling or default_coupling(info, period, *scales, law_evaluations, method)
-        law = method.law_coupling(requested, period / substeps)
+        timestep = max(ticks, 1) * period / substeps
+        if isinstance(coupling, Coupling):
+            requested = coupling
+        else:
+            requested = default_coupling(info, period, *scales, law_evaluations, method)
+            requested = at_timestep(method, requested, period / law_evaluations, timestep)
+            requested = replace(requested, **(coupling or {}))
+        law = method.law_coupling(requested, timestep)
         limits = limits_for(info, options.limits)
         guard = guard_parameters_for(
             info,
@@ -371,7 +420,6 @@ class RunSetup:
             dead_man=button_mask(options.dead_man, "dead-man"),
         )
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
-        is_real_clock = clock.name == RealClock.name
         return cls(
             scene=scene,
             info=info,
@@ -379,6 +427,7 @@ class RunSetup:
             method=method,
             period=period,
             substeps=substeps,
+            scene_ticks=ticks,
             workspace=options.workspace,
             limits=limits,
             guard=guard,
@@ -392,19 +441,29 @@ class RunSetup:
         )
 
     @property
+    def scene_period(self) -> float:
+        """Time in s between two results of the scene."""
+        return max(self.scene_ticks, 1) * self.period
+
+    @property
+    def timestep(self) -> float:
+        """MuJoCo's h in s."""
+        return self.scene_period / self.substeps
+
+    @property
     def law(self) -> Coupling:
         """Coupling of the law: K and B', for which the device needs b >= s (K T/2 + B')."""
-        return self.method.law_coupling(self.coupling, self.period / self.substeps)
+        return self.method.law_coupling(self.coupling, self.timestep)
 
     @property
     def attainable(self) -> Coupling:
         """Requested coupling, with damping raised to the least that the method can render."""
-        return self.method.requested_coupling(self.law, self.period / self.substeps)
+        return self.method.requested_coupling(self.law, self.timestep)
 
     @property
     def law_evaluations(self) -> int:
         """Evaluations of the wrench on the tool per tick."""
-        return self.method.law_evaluations(self.substeps)
+        return 1 if self.scene_ticks else self.method.law_evaluations(self.substeps)
 
     @property
     def coupling_limits(self) -> CouplingLimits:
@@ -417,7 +476,8 @@ class RunSetup:
             period=self.period,
             scale=scale,
             force_scale=force_scale,
-            substeps=self.substeps,
+            timestep=self.timestep,
+            law_evaluations=self.law_evaluations,
             limits=self.limits,
         )
 
@@ -480,6 +540,7 @@ class RunSetup:
             grip=self.scene.grip,
             period=self.period,
             substeps=self.substeps,
+            scene_ticks=self.scene_ticks,
             coupling=self.law,
             scale=scale,
             force_scale=force_scale,

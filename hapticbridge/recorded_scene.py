@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -41,6 +42,7 @@ from hapticbridge.run_description import (
 )
 from hapticbridge.scene import Scene, load_scene, scene_parameters
 from hapticbridge.scene.source import refuse_outside
+from hapticbridge.slow_scene import SlowScene
 
 SIMULATION_TIME, SLOWEST = 15, 20
 """Processor time in s that a simulation may take, and beyond it per second of the run. Machine code
@@ -59,7 +61,7 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
     The machine code of its method is loaded here first: the child inherits it.
     """
     method = method_of(recording.meta)
-    load_machine_code(method.name, method.contact)
+    load_machine_code(method.name, method.contact, parameters.scene_ticks > 0)
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
@@ -67,7 +69,7 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
 
 
 @cache
-def load_machine_code(name: str, contact: str) -> None:
+def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
     """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
     A child process may not write it, and each would load it again.
@@ -81,11 +83,17 @@ def load_machine_code(name: str, contact: str) -> None:
         parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
+        parameters = replace(parameters, scene_ticks=2 * is_slow)
         kernel = BoundKernel(scene.model, scene.data, parameters)
         sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
         rows, flags = np.zeros(1, TICK_DTYPE), np.zeros(1, np.int64)
         sample["quaternion"][:, 0] = 1.0
-        simulate_recorded(kernel.state, sample, flags, nothing, kernel.row, rows)
+        if is_slow:
+            slow = SlowScene(kernel, scene.model, scene.data, parameters)
+            slow.simulate(sample, flags, nothing, flags, rows)
+            slow.close()
+        else:
+            simulate_recorded(kernel.state, sample, flags, nothing, kernel.row, rows)
         kernel.release()
     finally:
         scene.release()
@@ -186,7 +194,7 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
             home, meta = f"{main.parent}/", recording.meta
             scene = load_unpacked(main, parameters.grip, recorded_values(meta), meta)
             requested, method = requested_of(meta), method_of(meta)
-            steps = parameters.period, parameters.substeps
+            steps = parameters.scene_period, parameters.substeps
             prepare(scene, requested, *steps, method, warns=False)
             check_prepared(scene.model, parameters, method)
     except RecordingError:

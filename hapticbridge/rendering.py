@@ -20,7 +20,7 @@ from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import HANDLE, WELD_NAME, Scheme, added_id, coupling_ids
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
-from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.kernel.parameters import SLOW_SCHEMES, RunParameters, checked_substeps
 from hapticbridge.kernel.rigid_contact import finish_contacts
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.pose import IDENTITY_POSE
@@ -95,6 +95,11 @@ class Method:
         """True if contacts can be rigid: MuJoCo solves the coupling's law together with them."""
         properties = self.scheme.properties
         return self.integrator == "discrete" and properties.has_law and not properties.holds_wrench
+
+    @property
+    def can_be_slow(self) -> bool:
+        """True if the scene can step in a slower loop than the bridge's (``slow_scene``)."""
+        return self.scheme in SLOW_SCHEMES
 
     @property
     def contact(self) -> str:
@@ -176,6 +181,11 @@ class Method:
             damping=damping(k, b, timestep, self.compensated_share),
             rotational_damping=damping(kr, br, timestep, self.compensated_share),
         )
+
+
+def at_timestep(method: Method, requested: Coupling, old: float, new: float) -> Coupling:
+    """Returns the requested coupling at another time step whose law is the same; steps in s."""
+    return method.requested_coupling(method.law_coupling(requested, old), new)
 
 
 def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> None:

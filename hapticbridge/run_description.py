@@ -229,6 +229,7 @@ def describe_run(
     return meta | {
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
+        "scene_ticks": str(parameters.scene_ticks),
         "ramp_ticks": str(parameters.ramp_ticks),
         "guard": parameters.guarding.to_json(),
         "method": method,
@@ -279,7 +280,7 @@ def requested_of(meta: Mapping[str, str]) -> Coupling:
     parameters, method = parameters_of(meta), method_of(meta)
     try:
         requested = Coupling(*numbers)
-        law = method.law_coupling(requested, parameters.period / parameters.substeps)
+        law = method.law_coupling(requested, parameters.timestep)
     except HapticBridgeError as error:
         raise RecordingError(f"metadata 'requested' is out of range: {error}") from None
     if law != parameters.coupling:
@@ -311,6 +312,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
             substeps=meta_count(meta, "substeps"),
+            scene_ticks=meta_count(meta, "scene_ticks") if "scene_ticks" in meta else 0,
             coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
             ramp_ticks=meta_count(meta, "ramp_ticks"),
             axes=meta_numbers(meta, "axes", 9),

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.device import Device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
-from hapticbridge.inputs import Write, apply_writes
+from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
@@ -43,6 +44,7 @@ from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare
 from hapticbridge.run_description import attachments, describe_run, start_state
 from hapticbridge.signals import deferring_stops
+from hapticbridge.slow_scene import SlowScene
 from hapticbridge.summary import RunOutcome, Summary
 
 SUSPENDED_NS = 50_000_000
@@ -175,9 +177,11 @@ class TickKernel:
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
         self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
 
-    def bind(self, bound: BoundKernel, setup: RunSetup) -> None:
+    def bind(self, bound: BoundKernel, setup: RunSetup, slow: SlowScene | None) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
         self.bound, self.step, self.substeps = bound, bound.step, range(setup.substeps)
+        if slow is not None:
+            self.step, self.substeps = slow.exchange, range(1)
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
         self.is_ahead = False
         self.external_flags = bound.external_flags
@@ -192,9 +196,9 @@ class TickKernel:
         is_taken = self._publish(self.bound.row, self.rows, self.cursors, *times, flags)
         return OK if is_taken else RING_FULL
 
-    def publish_positions(self, snapshot: Snapshot) -> None:
-        """Copies the scene's positions for an observer."""
-        self._publish_positions(self.bound.state, self.cursors, snapshot.head, snapshot.numbers)
+    def publish_positions(self, snapshot: Snapshot, bound: BoundKernel) -> None:
+        """Copies the positions of a scene for an observer."""
+        self._publish_positions(bound.state, self.cursors, snapshot.head, snapshot.numbers)
 
 
 class Session:
@@ -217,6 +221,7 @@ class Session:
         commands: Queue of commands.
         executor: Execution of the queue's commands.
         inputs: Waiting changes of the scene's inputs.
+        slow: Loop of a scene that is slower than the bridge's; None without one.
         mark: The mark button; None without one.
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
@@ -238,6 +243,7 @@ class Session:
         self.stopped_by = self.signal = ""
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = False
+        self.slow: SlowScene | None = None
         self.inputs: deque[list[Write]] = deque()
         self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
         with ExitStack() as resources:
@@ -253,7 +259,7 @@ class Session:
         resources.callback(scene.release)
         if not setup.tool_weight and not scene.is_carried:
             scene.carry_tool("--no-tool-weight")
-        effective = prepare(scene, setup.coupling, setup.period, setup.substeps, setup.method)
+        effective = prepare(scene, setup.coupling, setup.scene_period, setup.substeps, setup.method)
         with deferring_stops():
             self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
             if self._snapshot is not None:
@@ -266,10 +272,11 @@ class Session:
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
             is_real = self.device.info.is_real
-            check_pace(scene, setup.method, setup.period, setup.substeps, is_real=is_real)
+            check_pace(scene, setup.method, setup.scene_period, setup.substeps, is_real=is_real)
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
-        # before the recorder is waited for, which may stand still
+        resources.callback(self._close_scene)
+        # before the recorder and the scene are waited for, which may stand still
         resources.callback(self.device.close)
         sample[:] = self.device.start(setup.period)
         refuse_implausible_pose(self.device.info, sample)
@@ -277,7 +284,11 @@ class Session:
         start = start_state(scene.model, scene.data).tobytes()
         bound = BoundKernel(scene.model, scene.data, self.parameters)
         resources.callback(bound.release)
-        self.kernel.bind(bound, setup)
+        if self.parameters.scene_ticks:
+            self.slow = SlowScene(bound, scene.model, scene.data, self.parameters)
+            if not clock.may_wait:
+                self.slow.start()
+        self.kernel.bind(bound, setup, self.slow)
         if setup.workspace.absolute:
             refuse_stretched_start(bound.state, sample, setup.limits)
         if self.stream.is_read:
@@ -285,8 +296,12 @@ class Session:
             self.event("start")
         if self.output.observer is not None:
             self.commands.warm_up()
-        applier = EventApplier(bound, scene.model, scene.data, setup.method, self.parameters, start)
-        self.executor = CommandExecutor(self.commands, applier, setup.guard.fade_ticks, self.event)
+        self._applier = EventApplier(
+            bound, scene.data, setup.method, self.parameters, start, self.slow
+        )
+        self.executor = CommandExecutor(
+            self.commands, self._applier, setup.guard.fade_ticks, self.event
+        )
         self.mark: MarkButton | None = None
         if setup.mark:
             self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
@@ -321,6 +336,10 @@ class Session:
         )
         self._resources.close()
 
+    def _close_scene(self) -> None:
+        if self.slow is not None:
+            self.slow.close()
+
     def _close_stream(self) -> None:
         """Finishes the recording, or removes it if start-up failed or a signal came before."""
         is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
@@ -349,7 +368,9 @@ class Session:
         self.stopped_by = self.signal = ""
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
-        self.kernel.is_ahead = self.setup.is_pipelined and can_split(model, method.scheme)
+        self.kernel.is_ahead = (
+            self.setup.is_pipelined and self.slow is None and can_split(model, method.scheme)
+        )
 
     def note_grants(self, grants: tuple[Grant, ...]) -> None:
         """Records the answers of the system to the real-time requests; warns once of refusals."""
@@ -375,7 +396,7 @@ class Session:
         """Applies waiting inputs and one command before a tick, and records them."""
         while self.inputs:
             writes = self.inputs.popleft()
-            apply_writes(self.setup.scene.data, writes)
+            self._applier.write(writes)
             self.event("input", writes=writes)
         if self.commands.waiting or self.executor.later:
             self.executor.act(self.tick)
@@ -387,7 +408,11 @@ class Session:
             RecordingError: The recorder ended, or its disk is full.
         """
         if self._snapshot is not None:
-            self.kernel.publish_positions(self._snapshot)
+            publish = partial(self.kernel.publish_positions, self._snapshot)
+            if self.slow is None:
+                publish(self.kernel.bound)
+            else:
+                self.slow.note_picture(publish)
         self.stream.look()
         return self.tick + self._chore_ticks
 

@@ -275,7 +275,7 @@ class Summary:
             hazard=method.hazard,
             coupling=RunCoupling.of(
                 method,
-                parameters.period / parameters.substeps,
+                parameters.timestep,
                 requested,
                 law=parameters.coupling,
                 measured=parameters.effective,

@@ -75,6 +75,47 @@ def released_by_coupling(parameters: RunParameters, gains: Array, motion: Motion
     return stored
 
 
+def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
+    """Returns P, the coupling's work on a tool that is shown between a scene's steps, (n,) in J.
+
+        P = V(h − y_{k−1}) − V(h − y_k) + f_d·δy + the same for torques
+
+    V is the energy of the spring up to the force level, f_d the wrench beyond the spring's own.
+    """
+    ticks, motion, parameters = block.ticks, block.motion, events.parameters
+    gains, wrench = events.gains(ticks["tick"]), ticks["wrench_on_tool"]
+    twist_before = turn_between(motion.tool_before[:, 3:], ticks["handle_quaternion"])
+    work = np.zeros(len(ticks))
+    for column, part, limit, before, after, step in (
+        (0, slice(0, 3), 0, motion.stretch + motion.tool_step, motion.stretch, motion.tool_step),
+        (2, slice(3, 6), 1, twist_before, motion.twist, motion.tool_turn),
+    ):
+        stiffness, level = gains[:, column], limits_on_tool(parameters)[limit]
+        length = np.linalg.norm(after, axis=1)
+        elastic = np.minimum(stiffness, level / np.maximum(length, 1e-300))[:, None] * after
+        work += spring_energy(stiffness, np.linalg.norm(before, axis=1), level)
+        work -= spring_energy(stiffness, length, level)
+        work += np.sum((wrench[:, part] - elastic) * step, axis=1)
+    return work
+
+
+def _shown_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[Deviation]:
+    """Yields where a shown tool moved without being paid for, or the scene stepped too often."""
+    ticks, before = block.ticks, block.state
+    tank = ticks["scene_tank"]
+    work = np.diff(balance.coupling_work, prepend=before.sums["coupling_work"])
+    allowed = TOLERANCE * (1 + balance.throughput + np.abs(tank))
+    unpaid = np.minimum(tank - work, 0.0) - tank
+    yield Deviation("scene_tank", unpaid, allowed, "J", "the shown tool's motion")
+    last = np.concatenate([before.row["scene_tank"], tank[:-1]])
+    steps = ticks["scene_step"]
+    is_new = np.diff(steps, prepend=before.row["scene_step"])
+    raised = np.where(is_new == 0, tank - last - work, 0.0)
+    yield Deviation("scene_tank", raised, allowed, "J", "the shown tool's motion")
+    too_many = np.maximum(np.abs(is_new - 0.5) - 0.5, steps - ticks["tick"] / block.scene_ticks)
+    yield Deviation("scene_step", too_many, 0.0, "", "the ticks that it takes")
+
+
 @dataclass(frozen=True, slots=True)
 class EnergyBalance:
     """Energies of some ticks, computed from recorded poses and wrenches.
@@ -83,7 +124,7 @@ class EnergyBalance:
 
     Attributes:
         coupling_work: Cumulative Σ f·δx + τ·δφ of the recorded wrench, (n,) in J; as recorded if
-            several laws per tick are summed.
+            several laws per tick are summed. For a shown tool Σ P (``shown_work``).
         throughput: Cumulative Σ |f·δx + τ·δφ|, (n,) in J.
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
@@ -119,10 +160,14 @@ class EnergyBalance:
         totals = {"throughput": _summed(np.abs(work), before["throughput"])}
         # with several laws per tick the mean wrench does not determine the summed work
         coupling_work = ticks["coupling_work"]
+        if parameters.scene_ticks:
+            work = shown_work(block, events)
         if parameters.law_evaluations == 1:
             coupling_work = _summed(work, before["coupling_work"])
         stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        if parameters.scene_ticks:
+            created = created - np.maximum(-ticks["scene_tank"], 0.0)  # lent to the scene
         linear, angular = _slack_gains(parameters, gains)
         slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
@@ -145,7 +190,7 @@ class EnergyBalance:
             environment_energy=created,
             slack=totals["slack"],
             excess_device_energy=excess,
-            contact_tank=(ceiling - created) * parameters.is_rigid,
+            contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
 
@@ -212,9 +257,10 @@ def _device_motion(rows: NDArray[np.void], first: int, count: int) -> tuple[Arra
 def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]:
     """Returns K + B'/T and K_r + B'_r/T of the law, (n,) each.
 
-    With n laws per tick only half of K/n + B'/T counts; without a coupling law both are 0.
+    With n laws per tick only half of K/n + B'/T counts. Without a coupling law both are 0, also
+    where the work on a shown tool is exact.
     """
-    if not parameters.has_law:
+    if not parameters.has_law or parameters.scene_ticks:
         return np.zeros(len(gains)), np.zeros(len(gains))
     n, share = parameters.law_evaluations, 1.0 if parameters.law_evaluations == 1 else SLACK_SHARE
     linear = gains[:, 0] / n + gains[:, 1] / parameters.period
@@ -262,3 +308,5 @@ def energy_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[D
         size = throughput + np.abs(ticks["potential"]) + np.abs(balance.environment_energy)
         allowed = TOLERANCE * (1 + size)
         yield Deviation(name, amount, allowed, "J", "recorded poses and wrenches")
+    if block.scene_ticks:
+        yield from _shown_deviations(block, balance)

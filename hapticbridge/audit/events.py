@@ -116,7 +116,7 @@ class RunEvents:
         if last is first:
             return ()
         run = self.parameters
-        coupling = RunCoupling.of(method, run.period / run.substeps, law=last)
+        coupling = RunCoupling.of(method, run.timestep, law=last)
         translation, *rotation = coupling.sentences()
         if last.rotational_stiffness == first.rotational_stiffness:
             rotation = []

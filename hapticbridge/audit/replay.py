@@ -20,7 +20,6 @@ from hapticbridge.commands import EventApplier
 from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.inputs import apply_writes
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -39,6 +38,7 @@ from hapticbridge.run_description import (
     versions,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.slow_scene import SlowScene
 
 # Attached scene
 
@@ -142,7 +142,10 @@ class Resimulator:
         method.step(model, data)
         restore_state(model, data, start)
         self.binding = BoundKernel(model, data, parameters)
-        self._commands = EventApplier(self.binding, model, data, method, parameters, start)
+        self._slow: SlowScene | None = None
+        if parameters.scene_ticks:
+            self._slow = SlowScene(self.binding, model, data, parameters)
+        self._commands = EventApplier(self.binding, data, method, parameters, start, self._slow)
         check_start(recording, self.binding.state)
 
     @property
@@ -176,9 +179,12 @@ class Resimulator:
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
-            count = simulate_recorded(
-                state, samples[part], outside[part], elapsed[part], row, rows[part]
-            )
+            given = samples[part], outside[part], elapsed[part]
+            if self._slow is not None:
+                steps = np.ascontiguousarray(ticks["scene_step"][part])
+                count = self._slow.simulate(*given, steps, rows[part])
+            else:
+                count = simulate_recorded(state, *given, row, rows[part])
             self.is_over = count < end - done
             done += count
             if self._changes and done == end < len(ticks):
@@ -221,7 +227,7 @@ class Resimulator:
             self._commands.apply(event)
             return
         try:
-            apply_writes(self.data, event.get("writes", []))
+            self._commands.write(event.get("writes", []))
         except (HapticBridgeError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"event 'input' at tick {event.get('tick')} is damaged: {error}"

@@ -349,7 +349,7 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
         worst = run.worst
         coupling = RunCoupling.of(
             method,
-            parameters.period / parameters.substeps,
+            parameters.timestep,
             _requested(recording),
             law=parameters.coupling,
             measured=parameters.effective,

@@ -65,6 +65,7 @@ class AuditedBlock:
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
         share_before: r_{k−1}, the share of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
+        scene_ticks: Ticks between two results of a slower scene; 0 for another.
     """
 
     ticks: NDArray[np.void]
@@ -75,6 +76,7 @@ class AuditedBlock:
     interval: Array
     share_before: Array
     rise_ticks: Array
+    scene_ticks: int
 
     @classmethod
     def of(
@@ -104,6 +106,7 @@ class AuditedBlock:
             interval=_sample_intervals(ticks, state, parameters.period),
             share_before=before,
             rise_ticks=rise,
+            scene_ticks=parameters.scene_ticks,
         )
 
     def state_after(self, sums: dict[str, float]) -> AuditState:

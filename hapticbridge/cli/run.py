@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions, run_conditions
+from hapticbridge.certificate import device_conditions, run_conditions
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
@@ -33,7 +33,8 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.options import SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.options import AUTO, SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.realtime import scene_ticks_for, step_time
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
@@ -57,7 +58,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         f"{method.contact} contacts"
     )
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
-    rendered = RunCoupling.of(method, setup.period / substeps, coupling, is_always_implicit=held)
+    rendered = RunCoupling.of(method, setup.timestep, coupling, is_always_implicit=held)
     for sentence in rendered.sentences():
         err.print(f"  {sentence}")
     coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
@@ -303,6 +304,10 @@ class Run:
     """MuJoCo steps per tick; with more than one the mean of their wrenches is sent. By default one,
     or as many as keep the file's own time step if it is shorter and the scene alone would move
     noticeably differently."""
+    scene_rate: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="HZ")] = AUTO
+    """Steps of the scene per second. Below --rate the scene steps in a thread of its own, and the
+    tool is shown between its steps, passively. By default 'auto': every tick if the scene can keep
+    the rate, else as often as it can."""
     realtime: bool = False
     """Request real-time priority and locked memory for the loop, and print what the system refuses
     (see 'hapticbridge doctor'). Always done with a real device."""
@@ -403,8 +408,12 @@ class Run:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
         if self.method is not None:
             return 1
-        setting = Setting(NO_HAND, period_of(self.rate), contact=self.contact or "rigid")
+        ticks = self._scene_ticks(scene)
+        period = max(ticks, 1) * period_of(self.rate)
+        setting = Setting(NO_HAND, period, contact=self.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
+        if ticks:  # more steps would not be in time
+            count = 1
         if count > 1:
             notify(
                 f"{count} MuJoCo steps per tick keep the file's own time step, without which the "
@@ -415,6 +424,11 @@ class Run:
         if moved is not None and moved.creation:
             notify(moved.creation)
         return count
+
+    def _scene_ticks(self, scene: Scene) -> int:
+        if self.scene_rate != AUTO or self.fast:
+            return BridgeOptions(rate=self.rate, scene_rate=self.scene_rate).scene_ticks
+        return scene_ticks_for(step_time(scene, default_method()), period_of(self.rate))
 
     def _feel(
         self,
@@ -427,7 +441,8 @@ class Run:
     ) -> int:
         """Runs the bridge on a device that is open; returns the exit code."""
         options = self._options(device.info)
-        coupling = self._coupling(device.info, options)
+        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
+        coupling = {name: value for name, value in gains.items() if value is not None}
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
         )
@@ -458,6 +473,7 @@ class Run:
         return BridgeOptions(
             rate=self.rate,
             substeps=1 if self.substeps is None else self.substeps,
+            scene_rate=self.scene_rate,
             method=self.method,
             contact=self.contact,
             contact_stiffness=self.contact_stiffness,
@@ -491,11 +507,3 @@ class Run:
         from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone
 
         return Window(Address() if self.port is None else Address(self.port))
-
-    def _coupling(self, info: DeviceInfo, options: BridgeOptions) -> Coupling:
-        """Returns the default coupling with the user's gains."""
-        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
-        chosen = {name: value for name, value in gains.items() if value is not None}
-        method, period = options.rendering_method, period_of(options.rate)
-        law_evaluations, scales = method.law_evaluations(options.substeps), options.workspace.scales
-        return replace(default_coupling(info, period, *scales, law_evaluations, method), **chosen)

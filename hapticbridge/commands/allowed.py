@@ -92,8 +92,7 @@ class AxisCouplingLimits:
         """
         run, (linear, angular) = self.run, assumed_damping(self.run.info)
         known = replace(run.info, damping=linear, rotational_damping=angular)
-        law_evaluations = run.method.law_evaluations(run.substeps)
-        is_linear = law_evaluations == 1 and not delay_ticks(known, run.period)
+        is_linear = run.law_evaluations == 1 and not delay_ticks(known, run.period)
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
         ratios = run.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
@@ -102,7 +101,7 @@ class AxisCouplingLimits:
             scales = run.scale, run.force_scale
             try:
                 need = required_axis_damping(
-                    known, requested, run.period, *scales, law_evaluations, run.method
+                    known, requested, run.period, *scales, run.law_evaluations, run.method
                 )
                 needs.append(need[self.axis == "rotation"])
             except CouplingError:  # no damping compensates this delay
@@ -193,7 +192,8 @@ class CouplingLimits:
         period: T in s.
         scale: s_h, handle motion per device motion.
         force_scale: s_f, force on the device per force on the tool.
-        substeps: MuJoCo steps per tick.
+        timestep: MuJoCo's h in s.
+        law_evaluations: Evaluations of the law per tick.
         limits: Limits of the run.
     """
 
@@ -203,7 +203,8 @@ class CouplingLimits:
     period: float
     scale: float
     force_scale: float
-    substeps: int
+    timestep: float
+    law_evaluations: int
     limits: Limits
 
     @cached_property
@@ -231,7 +232,7 @@ class CouplingLimits:
 
     def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""
-        return self.method.law_coupling(requested, self.period / self.substeps)
+        return self.method.law_coupling(requested, self.timestep)
 
     def reason(self) -> str:
         """Returns the reason of the slider limits, in a sentence."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -15,11 +16,13 @@ from hapticbridge.commands.allowed import CouplingLimits
 from hapticbridge.commands.command import Command, Couple, Mark, Repeat, Reset, Switch
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CommandError, HapticBridgeError, RecordingError
+from hapticbridge.inputs import applied_writes
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.rendering import Method
 from hapticbridge.run_description import restore_state
+from hapticbridge.slow_scene import SlowScene
 
 # Events of commands: recorded, and repeated by a re-simulation
 
@@ -74,22 +77,23 @@ def bits_in(event: Mapping[str, Any]) -> int:
 
 
 class EventApplier:
-    """Applies events of commands to a live or simulated run.
+    """Applies events of commands and inputs to a live or simulated run.
 
     The loop applies the event that it records, so live run and re-simulation share one path.
-    ``start`` is the scene's state at the start (``run_description.start_state``), as bytes.
+    ``start`` is the scene's state at the start (``run_description.start_state``), as bytes. A scene
+    slower than the loop takes part in a change before its next step.
     """
 
     def __init__(
         self,
         binding: BoundKernel,
-        model: mujoco.MjModel,
         data: mujoco.MjData,
         method: Method,
         parameters: RunParameters,
         start: bytes,
+        slow: SlowScene | None = None,
     ) -> None:
-        self._binding, self._model, self._data = binding, model, data
+        self._binding, self._data, self._slow = binding, data, slow
         self._method, self._parameters, self._start = method, parameters, start
 
     def apply(self, event: Mapping[str, Any]) -> None:
@@ -101,16 +105,39 @@ class EventApplier:
         kind, parameters = event.get("event"), self._parameters
         if kind == "coupling":
             coupling = coupling_in(event, parameters)
-            gains = self._method.gains(coupling, parameters.period / parameters.substeps)
+            gains = self._method.gains(coupling, parameters.timestep)
             goal = replace(parameters, coupling=coupling)
             self._binding.tune(goal, gains, tuning_ticks(parameters.period))
+            if self._slow is not None:
+                of_scene = goal.of_scene
+                tune = partial(self._slow.bound.tune, of_scene, gains)
+                self._slow.change(partial(tune, tuning_ticks(of_scene.period)))
         elif kind == "switch":
             self._binding.command(bits_in(event))
         elif kind == "reset":
             if not self._method.has_coupling:
                 raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
-            restore_state(self._model, self._data, self._start)
-            self._binding.handle_reset()
+            self._reset()
+
+    def _reset(self) -> None:
+        if self._slow is not None:
+            self._slow.settle()
+        restore_state(self._data.model, self._data, self._start)
+        if self._slow is not None:
+            self._slow.bound.handle_reset()
+        self._binding.handle_reset()
+
+    def write(self, writes: Sequence[Sequence[Any]]) -> None:
+        """Applies the writes of an event ``input`` (``inputs.input_writes``).
+
+        Raises:
+            SceneError: A write names another field or exceeds it.
+        """
+        apply = applied_writes(self._data, writes)
+        if self._slow is None:
+            apply()
+        else:
+            self._slow.change(apply)
 
 
 MAX_WAITING = 8

@@ -15,6 +15,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import Scheme, SchemeProperties
+from hapticbridge.pose import IDENTITY_POSE
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
@@ -205,8 +206,35 @@ def refuse_substeps(scheme: int, substeps: int) -> None:
         raise HapticBridgeError(f"substeps is {substeps!r}; {reason}, so it must be 1")
 
 
+SLOW_SCHEMES = (Scheme.IMPLICIT, Scheme.MIDPOINT)
+"""Schemes of a scene that may be slower than the loop: MuJoCo solves the coupling in its step."""
+
+MAX_SCENE_TICKS = 1000
+"""Largest number of ticks per step of a slower scene. At 1 kHz that is one step per second; a
+slower one shows nothing that a hand could meet."""
+
+
+def refuse_scene_ticks(scheme: int, ticks: int) -> None:
+    """Refuses a number of ticks per step of a slower scene, or a scheme that cannot have one.
+
+    Raises:
+        HapticBridgeError: The number is neither 0 nor 2 to ``MAX_SCENE_TICKS``, or the scheme is
+            not solved within MuJoCo's step.
+    """
+    if ticks == 0:
+        return
+    if not isinstance(ticks, int) or not 2 <= ticks <= MAX_SCENE_TICKS:
+        raise HapticBridgeError(
+            f"the scene steps once in {ticks!r} ticks; it must be 2 to {MAX_SCENE_TICKS}, or in "
+            "every one"
+        )
+    if scheme not in SLOW_SCHEMES:
+        raise HapticBridgeError(
+            "a scene slower than the loop needs method 'lossless', 'implicit' or 'compensated'"
+        )
+
+
 _SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-_NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 TANK_STRETCH = 1e-3
 """Stretch c in m of the coupling whose energy is the cap of the tank of rigid contacts. Dissipation
@@ -245,7 +273,7 @@ class RunParameters:
         guarding: Limits and thresholds of the guard.
         is_rigid: True if contacts are rigid (``kernel.rigid_contact``), False for those of the
             scene.
-        scene_ticks: Ticks per step of a scene that is slower than the loop
+        scene_ticks: Ticks per ``substeps`` of a scene that is slower than the loop
             (``kernel.shown_tool``); 0 for a scene that steps in every tick.
 
     Raises:
@@ -296,6 +324,7 @@ class RunParameters:
                 "without mass, and has no meaning for another"
             )
         refuse_substeps(self.scheme, self.substeps)
+        refuse_scene_ticks(self.scheme, self.scene_ticks)
         if self.ramp_ticks < 0:
             raise HapticBridgeError(f"the ramp is {self.ramp_ticks} ticks; it must be >= 0")
         for name in ("device_origin", "handle_origin", "device_start"):
@@ -323,7 +352,7 @@ class RunParameters:
         """Parameters of a slower scene's own loop; its device is the handle."""
         return replace(
             self,
-            period=self.scene_ticks * self.period,
+            period=self.scene_period,
             scene_ticks=0,
             scale=1.0,
             force_scale=1.0,
@@ -331,9 +360,9 @@ class RunParameters:
             force_limit=self.force_limit / self.force_scale,
             torque_limit=self.torque_limit * self.scale / self.force_scale,
             ramp_ticks=0,
-            device_origin=_NO_POSE,
-            handle_origin=_NO_POSE,
-            device_start=_NO_POSE,
+            device_origin=IDENTITY_POSE,
+            handle_origin=IDENTITY_POSE,
+            device_start=IDENTITY_POSE,
             device_damping=None,
             device_rotational_damping=None,
             guarding=UNGUARDED,
@@ -352,7 +381,17 @@ class RunParameters:
     @property
     def law_evaluations(self) -> int:
         """Evaluations of the tool's wrench per tick."""
-        return self.properties.law_evaluations(self.substeps)
+        return 1 if self.scene_ticks else self.properties.law_evaluations(self.substeps)
+
+    @property
+    def scene_period(self) -> float:
+        """Time in s between two results of the scene."""
+        return max(self.scene_ticks, 1) * self.period
+
+    @property
+    def timestep(self) -> float:
+        """MuJoCo's h in s."""
+        return self.scene_period / self.substeps
 
     @property
     def has_law(self) -> bool:

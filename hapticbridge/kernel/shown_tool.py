@@ -13,13 +13,12 @@ moves on as fast as the tool has pushed it.
 
 The coupling between handle h and shown pose y gives the tool, when y moves by δy in one tick,
 
-    P = V(h − y + δy) − V(h − y) + f_d·δy
+    P = V(h − y_{k−1}) − V(h − y_k) + f_d·δy
 
-in J. V is the energy of its spring with its force level, f_d = P_F(K e + (B'/T)(δh − δy)) − P_F(K e)
-what its damper adds. Under b >= K T/2 + B', with the fast T, the hand has then put in at least
-Σ P + V, for every motion of y: ‖f_d‖² <= (B'/T) f_d·(δh − δy), so the damper's share is a sum of
-squares (``theory``, and a test with motions at random). The scene took W = Σ f_s·δx, metered in its
-own loop. The tank
+in J. V is the energy of its spring with its force level, f_d = P_F(K e + (B'/T)(δh − δy)) −
+P_F(K e) what its damper adds. Under b >= K T/2 + B', with the fast T, the hand has then put in at
+least Σ P + V, for every motion of y: ‖f_d‖² <= (B'/T) f_d·(δh − δy), so what the damper adds is a
+sum of squares. The scene took W = Σ f_s·δx, metered in its own loop. The tank
 
     D = Σ P − W
 
@@ -139,10 +138,19 @@ def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
     return np.ascontiguousarray(is_tool, dtype=np.int32)
 
 
+def fail_scene(shown: Part) -> None:
+    """Notes that the scene has no usable result; the tick then trips."""
+    shown["has_failed"] = 1
+
+
 @compiled
 def start_shown(state: NDArray[np.void]) -> None:
-    """Shows the tool at its present pose, at rest."""
+    """Shows the tool at its present pose, at rest, before a first result of the scene."""
     s = state[0]
+    s.shown.waits = s.shown.age = s.shown.planes = s.shown.contacts = 0
+    s.shown.lead = s.shown.work = 0.0
+    for i in range(6):
+        s.shown.velocity[i] = s.shown.acceleration[i] = 0.0
     for numbers in (s.shown.before, s.shown.pose):
         store_vector(numbers[0:3], vector_of(s.pose.tool_position))
         store_quaternion(numbers[3:7], quaternion_of(s.pose.tool_quaternion))

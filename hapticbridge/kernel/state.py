@@ -207,8 +207,6 @@ class BoundKernel:
         ``kernel.tick.advance`` calls the C functions with equal results to the bit.
         """
         plain: MujocoStep = mujoco.mj_step
-        if self._record["shown"]["is_shown"]:
-            raise SceneError("a shown tool has no step of its own")
         if self._record["run"]["scheme"] == Scheme.MASSLESS:
             plain = mujoco.mj_fwdPosition
         if not self._record["contact"]["is_rigid"]:
@@ -268,6 +266,8 @@ class BoundKernel:
         let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
             direct(restart_lossless, s)(s)
+        elif s["shown"]["is_shown"]:
+            direct(start_shown, self.state)(self.state)
 
     def _bind_model(self, parameters: RunParameters) -> None:
         model, data, mj = self._model, self._data, self._record["mj"]
@@ -313,7 +313,7 @@ class BoundKernel:
             run[name] = getattr(parameters, name)
         run["timestep"] = self._model.opt.timestep
         if parameters.scene_ticks:
-            run["scheme"] = Scheme.SHOWN
+            run["scheme"], run["substeps"] = Scheme.SHOWN, 1
         run["device_damping"] = parameters.device_damping or 0.0
         run["device_rotational_damping"] = parameters.device_rotational_damping or 0.0
         run["watches_device"] = not parameters.has_law and parameters.device_damping is not None

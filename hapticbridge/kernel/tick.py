@@ -393,6 +393,17 @@ def _has_failed(s: State) -> bool:
 
 
 @compiled
+def _active_contacts(s: State) -> int:
+    if s.run.scheme == Scheme.SHOWN:
+        return int(s.shown.contacts)
+    if s.contact.is_rigid:
+        return int(s.contact.active_contacts)
+    if s.run.scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
+        return int(s.lossless.active_contacts)
+    return int(ints(s.mj.ncon, 1)[0])
+
+
+@compiled
 def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
     """Computes the wrench of the step that just ended; after the last substep also the device's.
 
@@ -418,9 +429,9 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     end_mocap_moves(s)
     if s.contact.is_rigid:
         finish_contacts(s)
-    loop.law_work = dot(force, moved) + dot(torque, turned)
-    if scheme == Scheme.SHOWN:
-        loop.law_work = s.shown.work
+    loop.law_work = (
+        s.shown.work if scheme == Scheme.SHOWN else dot(force, moved) + dot(torque, turned)
+    )
     if count > 1:
         share = 1.0 / count
         force, torque = scaled(share, force), scaled(share, torque)
@@ -444,19 +455,12 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if foreseen_excess(s) > s.guard.max_energy:
         _refuse(s)
         return GAVE_ENERGY
-    if scheme == Scheme.SHOWN:
-        loop.active_contacts = s.shown.contacts
-    else:
-        loop.active_contacts = ints(s.mj.ncon, 1)[0]
-    if scheme == Scheme.MIDPOINT:  # a near contact may exist without a force
-        loop.active_contacts = s.lossless.active_contacts
-    if s.contact.is_rigid:
-        loop.active_contacts = s.contact.active_contacts
+    loop.active_contacts = _active_contacts(s)
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
         loop.flags |= CONTACT
-    row[0].solver_iterations = 0 if scheme == Scheme.SHOWN else _solver_iterations(s)
+    row[0].solver_iterations = _solver_iterations(s)
     return OK
 
 
@@ -527,6 +531,8 @@ def _refuse(s: State) -> int:
 
 @compiled
 def _solver_iterations(s: State) -> int:
+    if s.run.scheme == Scheme.SHOWN:
+        return 0
     # without islands MuJoCo counts its iterations as those of island 0
     islands = max(ints(s.mj.nisland, 1)[0], 1)
     total = 0
@@ -777,12 +783,14 @@ def simulate_recorded(
     return int(samples.size)
 
 
+@compiled_for_threads
+def end_scene_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
+    """Runs ``after_step`` for a scene in a thread of its own, which may take milliseconds."""
+    return after_step(state, row, substep)
+
+
 @compiled
-def take_result(
-    state: NDArray[np.void],
-    scene: NDArray[np.void],
-    given: NDArray[np.void],
-) -> None:
+def take_result(state: NDArray[np.void], scene: NDArray[np.void], given: NDArray[np.void]) -> None:
     """Takes over the step that a slower scene has done, and gives it the handle of now."""
     if state[0].shown.waits:
         take_over(state, scene)

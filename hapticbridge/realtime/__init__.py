@@ -12,6 +12,8 @@ from hapticbridge.realtime.realtime import lateness_of as lateness_of
 from hapticbridge.realtime.realtime import loop_core as loop_core
 from hapticbridge.realtime.realtime import memory_at_rest as memory_at_rest
 from hapticbridge.realtime.realtime import real_time as real_time
+from hapticbridge.realtime.realtime import scene_ticks_for as scene_ticks_for
+from hapticbridge.realtime.realtime import step_time as step_time
 from hapticbridge.realtime.realtime import stolen_time as stolen_time
 from hapticbridge.realtime.realtime import wants_real_time as wants_real_time
 from hapticbridge.realtime.realtime import warn_of_refusals as warn_of_refusals

@@ -11,6 +11,7 @@ import copy
 import ctypes
 import errno
 import gc
+import math
 import os
 import sys
 import time
@@ -25,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
 from hapticbridge.rendering import Method
 from hapticbridge.scene import Scene
 
@@ -147,6 +149,17 @@ def check_pace(
 def rate_for(needed: float) -> float:
     """Returns the rate in Hz that ticks hold whose steps take ``needed`` s, > 0 and finite."""
     return SPARE / (needed + BESIDE_THE_STEP)
+
+
+def scene_ticks_for(needed: float, period: float) -> int:
+    """Returns the ticks between two results of a scene whose steps take ``needed`` s each time.
+
+    0 if the loop can step the scene in every tick of ``period`` s. Else its thread fills ``SPARE``
+    of its time.
+    """
+    if rate_for(needed) * period >= 1.0:
+        return 0
+    return min(max(math.ceil(needed / (SPARE * period)), 2), MAX_SCENE_TICKS)
 
 
 def step_time(scene: Scene, method: Method) -> float:

@@ -122,8 +122,8 @@ def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
     if part != "period":
         name = f"{axis.replace(' ', '_')}{part}"
         requested = replace(requested, **{name: share * getattr(requested, name)})
-    law = method.law_coupling(requested, period / worst.substeps)
-    changed = replace(worst, coupling=law, period=period)
+    changed = replace(worst, period=period)
+    changed = replace(changed, coupling=method.law_coupling(requested, changed.timestep))
     kind = "rotation" if axis else "translation"
     conditions = run_conditions(evidence.info, changed, method)
     return all(c.holds is not False for c in conditions if c.axis == kind)

@@ -137,7 +137,7 @@ def draw_recording(recording: Recording) -> Figure:
     method = method_of(meta)
     coupling = RunCoupling.of(
         method,
-        parameters.period / parameters.substeps,
+        parameters.timestep,
         requested_of(meta),
         law=parameters.coupling,
         measured=parameters.effective,
@@ -218,7 +218,7 @@ class Evidence:
         If the law's damping is 0, the method removed all requested damping, which may have had any
         value up to the effective one. It then counts as 0.
         """
-        law, step = self.worst.coupling, self.worst.period / self.worst.substeps
+        law, step = self.worst.coupling, self.worst.timestep
         requested = self.method.requested_coupling(law, step)
         return replace(
             requested,

@@ -63,13 +63,12 @@ def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
     return CouplingLimits(
         info=info,
         method=method,
-        start=method.requested_coupling(
-            parameters.coupling, parameters.period / parameters.substeps
-        ),
+        start=method.requested_coupling(parameters.coupling, parameters.timestep),
         period=parameters.period,
         scale=parameters.scale,
         force_scale=parameters.force_scale,
-        substeps=parameters.substeps,
+        timestep=parameters.timestep,
+        law_evaluations=parameters.law_evaluations,
         limits=limits,
     )
 
@@ -260,14 +259,13 @@ class Controls:
     def _take_coupling(self, event: Mapping[str, Any]) -> None:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
-        step = allowance.period / allowance.substeps
-        requested = method.requested_coupling(Coupling(**law), step)
+        requested = method.requested_coupling(Coupling(**law), allowance.timestep)
         self._gains = [sliders.span.gains(requested) for sliders in self._sliders]
         is_still = time.monotonic() - self._touched > STILL
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)
         self._bounds.content = self._ends()
-        sentences = RunCoupling.of(method, step, law=Coupling(**law)).sentences()
+        sentences = RunCoupling.of(method, allowance.timestep, law=Coupling(**law)).sentences()
         self._say("answer", f"goes to {'; '.join(sentences[: len(self._sliders)])}")
 
     def _refuse(self, reason: str) -> None:

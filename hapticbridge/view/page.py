@@ -511,7 +511,7 @@ def _caption(scenery: Scenery, parameters: RunParameters, facts: dict[str, str])
     method = method_of(facts)
     coupling = RunCoupling.of(
         method,
-        parameters.period / parameters.substeps,
+        parameters.timestep,
         requested_of(facts),
         law=parameters.coupling,
         measured=parameters.effective,

@@ -1,0 +1,223 @@
+"""Loop of a scene that is slower than the bridge's, beside it.
+
+    bridge's loop, every T                        scene's loop, every n T
+    before_step: the handle moves
+    exchange: the last result is taken over,  ──▶ one tick of MuJoCo with this handle,
+              the handle is handed over           in a thread of its own
+    answer_step: the shown tool's wrench      ◀── its result, taken over when it is due
+
+The bridge's loop never waits for the scene: a result that is late is taken over when it is there,
+and the tool is shown meanwhile as it was foreseen (``kernel.shown_tool``). The record's
+``scene_step`` tells in which tick a result was taken over, so a re-simulation repeats the order.
+In simulated time every result is in time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import HapticBridgeError
+from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.shown_tool import fail_scene
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import (
+    after_step,
+    before_step,
+    end_scene_step,
+    simulate_shown,
+    take_result,
+)
+from hapticbridge.record import SAMPLE_DTYPE
+
+LONGEST_WAIT = 2.0
+"""Time in s that the end of a run waits for a step of the scene."""
+
+
+class SlowScene:
+    """Loop of a scene that steps once in n ticks of the bridge.
+
+    Args:
+        loop: The bridge's bound kernel, which shows the tool.
+        model: The prepared scene.
+        data: Its data, at the start.
+        parameters: Parameters of the run, with ``scene_ticks`` n >= 2.
+
+    Attributes:
+        bound: The scene's own bound kernel.
+        late: Results so far that were not there when they were due.
+        is_waited_for: True if the bridge waits for a result that is due, as in simulated time.
+    """
+
+    def __init__(
+        self,
+        loop: BoundKernel,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        parameters: RunParameters,
+    ) -> None:
+        self.bound = BoundKernel(model, data, parameters.of_scene)
+        self.late, self.is_waited_for = 0, True
+        self._loop, self._model, self._data = loop, model, data
+        self._ticks, self._substeps = parameters.scene_ticks, range(parameters.substeps)
+        self._period = parameters.of_scene.period
+        self._given = np.zeros(1, SAMPLE_DTYPE)
+        self._changes: deque[Callable[[], None]] = deque()
+        self._publish: Callable[[BoundKernel], None] | None = None
+        shown = loop.state["shown"]
+        self._age, self._waits = shown["age"], shown["waits"]
+        state, row = self.bound.state, self.bound.row
+        self._take_result = direct(take_result, loop.state, state, self._given)
+        self._before = direct(before_step, state, self._given, row, 0, 0.0)
+        self._end = direct(after_step, state, row, 0)
+        self._step = self.bound.step
+        self._thread: threading.Thread | None = None
+        self._wake, self._done = threading.Semaphore(0), threading.Event()
+        self._is_closed, self._is_sound, self._is_late = False, True, False
+        self._error: Exception | None = None
+
+    def change(self, apply: Callable[[], None]) -> None:
+        """Applies a change of the scene before its next step, when no step is under way."""
+        self._changes.append(apply)
+
+    def settle(self) -> None:
+        """Ends the step under way without taking it over, and applies the waiting changes.
+
+        The bridge's loop waits for it, so it is for moments without force, such as a reset.
+
+        Raises:
+            HapticBridgeError: The step takes longer than ``LONGEST_WAIT``.
+        """
+        if self._waits[0]:
+            self._wait_for_result()
+        self._apply_changes()
+
+    def _apply_changes(self) -> None:
+        while self._changes:
+            self._changes.popleft()()
+
+    def note_picture(self, publish: Callable[[BoundKernel], None]) -> None:
+        """Publishes the scene's positions when the next result is taken over."""
+        self._publish = publish
+
+    # In the live loop
+
+    def start(self) -> None:
+        """Starts the thread; without it every step is done when its result is due."""
+        self.is_waited_for = False
+        # a long step must not hold the interpreter lock, which the loop needs
+        self._end = direct(end_scene_step, self.bound.state, self.bound.row, 0)
+        self._thread = threading.Thread(target=self._work, name="scene", daemon=True)
+        self._thread.start()
+
+    def exchange(self, _model: mujoco.MjModel, _data: mujoco.MjData) -> None:
+        """Takes over the scene's result if it is due and there, and hands over the handle.
+
+        It stands where the loop of another scene has MuJoCo's step.
+
+        Raises:
+            Exception: MuJoCo's, from the scene's step.
+        """
+        if self._waits[0]:
+            if self._age[0] < self._ticks:
+                return
+            if not self.is_waited_for and not self._done.is_set():
+                self.late += not self._is_late
+                self._is_late = True
+                return
+            self._wait_for_result()
+            if not self._is_sound:
+                fail_scene(self._loop.state["shown"])
+                return
+        self._is_late = False
+        self._take_result(self._loop.state, self.bound.state, self._given)
+        self._apply_changes()
+        if self._publish is not None:
+            self._publish(self.bound)
+            self._publish = None
+        if self._thread is not None:
+            self._done.clear()
+            self._wake.release()
+
+    def _wait_for_result(self) -> None:
+        if self._thread is None:
+            self._is_sound = self._do_step()
+        elif not self._done.wait(LONGEST_WAIT):
+            raise HapticBridgeError(f"a step of the scene takes more than {LONGEST_WAIT:g} s")
+        if self._error is not None:
+            raise self._error
+
+    def _work(self) -> None:
+        while self._wake.acquire() and not self._is_closed:
+            try:
+                self._is_sound = self._do_step()
+            except Exception as error:  # raised again in the bridge's loop
+                self._error = error
+            self._done.set()
+
+    def _do_step(self) -> bool:
+        """Runs one tick of the scene; returns False if its result is not usable."""
+        state, row, period = self.bound.state, self.bound.row, self._period
+        for substep in self._substeps:
+            if self._before(state, self._given, row, substep, period) != OK:
+                return False
+            self._step(self._model, self._data)
+            if self._end(state, row, substep) != OK:
+                return False
+        return True
+
+    def close(self) -> None:
+        """Ends the thread after its present step, which is waited for ``LONGEST_WAIT`` s."""
+        self._is_closed = True
+        self._wake.release()
+        if self._thread is not None:
+            self._thread.join(LONGEST_WAIT)
+        self.bound.release()
+
+    # Whole ticks in compiled code
+
+    def simulate(
+        self,
+        samples: NDArray[np.void],
+        external_flags: NDArray[np.int64],
+        elapsed: NDArray[np.float64],
+        scene_steps: NDArray[np.int64],
+        rows: NDArray[np.void],
+    ) -> int:
+        """Runs the ticks of a recorded run; arguments and result as for ``simulate_shown``.
+
+        Changes are applied after the next result, as in the live loop.
+        """
+        states = self._loop.state, self.bound.state
+        own = self._loop.row, self.bound.row, self._given
+        step, done = self._loop.state["shown"]["scene_step"], 0
+        while done < len(samples):
+            end = len(samples)
+            is_taken = False
+            if self._changes:
+                taken = np.flatnonzero(scene_steps[done:] > step[0])
+                first = 0 if not self._waits[0] else int(taken[0]) if taken.size else end
+                is_taken, end = done + first < end, min(done + first + 1, end)
+            part = slice(done, end)
+            count = simulate_shown(
+                states,
+                samples[part],
+                external_flags[part],
+                elapsed[part],
+                scene_steps[part],
+                own,
+                rows[part],
+            )
+            done += count
+            if done < end:
+                break
+            if is_taken:
+                self._apply_changes()
+        return done
