@@ -19,11 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import default_coupling, required_axis_damping
+from hapticbridge.check.physics import site_inertia
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
+from hapticbridge.device.simulated.hand import DEFAULT_HAND
 from hapticbridge.errors import (
     DeviceError,
     HapticBridgeError,
@@ -55,7 +57,6 @@ from hapticbridge.realtime import scene_ticks_for, step_time, wants_real_time
 from hapticbridge.rendering import (
     TIPPED,
     Method,
-    at_timestep,
     default_method,
     holding_force,
     method_named,
@@ -236,12 +237,12 @@ class BridgeOptions:
         """
         if self.scene_rate == AUTO:
             return 0
-        if not is_number(self.scene_rate) or not 0 < float(self.scene_rate) <= self.rate:
+        least, rate = self.rate / MAX_SCENE_TICKS, self.scene_rate
+        if not is_number(rate) or not least <= float(rate) <= self.rate:
             raise HapticBridgeError(
-                f"scene rate is {shown(self.scene_rate)}; it must be 'auto', or a number of Hz > 0 "
-                f"and at most the rate, {self.rate:g}"
+                f"scene rate is {shown(rate)} Hz; it must be 'auto', or {least:g} to {self.rate:g}"
             )
-        ticks = round(min(self.rate / float(self.scene_rate), MAX_SCENE_TICKS + 1))
+        ticks = round(self.rate / float(rate))
         return 0 if ticks < 2 else ticks
 
     @property
@@ -282,6 +283,33 @@ class OptionChanges(TypedDict, total=False):
 
 
 # Setup of a run
+
+STEADY = 0.8
+"""Largest K T_s² (1/m_tool + 1/m_hand) of the usual coupling to a slower scene, without unit. The
+tool is shown by what was foreseen up to 2 T_s ago; above 1.6 that lets it shake, by up to 10 N,
+though passively."""
+
+
+def steady_stiffness(
+    scene: Scene, info: DeviceInfo, period: float, scale: float, force_scale: float
+) -> float:
+    """Returns the largest stiffness in N/m with which a slower scene's tool is shown steadily.
+
+        K = STEADY / (T_s² (1/m_tool + s s_f/m_hand))
+
+    m_tool is the tool's smallest inertia at the grip in kg, m_hand that of hand and device.
+
+    Args:
+        scene: The loaded scene.
+        info: The device's data sheet.
+        period: T_s in s.
+        scale: s, handle motion per device motion.
+        force_scale: s_f, force on the device per force on the tool.
+    """
+    tool = site_inertia(scene.model, scene.data, scene.model.site(scene.grip).id)
+    hand = DEFAULT_HAND.mass + (info.mass or 0.0)
+    return STEADY / (period * period * (1.0 / tool + scale * force_scale / hand))
+
 
 PRESCRIBED_MOTION = DeviceInfo(
     name="prescribed motion", axes=AXES, force_limit=0.0, is_prescribed=True, is_real=False
@@ -397,7 +425,13 @@ class RunSetup:
             requested = coupling
         else:
             requested = default_coupling(info, period, *scales, law_evaluations, method)
-            requested = at_timestep(method, requested, period / law_evaluations, timestep)
+            if ticks:
+                law = method.law_coupling(requested, period)
+                most = steady_stiffness(scene, info, ticks * period, *scales)
+                share = min(most / law.stiffness, 1.0)
+                springs = ("stiffness", "rotational_stiffness")
+                law = replace(law, **{name: share * getattr(law, name) for name in springs})
+                requested = method.requested_coupling(law, timestep)
             requested = replace(requested, **(coupling or {}))
         law = method.law_coupling(requested, timestep)
         limits = limits_for(info, options.limits)

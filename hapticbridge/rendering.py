@@ -183,11 +183,6 @@ class Method:
         )
 
 
-def at_timestep(method: Method, requested: Coupling, old: float, new: float) -> Coupling:
-    """Returns the requested coupling at another time step whose law is the same; steps in s."""
-    return method.requested_coupling(method.law_coupling(requested, old), new)
-
-
 def require_hazard_consent(method: Method, *, is_real: bool, i_know: bool) -> None:
     """Refuses a hazardous method on a device with motors without the user's consent.
 

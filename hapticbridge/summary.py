@@ -253,6 +253,7 @@ class Summary:
             is_realtime=outcome.is_realtime,
             flags=int(state["watch"]["flags"][0]),
             has_tripped=outcome.stopped_by == "trip",
+            scene_steps=int(state["shown"]["scene_step"][0]),
         )
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
@@ -279,7 +280,9 @@ class Summary:
                 requested,
                 law=parameters.coupling,
                 measured=parameters.effective,
-                is_always_implicit=outcome.ticks > 0 and not state["lossless"]["ticks"][0],
+                is_always_implicit=outcome.ticks > 0
+                and not parameters.scene_ticks
+                and not state["lossless"]["ticks"][0],
             ),
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),

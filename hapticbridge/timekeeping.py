@@ -38,6 +38,9 @@ larger one can be felt."""
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
 
+SLOW_MOTION = 0.95
+"""Share of its speed below which a slower scene is felt to be in slow motion, without unit."""
+
 SWUNG = "its force came late, reversed or in steps"
 """Words for what the watch found (``kernel.swing_watch``)."""
 
@@ -57,6 +60,7 @@ class RunTimes:
         fresh: Share of the samples due that were new, 0 to 1.
         flags: Combined flags of the records, or of the watch alone.
         has_tripped: True if the guard stopped the run.
+        scene_steps: Results that a scene slower than the loop has given.
     """
 
     ticks: int
@@ -68,6 +72,7 @@ class RunTimes:
     is_realtime: bool
     flags: int = 0
     has_tripped: bool = False
+    scene_steps: int = 0
 
 
 def watch_sentence(flags: int) -> str:
@@ -110,6 +115,8 @@ class Timekeeping:
         watch: What the watch for a late or reversed force did, in a sentence; empty for nothing.
         law_evaluations: Evaluations of the law per tick.
         has_tripped: True if the guard stopped the run.
+        scene_rate: Results per second in Hz that a slower scene was to give; None for another.
+        scene_speed: Share of them that it gave, 0 to 1.
     """
 
     rate: float
@@ -125,6 +132,8 @@ class Timekeeping:
     watch: str
     law_evaluations: int
     has_tripped: bool
+    scene_rate: float | None
+    scene_speed: float
 
     @classmethod
     def of(
@@ -150,6 +159,8 @@ class Timekeeping:
             watch=watch_sentence(times.flags),
             law_evaluations=parameters.law_evaluations,
             has_tripped=times.has_tripped,
+            scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
+            scene_speed=_scene_speed(times, parameters.scene_ticks),
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
@@ -187,12 +198,16 @@ class Timekeeping:
             "" if self.fresh >= self.share else f", {100.0 * self.fresh:.3g} % of the samples new"
         )
         late = f", {self._late}" if self._late else ""
+        if self.scene_rate is not None:
+            late += (
+                f", the scene at {self.scene_rate:.4g} Hz and {self.scene_speed:.0%} of its speed"
+            )
         return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
 
     @property
     def remark(self) -> str:
         """``words`` where the run was not simply in time; else empty."""
-        is_exact = min(self.share, self.fresh) == 1.0 and not self._late
+        is_exact = min(self.share, self.fresh, self.scene_speed) == 1.0 and not self._late
         return "" if is_exact else self.words
 
     @property
@@ -218,7 +233,9 @@ class Timekeeping:
 
     @property
     def hint(self) -> str:
-        """Sentence that suggests ``--realtime`` after missed deadlines; empty if not needed."""
+        """Sentence that suggests a remedy after missed deadlines or late steps of the scene."""
+        if self.scene_speed < SLOW_MOTION:
+            return "the scene runs in slow motion: a lower --scene-rate gives its steps more time"
         if self.share == 1.0 or self.is_realtime or self.is_kept is False:
             return ""
         return "deadlines were missed: --realtime requests the processor for the loop"
@@ -248,6 +265,12 @@ class Timekeeping:
                 f"more than {format_si(INSTANT, 'J')}"
             )
         return f"{NOT_KEPT}: {found}; try {self.remedy}"
+
+
+def _scene_speed(times: RunTimes, ticks: int) -> float:
+    """Returns the share of a slower scene's results that arrived; the newest is not due yet."""
+    due = (times.due - 1) // ticks if ticks else 0
+    return min(times.scene_steps / due, 1.0) if due > 0 else 1.0
 
 
 def _remedy(*, is_realtime: bool) -> str:

@@ -35,6 +35,7 @@ class TimingTally:
     Attributes:
         parameters: Run parameters.
         ticks: Number of records so far.
+        scene_steps: Results of a slower scene so far.
         fresh: Number of records with a new sample so far.
         due: Number of deadlines so far.
         overruns: Number of records after skipped deadlines so far.
@@ -50,6 +51,7 @@ class TimingTally:
 
     parameters: RunParameters
     ticks: int = 0
+    scene_steps: int = 0
     fresh: int = 0
     due: int = 0
     overruns: int = 0
@@ -65,6 +67,8 @@ class TimingTally:
         """Adds consecutive records, at least one."""
         ticks, parameters = block.ticks, self.parameters
         self.ticks += len(ticks)
+        if parameters.scene_ticks:
+            self.scene_steps = int(ticks["scene_step"][-1])
         self.fresh += int(np.count_nonzero(~has_flag(ticks, TickFlag.STALE_SAMPLE)))
         self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
         self.overruns += int(np.count_nonzero(has_flag(ticks, TickFlag.OVERRUN)))

@@ -353,7 +353,8 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
             _requested(recording),
             law=parameters.coupling,
             measured=parameters.effective,
-            is_always_implicit=was_never_lossless(recording.count, recording.flags),
+            is_always_implicit=not parameters.scene_ticks
+            and was_never_lossless(recording.count, recording.flags),
         )
         conditions = run_conditions(info, worst, method)
         return {
@@ -388,6 +389,7 @@ def _time_facts(
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
         flags=recording.flags,
         has_tripped=any(event.get("event") == "trip" for event in recording.events),
+        scene_steps=timing.scene_steps,
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)

@@ -87,6 +87,21 @@ def body_inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> float
         return math.inf
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+    return _inertia_along(model, data, jacobian)
+
+
+def site_inertia(model: mujoco.MjModel, data: mujoco.MjData, site: int) -> float:
+    """Returns the inertia in kg at a site, as ``body_inertia`` at a centre of mass."""
+    if model.nv == 0:
+        return math.inf
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, site)
+    return _inertia_along(model, data, jacobian)
+
+
+def _inertia_along(
+    model: mujoco.MjModel, data: mujoco.MjData, jacobian: NDArray[np.float64]
+) -> float:
     answer = np.zeros_like(jacobian)
     mujoco.mj_solveM(model, data, answer, jacobian)
     weight = float(np.linalg.eigvalsh(jacobian @ answer.T)[-1])

@@ -33,7 +33,14 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.options import AUTO, SAME_FRAME, BridgeOptions, RunSetup, Workspace
+from hapticbridge.options import (
+    AUTO,
+    SAME_FRAME,
+    BridgeOptions,
+    RunSetup,
+    Workspace,
+    steady_stiffness,
+)
 from hapticbridge.realtime import scene_ticks_for, step_time
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method, method_named
@@ -77,6 +84,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         )
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
+    if setup.scene_ticks:
+        _announce_slow(setup)
     attainable = setup.attainable
     if not (
         math.isclose(attainable.damping, coupling.damping)
@@ -104,6 +113,19 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     for condition in conditions:
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
+
+
+def _announce_slow(setup: RunSetup) -> None:
+    rate, scales = 1.0 / setup.scene_period, setup.workspace.scales
+    err.print(
+        f"  the scene steps at {rate:.4g} Hz beside the loop, and its tool is shown in between"
+    )
+    most = steady_stiffness(setup.scene, setup.info, setup.scene_period, *scales)
+    if setup.coupling.stiffness > 2.0 * most:
+        err.print(
+            "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
+            f"{most:.2g} N/m: lower --stiffness, or raise --scene-rate"
+        )
 
 
 def _without_motor(setup: RunSetup) -> Iterator[str]:
