@@ -93,11 +93,13 @@ class RecordedRun:
             info = DeviceInfo.from_json(recording.meta.get("device", ""))
         except HapticBridgeError as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
+        rate = invert_exactly(parameters.period, period_of, 1.0 / parameters.period)
         settings = Settings(
             coupling=requested_of(recording.meta),
             method=method,
-            rate=invert_exactly(parameters.period, period_of, 1.0 / parameters.period),
+            rate=rate,
             substeps=parameters.substeps,
+            scene_rate=rate / max(parameters.scene_ticks, 1),
             scale=parameters.scale,
             force_scale=parameters.force_scale,
             contact_stiffness=parameters.contact_stiffness or None,

@@ -312,6 +312,7 @@ class Repetition:
             settings.coupling,
             rate=settings.rate,
             substeps=settings.substeps,
+            scene_rate=settings.scene_rate,
             method=settings.method.name,
             contact=settings.method.contact,
             contact_stiffness=settings.contact_stiffness,
@@ -406,9 +407,9 @@ class Repetition:
         if replace(new, scene=old.scene, controller=old.controller) == old:
             return event
         law = coupling_in(event, self._run.parameters)
-        requested = old.method.requested_coupling(law, self._run.period / old.substeps)
+        requested = old.method.requested_coupling(law, old.timestep)
         kept = {name: getattr(new.coupling, name) for name in GAINS[2:]}
-        law = new.method.law_coupling(replace(requested, **kept), period / new.substeps)
+        law = new.method.law_coupling(replace(requested, **kept), new.timestep)
         return {**event, **asdict(law), "ticks": tuning_ticks(period)}
 
 

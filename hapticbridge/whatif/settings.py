@@ -20,6 +20,7 @@ UNITS = {
     "contact": "",
     "rate": "Hz",
     "substeps": "",
+    "scene_rate": "Hz",
     "scale": "",
     "force_scale": "",
     "contact_stiffness": "N/m",
@@ -41,7 +42,8 @@ class Settings:
         coupling: Requested K and B.
         method: Rendering method.
         rate: Ticks per second.
-        substeps: MuJoCo steps per tick.
+        substeps: MuJoCo steps per tick, or between two results of a slower scene.
+        scene_rate: Results of the scene per second in Hz; ``rate`` steps it in every tick.
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's.
@@ -53,11 +55,17 @@ class Settings:
     method: Method
     rate: float
     substeps: int
+    scene_rate: float
     scale: float
     force_scale: float
     contact_stiffness: float | None
     scene: Mapping[str, float]
     controller: str | None = None
+
+    @property
+    def timestep(self) -> float:
+        """MuJoCo's h in s."""
+        return max(round(self.rate / self.scene_rate), 1) / (self.rate * self.substeps)
 
     def value(self, name: str) -> Value | None:
         """Returns the value of a setting or scene parameter."""
@@ -78,7 +86,7 @@ class Settings:
         """Returns the settings with changes applied.
 
         If both scales were equal, a new ``scale`` also changes ``force_scale``, so that power stays
-        equal on both sides. A contact stiffness is dropped if the new method has none.
+        equal on both sides. A scene that steps in every tick does so at a new ``rate`` too. A contact stiffness is dropped if the new method has none.
 
         Raises:
             RecordingError: A name is unknown, or its value is not valid.
@@ -97,6 +105,8 @@ class Settings:
             contact_name = self.method.contact
         method = method.with_contact(None if contact_name is None else str(contact_name))
         gains = {name: float(values[name]) for name in GAINS if name in values}
+        rate = float(values.get("rate", self.rate))
+        is_slow = self.scene_rate < self.rate
         scale = float(values.get("scale", self.scale))
         is_equal = self.scale == self.force_scale
         contact = values.get("contact_stiffness", self.contact_stiffness)
@@ -106,8 +116,9 @@ class Settings:
         return Settings(
             coupling=replace(self.coupling, **gains),
             method=method,
-            rate=float(values.get("rate", self.rate)),
+            rate=rate,
             substeps=int(values.get("substeps", self.substeps)),
+            scene_rate=float(values.get("scene_rate", self.scene_rate if is_slow else rate)),
             scale=scale,
             force_scale=float(values.get("force_scale", scale if is_equal else self.force_scale)),
             contact_stiffness=None if contact is None else float(contact),
