@@ -155,7 +155,11 @@ class SlowScene:
             raise self._error
 
     def _work(self) -> None:
-        while self._wake.acquire() and not self._is_closed:
+        while not self._is_closed:
+            if not self._wake.acquire(timeout=LONGEST_WAIT):
+                continue
+            if self._is_closed:
+                return
             try:
                 self._is_sound = self._do_step()
             except Exception as error:  # raised again in the bridge's loop

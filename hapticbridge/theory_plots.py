@@ -21,8 +21,7 @@ from hapticbridge.rendering import (
 )
 from hapticbridge.theory.bounds import minimum_damping, worst_frequency
 from hapticbridge.theory.spectrum import damping_spectrum
-from hapticbridge.theory.transfer import Discretization
-from hapticbridge.theory.transmission_line import transmission_line_spectrum
+from hapticbridge.theory.transfer import Discretization, transmission_line_spectrum
 from hapticbridge.theory.z_width import ZWidth
 
 if TYPE_CHECKING:

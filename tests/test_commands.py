@@ -43,7 +43,8 @@ def allowance(
         period=T,
         scale=scale,
         force_scale=scale,
-        substeps=1,
+        timestep=T,
+        law_evaluations=1,
         limits=Limits(force=10.0, torque=0.5),
     )
 
@@ -224,10 +225,10 @@ def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
 @pytest.mark.parametrize("substeps", [1, 4])
 @pytest.mark.parametrize("delay", [0.0, 1e-3])
 def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float) -> None:
-    allowed = replace(allowance(delay=delay), substeps=substeps)
+    laws = method_named("implicit").law_evaluations(substeps)
+    allowed = replace(allowance(delay=delay), timestep=T / substeps, law_evaluations=laws)
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
         used = allowed.law(allowed.requested(Couple(stiffness, damping), COUPLING))
-        laws = allowed.method.law_evaluations(substeps)
         said = required_axis_damping(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
         need = allowed.translation.needed(stiffness, damping)
         if substeps == 1 and not delay:

@@ -16,14 +16,15 @@ from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.lab.chart import setting
-from hapticbridge.lab.chart.catalogue import Extent, open_workload
 from hapticbridge.lab.chart.chart import (
     Chart,
     Cost,
+    Extent,
     Measurement,
     convergence_orders,
     interleaved_costs,
     measure_chart,
+    open_workload,
     pareto_front,
 )
 from hapticbridge.lab.chart.output import prepared_files, recommendation, recommended, write_chart

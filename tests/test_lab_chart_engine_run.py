@@ -14,8 +14,7 @@ from engine_tasks import engine_or_skip
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import chart as chart_module
 from hapticbridge.lab.chart import contact_bodies
-from hapticbridge.lab.chart.catalogue import Extent, open_workload
-from hapticbridge.lab.chart.chart import Chart, measure_chart
+from hapticbridge.lab.chart.chart import Chart, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
 from hapticbridge.lab.chart.output import summary_of
 from hapticbridge.lab.chart.peg import JammedPeg

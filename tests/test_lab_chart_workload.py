@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import contact_bodies, free_bodies, peg
-from hapticbridge.lab.chart.catalogue import Extent, open_workload
-from hapticbridge.lab.chart.chart import measure_chart
+from hapticbridge.lab.chart.chart import Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences
 from hapticbridge.lab.chart.setting import Setting
 from hapticbridge.lab.chart.workload import Score, Workload

@@ -19,7 +19,7 @@ ORDER = (
     ("kernel", "theory", "plotting", "sweep", "film"),
     ("scene", "inputs"),
     ("rendering", "device"),
-    ("certificate", "identify", "realtime", "run_description", "theory_plots"),
+    ("certificate", "identify", "realtime", "run_description", "slow_scene", "theory_plots"),
     ("guard", "summary", "timekeeping", "export", "recorded_scene"),
     ("commands", "check"),
     ("audit", "compare", "options"),
@@ -202,6 +202,7 @@ WRITERS = {
     "lossless": "lossless",
     "springs": "springs",
     "contact": "rigid_contact",
+    "shown": "shown_tool",
     "timing": "timing",
 }
 """Sub-records of the kernel's state, and the module of the kernel that writes each."""

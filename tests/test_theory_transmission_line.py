@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import CouplingError
 from hapticbridge.theory.bounds import maximum_stiffness
-from hapticbridge.theory.transmission_line import (
+from hapticbridge.theory.transfer import (
     Termination,
     transmission_line_spectrum,
     transmission_line_stiffness,

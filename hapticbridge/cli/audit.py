@@ -150,10 +150,10 @@ class Audit:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
     ] = ()
     """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
-    rotational_stiffness, rotational_damping, method, rate, substeps, scale, force_scale,
-    contact_stiffness, controller, or a parameter of the scene. Twice: with the recorded motion,
-    and, where the device is known, with a model hand. --plot and --report show all runs side by
-    side (one file only)."""
+    rotational_stiffness, rotational_damping, method, rate, substeps, scene_rate, scale,
+    force_scale, contact_stiffness, controller, or a parameter of the scene. Twice: with the
+    recorded motion, and, where the device is known, with a model hand. --plot and --report show all
+    runs side by side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""

@@ -10,8 +10,7 @@ import tyro
 
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart.catalogue import Extent, open_workload
-from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, measure_chart
+from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.engine_run import peer_settings
 from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
 from hapticbridge.lab.chart.setting import chosen_methods, chosen_periods, settings_for

@@ -142,13 +142,15 @@ RIGID_DTYPE = np.dtype(
         ("cap", "<f8"),
         ("last_energy", "<f8"),
         ("lift", "<f8"),
+        ("ahead", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
 ``repetitions`` counts repeated steps since the start, ``active_contacts`` the contacts with a
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
 last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
-repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it. Of limits
+repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
+the time in s for which margins reach ahead. Of limits
 and equality constraints: largest count of rows (0 if there are none), and addresses of the model's
 parameters, of copies, of the rows' own positions and of J v⁺. Of margins: addresses and counts of
 the geoms that move, of pairs, and of the bodies' velocities."""
@@ -160,6 +162,7 @@ def bind_contact(
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
+    contact["ahead"] = parameters.steps_ahead * model.opt.timestep
     is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
@@ -428,10 +431,11 @@ def finish_contacts(s: State) -> None:
 def follow_speed(s: State) -> None:
     """Widens each geom's margin for the next collisions by the way that it goes in a step.
 
-    The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
-    bounding sphere, at most ``LARGEST_MARGIN``. Positions are those at the start of the last step.
+    The way is t (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
+    bounding sphere, at most ``LARGEST_MARGIN``. t is the time step, or three of them where a tool
+    is shown until two after the newest. Positions are those at the start of the last step.
     """
-    contact, mj, h = s.contact, s.mj, s.run.timestep
+    contact, mj, ahead = s.contact, s.mj, s.contact.ahead
     _move_bodies(s)
     velocities, centres = floats(contact.body_velocity, 6 * mj.nbody), contact.geom_xpos
     bodies, roots = ints(mj.geom_bodyid, mj.ngeom), ints(contact.body_rootid, mj.nbody)
@@ -447,7 +451,7 @@ def follow_speed(s: State) -> None:
         turn = vector_of(velocities[6 * body : 6 * body + 3])
         velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
         velocity = add(velocity, cross(turn, subtract(centre, origin)))
-        way = h * (norm(velocity) + radii[geom] * norm(turn))
+        way = ahead * (norm(velocity) + radii[geom] * norm(turn))
         margins[geom] = at_rest[geom] + (way if way < LARGEST_MARGIN else LARGEST_MARGIN)
     for pair in range(contact.pair_count):
         way = 0.0

@@ -98,7 +98,7 @@ SHOWN_DTYPE = np.dtype(
         ("work", "<f8"),
         ("scene_work", "<f8"),
         ("before", "<f8", 7),
-        ("pose", "<f8", 7),
+        ("newest", "<f8", 7),
         ("velocity", "<f8", 6),
         ("acceleration", "<f8", 6),
         ("normals", "<f8", 3 * PLANES),
@@ -111,7 +111,7 @@ SHOWN_DTYPE = np.dtype(
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*. ``lead`` in s is the age of
 the newest result when it was taken over. ``tank`` D, ``cap``, ``credit``, ``work`` P of the present
-tick and ``scene_work`` W in J. ``before`` and ``pose`` are the tool's poses before and after the
+tick and ``scene_work`` W in J. ``before`` and ``newest`` are the tool's poses before and after the
 newest step; a plane has a normal away from the surface, the arm from the grip to the contact point,
 the gap at the pose ``before`` in m, and the speed against its normal in m/s."""
 
@@ -151,7 +151,7 @@ def start_shown(state: NDArray[np.void]) -> None:
     s.shown.lead = s.shown.work = 0.0
     for i in range(6):
         s.shown.velocity[i] = s.shown.acceleration[i] = 0.0
-    for numbers in (s.shown.before, s.shown.pose):
+    for numbers in (s.shown.before, s.shown.newest):
         store_vector(numbers[0:3], vector_of(s.pose.tool_position))
         store_quaternion(numbers[3:7], quaternion_of(s.pose.tool_quaternion))
 
@@ -169,7 +169,7 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     s = state[0]
     pose, given, k, level = s.pose, sample[0], s.coupling, s.level.level
     s.shown.age, s.shown.waits = 0, 1
-    tool, orientation = vector_of(s.shown.pose), quaternion_of(s.shown.pose[3:7])
+    tool, orientation = vector_of(s.shown.newest), quaternion_of(s.shown.newest[3:7])
     stretch = subtract(vector_of(pose.handle_position), tool)
     twist = rotation_between(orientation, quaternion_of(pose.handle_quaternion))
     energy = spring_energy(k.stiffness, norm(stretch), level[0])
@@ -201,9 +201,9 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
         shown.acceleration[i] = rate * (velocity - shown.velocity[i]) if is_free else 0.0
         shown.velocity[i] = velocity
     for i in range(7):
-        shown.before[i] = shown.pose[i]
-    store_vector(shown.pose[0:3], vector_of(scene.pose.tool_position))
-    store_quaternion(shown.pose[3:7], quaternion_of(scene.pose.tool_quaternion))
+        shown.before[i] = shown.newest[i]
+    store_vector(shown.newest[0:3], vector_of(scene.pose.tool_position))
+    store_quaternion(shown.newest[3:7], quaternion_of(scene.pose.tool_quaternion))
     shown.contacts = scene.loop.active_contacts
     shown.tank -= scene.energy.coupling_work - shown.scene_work
     shown.scene_work = scene.energy.coupling_work
@@ -219,8 +219,8 @@ def _take_planes(s: State, scene: State) -> None:
     mj, shown = scene.mj, s.shown
     is_tool = ints(mj.geom_is_tool, mj.ngeom)
     grip = vector_of(shown.before)
-    moved = subtract(vector_of(shown.pose), grip)
-    turn = rotation_between(quaternion_of(shown.before[3:7]), quaternion_of(shown.pose[3:7]))
+    moved = subtract(vector_of(shown.newest), grip)
+    turn = rotation_between(quaternion_of(shown.before[3:7]), quaternion_of(shown.newest[3:7]))
     count = 0
     for c in range(ints(mj.ncon, 1)[0]):
         contact = pointer_at(mj.contact) + c * mj.contact_size
@@ -254,8 +254,8 @@ def _foreseen(s: State) -> tuple[Vector, Quaternion]:
     v, a, half = shown.velocity, shown.acceleration, 0.5 * q * q
     step = add(scaled(q, vector_of(v)), scaled(half, vector_of(a)))
     turn = add(scaled(q, vector_of(v[3:6])), scaled(half, vector_of(a[3:6])))
-    orientation = product(quaternion_exp(turn), quaternion_of(shown.pose[3:7]))
-    position = add(vector_of(shown.pose), step)
+    orientation = product(quaternion_exp(turn), quaternion_of(shown.newest[3:7]))
+    position = add(vector_of(shown.newest), step)
     if shown.planes > 0:
         position = _outside(shown, position, orientation, q + shown.scene_period)
     return position, canonical(orientation)

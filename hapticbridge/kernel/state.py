@@ -19,7 +19,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
 | contact     | tank and share of rigid contacts                  | rigid_contact                 |
-| shown       | shown pose of a slower scene's tool, its tank      | shown_tool                    |
+| shown       | shown pose of a slower scene's tool, its tank     | shown_tool                    |
 | timing      | delay of the force, energy that it may have given | timing                        |
 """
 

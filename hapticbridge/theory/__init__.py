@@ -1,9 +1,10 @@
 """Theory of passive haptic display, without MuJoCo.
 
-Device damping: ``transfer`` holds the sampled coupling, ``spectrum`` the damping needed at each
-frequency, ``bounds`` its supremum (also with delay) and the damping that each method adds.
+Device damping: ``transfer`` holds the sampled coupling and a transmission line, ``spectrum`` the
+damping needed at each frequency, ``bounds`` its supremum (also with delay) and the damping that
+each method adds.
 ``sampled_loop`` finds the same limit in the time domain with the worst hand. ``virtual_mass``
-treats the tool's integrator, ``transmission_line`` a wave-based law. ``device_limits``
+treats the tool's integrator. ``device_limits``
 (quantisation, friction, a free device) bounds a ``z_width``.
 
 Reference mechanics: ``rigid_body`` moves a body by four integrators of known energy and a mass
@@ -37,10 +38,10 @@ from hapticbridge.theory.sampled_loop import stability_limit as stability_limit
 from hapticbridge.theory.spectrum import damping_spectrum as damping_spectrum
 from hapticbridge.theory.spectrum import damping_spectrum_of as damping_spectrum_of
 from hapticbridge.theory.transfer import CouplingGrid as CouplingGrid
-from hapticbridge.theory.transmission_line import (
+from hapticbridge.theory.transfer import (
     transmission_line_spectrum as transmission_line_spectrum,
 )
-from hapticbridge.theory.transmission_line import (
+from hapticbridge.theory.transfer import (
     transmission_line_stiffness as transmission_line_stiffness,
 )
 from hapticbridge.theory.virtual_mass import (

@@ -86,7 +86,8 @@ class Settings:
         """Returns the settings with changes applied.
 
         If both scales were equal, a new ``scale`` also changes ``force_scale``, so that power stays
-        equal on both sides. A scene that steps in every tick does so at a new ``rate`` too. A contact stiffness is dropped if the new method has none.
+        equal on both sides. A scene that steps in every tick does so at a new ``rate`` too. A
+        contact stiffness is dropped if the new method has none.
 
         Raises:
             RecordingError: A name is unknown, or its value is not valid.

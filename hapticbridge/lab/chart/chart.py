@@ -1,4 +1,4 @@
-"""Measures a chart: every point judged once, then all timed side by side."""
+"""Measures a chart: every point judged once, then all timed side by side. Workloads by name."""
 
 from __future__ import annotations
 
@@ -16,11 +16,51 @@ from numpy.typing import NDArray
 from hapticbridge.check.observe import quiet
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, scene_run
 from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.setting import OWN, Setting, who
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
 from hapticbridge.run_description import processor
+
+# Workloads by name
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Time steps of a chart that a workload depends on.
+
+    Attributes:
+        grid: Longest period T in s; runs are compared at its multiples.
+        finest: Shortest period T in s.
+    """
+
+    grid: float
+    finest: float
+
+
+def open_workload(name: str, extent: Extent) -> Workload:
+    """Returns a workload by its name, or by that of a scene.
+
+    Raises:
+        HapticBridgeError: There is no such scene, or it has no hand path.
+    """
+    grid, finest = extent.grid, extent.finest
+    known: dict[str, Callable[[], Workload]] = {
+        "point_mass": lambda: free_bodies.DrivenMass(scene_run.COUPLING, grid, finest),
+        "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
+        "rod_impact": lambda: contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, grid),
+        "sliding_block": lambda: contact_bodies.SlidingBlock(
+            contact_bodies.BLOCK_COUPLING, grid, finest
+        ),
+        "spinning_body": lambda: free_bodies.SpinningBody(free_bodies.COUPLING, grid, finest),
+    }
+    if name in known:
+        return known[name]()
+    return scene_run.SceneMotion(name, scene_run.COUPLING, grid, finest)
+
+
+# Points of a chart
 
 
 def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[int]:

@@ -9,7 +9,7 @@ from hapticbridge.lab.paper.section import Check, Section, Table, explained, pan
 from hapticbridge.theory.bounds import maximum_stiffness
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit, threshold
 from hapticbridge.theory.spectrum import damping_spectrum
-from hapticbridge.theory.transmission_line import (
+from hapticbridge.theory.transfer import (
     transmission_line_spectrum,
     transmission_line_stiffness,
 )

@@ -1,0 +1,205 @@
+"""A tool shown between the steps of a slower scene: no hand gets energy, and it is where it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from adversary import UNPAID, Attack
+from kernel_runs import IDENTITY, T
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step, take_result, whole_tick
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import method_named, prepare
+from hapticbridge.scene import load_scene
+
+LAW = Coupling(800.0, 0.5, 0.8, 5e-4)
+
+
+def attack(seed: int, ticks: int, *, pays: bool = True) -> float:
+    """Returns the most energy in J that a hand got out of a scene of so many ticks a step."""
+    drawn = Attack.at_random(seed, scene_ticks=ticks, pays=pays)
+    energy, _, code = drawn.run()
+    assert code == OK
+    return energy
+
+
+@pytest.mark.parametrize("ticks", [2, 5, 10, 20])
+def test_no_hand_gets_energy_out_of_a_slower_scene(ticks: int) -> None:
+    for seed in range(40):
+        assert attack(seed, ticks) <= UNPAID, (seed, ticks)
+
+
+def test_results_that_nobody_pays_for_are_seen_to_give_energy() -> None:
+    assert max(attack(seed, 20, pays=False) for seed in range(60)) > 0.1
+
+
+class Loop:
+    """The ticks of a loop in front of a slower scene, or of one that steps in every tick (0)."""
+
+    def __init__(self, scene: str, ticks: int, **values: float) -> None:
+        self.ticks, self.scene = ticks, load_scene(scene, **values)
+        method = method_named("lossless").with_contact(None)
+        prepare(self.scene, LAW, max(ticks, 1) * T, 1, method, warns=False)
+        self.scene.set_gains(*method.gains(LAW, max(ticks, 1) * T))
+        self.scene.reset()
+        parameters = RunParameters(
+            grip=self.scene.grip,
+            period=T,
+            substeps=1,
+            coupling=LAW,
+            force_limit=10.0,
+            torque_limit=0.5,
+            ramp_ticks=0,
+            device_origin=IDENTITY,
+            handle_origin=self.scene.grip_pose(),
+            device_start=IDENTITY,
+            scheme=method.scheme,
+            is_rigid=True,
+            scene_ticks=ticks,
+        )
+        model, data = self.scene.model, self.scene.data
+        self.fast = self.slow = BoundKernel(model, data, parameters)
+        if ticks:
+            self.slow = BoundKernel(model, data, parameters.of_scene)
+        self.given = np.zeros(1, SAMPLE_DTYPE)
+
+    def run(self, motion: NDArray[np.float64]) -> NDArray[np.void]:
+        """Returns the records of a motion of the handle from the start, (n, 3) in m."""
+        rows, sample = np.zeros(len(motion), TICK_DTYPE), np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        state, row = self.fast.state, self.fast.row
+        for k, position in enumerate(motion):
+            sample["position"] = position
+            if not self.ticks:
+                assert whole_tick(state, sample, row, T)
+            else:
+                assert before_step(state, sample, row, 0, T) == OK
+                if k % self.ticks == 0:
+                    if k:
+                        period = self.ticks * T
+                        assert whole_tick(self.slow.state, self.given, self.slow.row, period)
+                    take_result(state, self.slow.state, self.given)
+                assert after_step(state, row, 0) == OK
+            rows[k] = row[0]
+        return rows
+
+
+def stroke(length: float, rate: float, count: int = 2000) -> NDArray[np.float64]:
+    """A stroke to and fro along x, at rest at its ends."""
+    motion = np.zeros((count, 3))
+    motion[:, 0] = 0.5 * length * (1.0 - np.cos(2.0 * np.pi * rate * T * np.arange(count)))
+    return motion
+
+
+@pytest.mark.parametrize(("ticks", "share"), [(2, 0.02), (5, 0.1), (10, 0.3)])
+def test_a_free_tool_is_shown_where_the_fast_scene_has_it(ticks: int, share: float) -> None:
+    motion = stroke(0.05, 1.0)
+    exact, shown = (Loop("point_mass", n).run(motion) for n in (0, ticks))
+    off = np.abs(shown["wrench_on_tool"][:, 0] - exact["wrench_on_tool"][:, 0])
+    assert off.max() < share * np.abs(exact["wrench_on_tool"][:, 0]).max()
+    way = np.abs(shown["tool_position"] - exact["tool_position"]).max()
+    assert way < 5e-5
+
+
+def test_a_pose_held_until_the_next_result_is_farther_off() -> None:
+    motion, errors = stroke(0.05, 1.0), []
+    exact = Loop("point_mass", 0).run(motion)["wrench_on_tool"][:, 0]
+    for is_foreseen in (True, False):
+        loop = Loop("point_mass", 10)
+        if not is_foreseen:
+            loop.fast.state["shown"]["scene_period"] = 1e9  # the velocities are then zero
+        errors.append(np.sqrt(np.mean((loop.run(motion)["wrench_on_tool"][:, 0] - exact) ** 2)))
+    assert errors[0] < 0.2 * errors[1]
+
+
+def test_a_tap_on_a_wall_is_felt_at_once() -> None:
+    motion = stroke(0.03, 2.0, 500)
+    exact = Loop("virtual_wall", 0).run(motion)["wrench_on_tool"][:, 0]
+    errors = []
+    for has_planes in (True, False):
+        loop = Loop("virtual_wall", 10)
+        if not has_planes:  # no geom is the tool's
+            nothing = np.zeros(loop.scene.model.ngeom, np.int32)
+            loop.fast.state["mj"]["geom_is_tool"] = nothing.ctypes.data
+            loop.slow.state["mj"]["geom_is_tool"] = nothing.ctypes.data
+        force = loop.run(motion)["wrench_on_tool"][:, 0]
+        errors.append(np.abs(force - exact).max())
+    assert np.abs(exact).max() > 2.0
+    assert errors[0] < 0.5 * errors[1]
+
+
+def energy_given(rows: NDArray[np.void]) -> NDArray[np.float64]:
+    """P of each tick by the definition, for forces below their level, without a damper."""
+    handle, tool = rows["handle_position"], rows["tool_position"]
+    before = np.concatenate([[tool[0]], tool[:-1]])
+    stored = [0.5 * LAW.stiffness * np.sum((handle - x) ** 2, axis=1) for x in (before, tool)]
+    step = tool - before
+    elastic = LAW.stiffness * (handle - tool)
+    damped = np.sum((rows["wrench_on_tool"][:, :3] - elastic) * step, axis=1)
+    return np.asarray(stored[0] - stored[1] + damped)
+
+
+def test_the_tool_moves_only_as_far_as_the_hand_has_paid() -> None:
+    loop = Loop("point_mass", 20)
+    shaken = stroke(0.02, 7.3, 3000)
+    rows = loop.run(shaken)
+    tank, work = rows["scene_tank"], energy_given(rows)[1:]
+    assert loop.fast.state["shown"]["held_back"][0] > 10
+    assert tank.min() < 0.0 < tank.max()  # loans, and energy on the way
+    is_new = np.diff(rows["scene_step"]) > 0
+    assert is_new.sum() == 149
+    cap = loop.fast.state["shown"]["cap"][0]
+    moved = np.minimum(tank[:-1] + work, cap)
+    assert tank[1:][~is_new] == pytest.approx(moved[~is_new], abs=1e-9)
+    assert (tank[1:] >= np.minimum(tank[1:] - work, 0.0) - 1e-9).all()
+    assert loop.fast.state["energy"]["first_unstrict"][0] == -1
+    assert loop.slow.state["energy"]["first_unstrict"][0] == -1
+
+
+def test_the_handle_is_drawn_near_while_a_loan_is_out() -> None:
+    loop = Loop("point_mass", 10)
+    loop.run(stroke(0.05, 2.0, 60))
+    fast = loop.fast.state
+    for tank, share in ((0.0, 1.0), (-0.75, 0.5), (-1.0, 0.0), (-2.0, 0.0)):
+        stretch = fast["pose"]["handle_position"][0] - fast["shown"]["newest"][0, :3]
+        energy = 0.5 * LAW.stiffness * float(stretch @ stretch)
+        fast["shown"]["credit"], fast["shown"]["tank"] = energy, tank * energy
+        fast["shown"]["waits"] = 0
+        take_result(fast, loop.slow.state, loop.given)
+        given = loop.given["position"][0] - fast["shown"]["newest"][0, :3]
+        assert given == pytest.approx(share * stretch, abs=1e-9)
+
+
+def test_a_slower_scene_needs_a_method_that_solves_its_coupling() -> None:
+    parameters = replace(TO_REPLACE, scene_ticks=10)
+    assert parameters.scene_period == pytest.approx(10 * T)
+    assert parameters.of_scene.period == parameters.scene_period
+    assert parameters.of_scene.scene_ticks == 0
+    for changes, words in (
+        ({"scheme": 2}, "needs method 'lossless', 'implicit' or 'compensated'"),
+        ({"scene_ticks": 1}, "once in 1 ticks; it must be 2 to 1000"),
+        ({"scene_ticks": 1001}, "it must be 2 to 1000"),
+    ):
+        with pytest.raises(Exception, match=words):
+            replace(parameters, **changes)
+
+
+TO_REPLACE = RunParameters(
+    grip="grip",
+    period=T,
+    substeps=1,
+    coupling=LAW,
+    force_limit=10.0,
+    torque_limit=0.5,
+    ramp_ticks=0,
+    device_origin=IDENTITY,
+    handle_origin=IDENTITY,
+    device_start=IDENTITY,
+)
