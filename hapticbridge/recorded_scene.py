@@ -21,6 +21,7 @@ from hapticbridge import jit
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
+from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -88,6 +89,7 @@ def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
         sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
         rows, flags = np.zeros(1, TICK_DTYPE), np.zeros(1, np.int64)
         sample["quaternion"][:, 0] = 1.0
+        jit.direct(stretch_at, kernel.state[0], sample)  # of a run with absolute poses
         if is_slow:
             slow = SlowScene(kernel, scene.model, scene.data, parameters)
             slow.simulate(sample, flags, nothing, flags, rows)

@@ -77,7 +77,7 @@ class SlowScene:
         self._take_result = direct(take_result, loop.state, state, self._given)
         self._before = direct(before_step, state, self._given, row, 0, 0.0)
         self._end = direct(after_step, state, row, 0)
-        self._step = self.bound.step
+        self.step = self.bound.step
         self._thread: threading.Thread | None = None
         self._wake, self._done = threading.Semaphore(0), threading.Event()
         self._is_closed, self._is_sound, self._is_late = False, True, False
@@ -172,7 +172,7 @@ class SlowScene:
         for substep in self._substeps:
             if self._before(state, self._given, row, substep, period) != OK:
                 return False
-            self._step(self._model, self._data)
+            self.step(self._model, self._data)
             if self._end(state, row, substep) != OK:
                 return False
         return True

@@ -199,15 +199,14 @@ class Timekeeping:
         )
         late = f", {self._late}" if self._late else ""
         if self.scene_rate is not None:
-            late += (
-                f", the scene at {self.scene_rate:.4g} Hz and {self.scene_speed:.0%} of its speed"
-            )
+            speed = f"{100.0 * self.scene_speed:.3g} % of its speed"
+            late += f", the scene at {self.scene_rate:.4g} Hz and {speed}"
         return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
 
     @property
     def remark(self) -> str:
         """``words`` where the run was not simply in time; else empty."""
-        is_exact = min(self.share, self.fresh, self.scene_speed) == 1.0 and not self._late
+        is_exact = min(self.share, self.fresh) == 1.0 and not self._late and not self.scene_rate
         return "" if is_exact else self.words
 
     @property

@@ -15,7 +15,7 @@ from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, take_result, whole_tick
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import load_scene
 
@@ -38,6 +38,10 @@ def test_no_hand_gets_energy_out_of_a_slower_scene(ticks: int) -> None:
 
 def test_results_that_nobody_pays_for_are_seen_to_give_energy() -> None:
     assert max(attack(seed, 20, pays=False) for seed in range(60)) > 0.1
+
+
+def rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 class Loop:
@@ -98,14 +102,14 @@ def stroke(length: float, rate: float, count: int = 2000) -> NDArray[np.float64]
     return motion
 
 
-@pytest.mark.parametrize(("ticks", "share"), [(2, 0.02), (5, 0.1), (10, 0.3)])
+@pytest.mark.parametrize(("ticks", "share"), [(2, 0.06), (5, 0.2), (10, 0.7)])
 def test_a_free_tool_is_shown_where_the_fast_scene_has_it(ticks: int, share: float) -> None:
     motion = stroke(0.05, 1.0)
     exact, shown = (Loop("point_mass", n).run(motion) for n in (0, ticks))
-    off = np.abs(shown["wrench_on_tool"][:, 0] - exact["wrench_on_tool"][:, 0])
-    assert off.max() < share * np.abs(exact["wrench_on_tool"][:, 0]).max()
+    off = shown["wrench_on_tool"][:, 0] - exact["wrench_on_tool"][:, 0]
+    assert rms(off) < share * rms(exact["wrench_on_tool"][:, 0])
     way = np.abs(shown["tool_position"] - exact["tool_position"]).max()
-    assert way < 5e-5
+    assert way < 2e-5 * ticks
 
 
 def test_a_pose_held_until_the_next_result_is_farther_off() -> None:
@@ -115,7 +119,7 @@ def test_a_pose_held_until_the_next_result_is_farther_off() -> None:
         loop = Loop("point_mass", 10)
         if not is_foreseen:
             loop.fast.state["shown"]["scene_period"] = 1e9  # the velocities are then zero
-        errors.append(np.sqrt(np.mean((loop.run(motion)["wrench_on_tool"][:, 0] - exact) ** 2)))
+        errors.append(rms(loop.run(motion)["wrench_on_tool"][:, 0] - exact))
     assert errors[0] < 0.2 * errors[1]
 
 
@@ -130,7 +134,7 @@ def test_a_tap_on_a_wall_is_felt_at_once() -> None:
             loop.fast.state["mj"]["geom_is_tool"] = nothing.ctypes.data
             loop.slow.state["mj"]["geom_is_tool"] = nothing.ctypes.data
         force = loop.run(motion)["wrench_on_tool"][:, 0]
-        errors.append(np.abs(force - exact).max())
+        errors.append(rms(force - exact))
     assert np.abs(exact).max() > 2.0
     assert errors[0] < 0.5 * errors[1]
 
@@ -148,9 +152,14 @@ def energy_given(rows: NDArray[np.void]) -> NDArray[np.float64]:
 
 def test_the_tool_moves_only_as_far_as_the_hand_has_paid() -> None:
     loop = Loop("point_mass", 20)
-    shaken = stroke(0.02, 7.3, 3000)
+    rng = np.random.default_rng(3)
+    speed, shaken = np.zeros(3), np.zeros((3000, 3))
+    for k in range(1, len(shaken)):  # wanders
+        speed = 0.98 * speed + 0.01 * rng.standard_normal(3)
+        shaken[k] = shaken[k - 1] + T * speed
     rows = loop.run(shaken)
     tank, work = rows["scene_tank"], energy_given(rows)[1:]
+    assert not (rows["flags"] & int(TickFlag.FORCE_LIMITED)).any()
     assert loop.fast.state["shown"]["held_back"][0] > 10
     assert tank.min() < 0.0 < tank.max()  # loans, and energy on the way
     is_new = np.diff(rows["scene_step"]) > 0

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from hapticbridge.guard import trip_reason
 from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
 from hapticbridge.options import Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.scene import load_scene
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.settings import GAINS, Settings
 
@@ -284,6 +286,21 @@ _BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY)
 """Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""
 
 Event = Mapping[str, Any]
+
+
+@cache
+def load_bridge_code(method: str, contact: str, is_slow: bool) -> None:
+    """Loads the machine code of a bridge, which is first compiled and kept on disk if missing.
+
+    A child process may not write it (``recorded_scene.load_machine_code``).
+    """
+    options: dict[str, Any] = {"method": method, "contact": contact, "clock": SimulatedClock()}
+    if is_slow:
+        options["scene_rate"] = 500.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Bridge(load_scene("point_mass"), i_know=True, **options) as bridge:
+            bridge.run(4e-3)
 
 
 class Repetition:

@@ -34,6 +34,7 @@ from hapticbridge.whatif.replayed_hand import (
     RecordedMotion,
     Repetition,
     ResampledMotion,
+    load_bridge_code,
     missing_for_closed_loop,
 )
 from hapticbridge.whatif.settings import UNITS, Settings, Value
@@ -254,6 +255,9 @@ class _Experiment:
             period, trip = repetition.into(path, device_in(scene), clock)
             return period, trip, repetition.warned
 
+        load_bridge_code(
+            settings.method.name, settings.method.contact, settings.scene_rate < settings.rate
+        )
         old = run.settings
         steps = settings.rate * settings.substeps / (old.rate * old.substeps)
         period, trip, warned = self._in_bounds(work, max(1.0, steps))

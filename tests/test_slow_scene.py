@@ -1,0 +1,307 @@
+"""A scene that steps in a loop of its own: the run, its recording, changes, faults and the end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, rewritten, verdict_of
+from bridge_runs import fast, still, sway
+from cli_cases import Called
+
+import hapticbridge as hb
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.commands import Couple, Reset
+from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.options import RunSetup, steady_stiffness
+from hapticbridge.recording import read_recording
+from hapticbridge.scene import load_scene
+from hapticbridge.whatif import what_if
+
+
+def stroke(tick: int) -> tuple[float, ...]:
+    """Presses the wall at 1 cm again and again."""
+    return (0.008 - 0.008 * np.cos(0.012 * tick), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def audited(path: Path) -> Any:
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit"), report.faults
+    assert report.environment == "strict"
+    return report
+
+
+@pytest.fixture(scope="module")
+def pressed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("slow") / "pressed.mcap"
+    recorded(path, "virtual_wall", ScriptedDevice(stroke), COUPLING, scene_rate=200.0, duration=0.6)
+    return path
+
+
+def test_a_slower_scene_runs_and_is_audited(pressed: Path) -> None:
+    report = audited(pressed)
+    ticks = read_recording(pressed).ticks
+    assert ticks["scene_step"].tolist() == [tick // 5 for tick in range(600)]
+    assert np.abs(ticks["wrench_on_device"][:, 0]).max() > 1.0
+    assert report.timekeeping.scene_rate == pytest.approx(200.0)
+    assert report.timekeeping.scene_speed == 1.0
+
+
+@pytest.mark.filterwarnings("ignore:.*time step 0.01 s")
+@pytest.mark.parametrize("options", [{"method": "implicit", "substeps": 4}, {"contact": "scene"}])
+def test_the_scene_keeps_method_substeps_and_contact(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    path = tmp_path / "run.mcap"
+    device = ScriptedDevice(stroke)
+    summary = recorded(
+        path, "peg_in_hole", device, COUPLING, scene_rate=100.0, duration=0.4, **options
+    )
+    assert summary.environment in ("strict", "within slack")
+    report = audit(path)
+    assert (report.verdict, report.resimulation) == (summary.verdict, "bit for bit")
+
+
+def test_late_results_are_recorded_and_repeated(tmp_path: Path) -> None:
+    """The loop runs far ahead of the scene's thread, which no clock holds back."""
+    path = tmp_path / "late.mcap"
+    device = ScriptedDevice(sway)
+    summary = recorded(
+        path, "point_mass", device, COUPLING, clock=SlowClock({}), scene_rate=500.0, duration=1.0
+    )
+    kept = summary.timekeeping
+    assert kept.scene_speed < 0.95
+    assert "slow motion: a lower --scene-rate" in kept.hint
+    report = audited(path)
+    assert report.timekeeping.scene_speed == kept.scene_speed
+    assert "the scene at 500 Hz and" in report.timekeeping.remark
+    gaps = np.diff(np.flatnonzero(np.diff(read_recording(path).ticks["scene_step"])))
+    assert gaps.min() >= 2
+    assert gaps.max() > 2
+
+
+def test_a_run_against_the_wall_clock_ends_with_its_thread(tmp_path: Path) -> None:
+    path = tmp_path / "real.mcap"
+    before = threading.active_count()
+    with Bridge(
+        "peg_in_hole", ScriptedDevice(stroke), COUPLING, recording=path, scene_rate=100.0
+    ) as bridge:
+        summary = bridge.run(0.3)
+        again = bridge.run(0.2)
+        assert threading.active_count() > before
+    assert summary.verdict == again.verdict == "passive"
+    assert threading.active_count() == before
+    audited(path)
+
+
+def test_changes_wait_for_the_step_under_way(tmp_path: Path) -> None:
+    scene = tmp_path / "arm.xml"
+    scene.write_text(ARM)
+    path = tmp_path / "changed.mcap"
+
+    def act(bridge: Bridge, tick: int) -> None:
+        if tick == 33:
+            bridge.set_input(ctrl={"lift": 1.0}, body_wrench={"arm": [0, 0, 0.3, 0, 0, 0]})
+        if tick == 57:
+            bridge.set_input(mocap={"plate": [0.2, 0, -0.03]})
+        if tick == 101:
+            bridge.command(Couple(800.0, 4.0))
+        if tick == 903:
+            bridge.session.commands.now = lambda: 1e9  # no command is too soon
+            bridge.command(Reset())
+
+    recorded(
+        path, scene, ScriptedDevice(sway), COUPLING, scene_rate=100.0, duration=1.5, on_tick=act
+    )
+    report = audited(path)
+    assert report.events["reset"] == report.events["coupling"] == 1
+    assert report.events["input"] == 2
+    ticks = read_recording(path).ticks
+    assert np.ptp(ticks["actuator_work"][100:900]) > 1e-6  # the lift has moved the arm
+
+
+ARM = """<mujoco>
+  <worldbody>
+    <body name="tool"><freejoint/><geom size="0.01" mass="0.1"/><site name="grip"/></body>
+    <body name="arm" pos="0.2 0 0">
+      <joint name="arm" type="slide" axis="0 0 1" stiffness="50" damping="0.5"/>
+      <geom size="0.01" mass="0.2"/>
+    </body>
+    <body name="plate" mocap="true" pos="0.2 0 -0.1"><geom type="box" size="0.05 0.05 0.01"/></body>
+  </worldbody>
+  <actuator><motor name="lift" joint="arm"/></actuator>
+</mujoco>"""
+
+
+# Faults
+
+
+def broken(bridge: Bridge, step: Callable[..., None]) -> None:
+    """Replaces MuJoCo's step in the scene's loop."""
+    slow = bridge.session.slow
+    assert slow is not None
+    slow.step = step
+
+
+@pytest.mark.parametrize("clock", [hb.SimulatedClock, hb.RealClock])
+def test_an_error_of_the_scene_ends_the_run_with_zero_force(clock: type) -> None:
+    device = ScriptedDevice(sway)
+    bridge = Bridge("point_mass", device, COUPLING, clock=clock(), scene_rate=100.0)
+
+    def fails(*_: object) -> None:
+        raise ArithmeticError("as told")
+
+    with pytest.raises(ArithmeticError, match="as told"), bridge:
+        bridge.run(0.1)
+        broken(bridge, fails)
+        bridge.run(1.0)
+    assert device.is_closed
+    assert not device.writes[-1].any()
+
+
+def test_a_result_that_is_not_finite_trips() -> None:
+    device = ScriptedDevice(sway)
+    bridge = fast("point_mass", device, coupling=COUPLING, scene_rate=100.0)
+
+    def spoils(_: object, data: Any) -> None:
+        data.qvel[:] = np.nan
+
+    with pytest.raises(SafetyTrip, match=r"not finite|unstable|diverge"), bridge:
+        broken(bridge, spoils)
+        bridge.run(1.0)
+    assert not device.writes[-1].any()
+
+
+def test_a_step_that_stands_still_keeps_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hapticbridge.slow_scene.LONGEST_WAIT", 0.1)
+    device, release = ScriptedDevice(still), threading.Event()
+    bridge = Bridge("point_mass", device, COUPLING, scene_rate=100.0)
+    began = time.monotonic()
+    try:
+        with bridge:
+            broken(bridge, lambda *_: release.wait(60.0) and None)
+            summary = bridge.run(0.3)
+        assert device.is_closed
+        assert time.monotonic() - began < 30.0
+        assert summary.ticks > 100  # the loop did not wait
+        assert summary.timekeeping.scene_speed == 0.0
+    finally:
+        release.set()
+
+
+# Options
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scene_rate": 3000.0}, "scene rate is 3000.0 Hz; it must be 'auto', or 1 to 1000"),
+        ({"scene_rate": 0.5}, "it must be 'auto', or 1 to 1000"),
+        ({"scene_rate": "fast"}, "scene rate is 'fast' Hz; it must be 'auto', or 1 to 1000"),
+        ({"scene_rate": 100.0, "method": "weld"}, "needs method 'lossless', 'implicit' or"),
+        ({"scene_rate": 100.0, "substeps": 2, "method": "lossless"}, "so it must be 1"),
+    ],
+)
+def test_rates_that_no_scene_can_have_are_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(HapticBridgeError, match=words):
+        fast("point_mass", ScriptedDevice(still), **options)
+
+
+def test_a_scene_that_cannot_keep_the_rate_steps_beside_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def ticks_of(step: float, clock: hb.Clock, **options: Any) -> int:
+        monkeypatch.setattr("hapticbridge.options.step_time", lambda *_: step)
+        return Bridge("point_mass", ScriptedDevice(still), clock=clock, **options).setup.scene_ticks
+
+    assert ticks_of(8e-3, hb.RealClock()) == 10  # a fifth of its time is to spare
+    assert ticks_of(0.9e-3, hb.RealClock()) == 2
+    assert ticks_of(0.7e-3, hb.RealClock()) == 0
+    assert ticks_of(8e-3, hb.SimulatedClock()) == 0
+    assert ticks_of(8e-3, hb.RealClock(), method="weld") == 0
+    assert ticks_of(8e-3, hb.RealClock(), scene_rate=1000.0) == 0
+
+
+def test_the_usual_coupling_to_a_slower_scene_does_not_shake() -> None:
+    def setup(rate: float) -> RunSetup:
+        return fast("point_mass", ScriptedDevice(still), scene_rate=rate).setup
+
+    usual, slower = setup(1000.0), setup(50.0)
+    most = steady_stiffness(slower.scene, slower.info, 0.02, 1.0, 1.0)
+    # K = 0.8/(T_s² (1/m_tool + 1/m_hand))
+    hand = 0.55 + (slower.info.mass or 0.0)
+    assert most == pytest.approx(0.8 / (0.02**2 * (1.0 / 0.1 + 1.0 / hand)), rel=1e-6)
+    assert slower.law.stiffness == pytest.approx(most)
+    assert slower.law.damping == pytest.approx(usual.law.damping)
+    ratio = slower.law.rotational_stiffness / usual.law.rotational_stiffness
+    assert ratio == pytest.approx(most / usual.law.stiffness)
+    chosen = fast("point_mass", ScriptedDevice(still), coupling={"damping": 9.0}, scene_rate=50.0)
+    assert chosen.setup.coupling.damping == 9.0
+    assert chosen.setup.coupling.stiffness == slower.coupling.stiffness
+    assert load_scene("point_mass").model.body_mass.sum() == pytest.approx(0.1)
+
+
+# Recordings
+
+
+@pytest.mark.parametrize("field", ["scene_tank", "scene_step"])
+def test_a_changed_tank_or_step_is_seen(pressed: Path, tmp_path: Path, field: str) -> None:
+    recording = read_recording(pressed)
+    for first, change in ((301, 1), (305, 1), (305, -1)):
+        ticks = recording.ticks.copy()
+        ticks[field][first:] += change if field == "scene_step" else change * 1e-4
+        report = verdict_of(recording, tmp_path, ticks=ticks)
+        assert report.exit_code != 0, (field, first, change)
+
+
+@pytest.mark.parametrize("is_resimulated", [True, False])
+@pytest.mark.parametrize("ticks", ["0", "4", "6", "1", "-5", "x"])
+def test_another_rate_of_the_scene_is_seen(
+    pressed: Path, tmp_path: Path, ticks: str, is_resimulated: bool
+) -> None:
+    recording = read_recording(pressed)
+    meta = {"scene_ticks": ticks} | ({} if is_resimulated else {"versions": "{}"})
+    assert verdict_of(recording, tmp_path, meta=meta).exit_code != 0
+
+
+def test_a_tool_that_nobody_paid_for_is_seen_without_simulation(
+    pressed: Path, tmp_path: Path
+) -> None:
+    recording = read_recording(pressed)
+    ticks = recording.ticks.copy()
+    ticks["tool_position"][311:, 0] -= 2e-3  # toward the hand that pulls back
+    report = verdict_of(recording, tmp_path, ticks=ticks, meta={"versions": "{}"})
+    assert report.verdict == "invalid"
+
+
+def test_records_without_steps_are_refused(pressed: Path, tmp_path: Path) -> None:
+    recording = read_recording(pressed)
+    names = [name for name in recording.ticks.dtype.names or () if name != "scene_step"]
+    path = rewritten(recording, tmp_path / "old.mcap", ticks=np.array(recording.ticks[names]))
+    assert audit(path).exit_code != 0
+
+
+def test_what_if_repeats_it_to_the_bit(pressed: Path) -> None:
+    result = what_if(pressed, {})
+    assert any("the recorded one in every bit" in note for note in result.notes)
+
+
+def test_the_command_line_names_the_rate(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    code, out, err = call(
+        *("run", "peg_in_hole", "--fast", "--duration", 0.3, "--record", path),
+        *("--scene-rate", 100, "--stiffness", 3000),
+    )
+    assert code == 0
+    assert "the scene steps at 100 Hz beside the loop" in err
+    assert "the tool may shake above about" in err
+    assert "the scene at 100 Hz and 100 % of its speed" in " ".join(out.split())
+    code, out, _ = call("audit", path)
+    assert code == 0
+    assert "the scene at 100 Hz and 100 % of its speed" in out
