@@ -36,7 +36,13 @@ from hapticbridge.kernel.tick import (
     publish_positions,
 )
 from hapticbridge.options import RunSetup
-from hapticbridge.realtime import Grant, check_pace, memory_at_rest, warn_of_refusals
+from hapticbridge.realtime import (
+    Grant,
+    check_pace,
+    memory_at_rest,
+    warn_of_refusals,
+    warn_of_slow_motion,
+)
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.seal import Signer
@@ -271,8 +277,11 @@ class Session:
         sample = np.zeros(1, SAMPLE_DTYPE)
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
-            is_real = self.device.info.is_real
-            check_pace(scene, setup.method, setup.scene_period, setup.substeps, is_real=is_real)
+            pace = scene, setup.method, setup.scene_period, setup.substeps
+            if setup.scene_ticks:
+                warn_of_slow_motion(*pace)
+            else:
+                check_pace(*pace, is_real=self.device.info.is_real)
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)

@@ -363,7 +363,7 @@ def test_a_scene_too_slow_is_refused_for_a_real_device_and_warned_of_for_others(
     started: list[float] = []
     monkeypatch.setattr(device, "start", started.append)
     with pytest.raises(SceneError, match="could hold"):
-        Bridge("point_mass", device, rate=1e6, realtime=False).__enter__()
+        Bridge("point_mass", device, rate=1e6, scene_rate=1e6, realtime=False).__enter__()
     assert not started
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from bridge_runs import fast, still, sway
 from cli_cases import Called
 
 import hapticbridge as hb
+from hapticbridge import jit
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Couple, Reset
@@ -23,6 +25,7 @@ from hapticbridge.options import RunSetup, steady_stiffness
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
 from hapticbridge.whatif import what_if
+from hapticbridge.whatif.replayed_hand import load_bridge_code
 
 
 def stroke(tick: int) -> tuple[float, ...]:
@@ -305,3 +308,30 @@ def test_the_command_line_names_the_rate(call: Called, tmp_path: Path) -> None:
     code, out, _ = call("audit", path)
     assert code == 0
     assert "the scene at 100 Hz and 100 % of its speed" in out
+
+
+def test_a_scene_beside_the_loop_that_is_still_too_slow_is_warned_of(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hapticbridge.realtime.realtime.step_time", lambda *_: 12e-3)
+    device = ScriptedDevice(still)
+    with (
+        pytest.warns(UserWarning, match=r"12 ms for 10 ms .* slow motion; .* --scene-rate 67"),
+        Bridge("point_mass", device, COUPLING, scene_rate=100.0),
+    ):
+        pass
+
+
+def test_a_bridge_in_a_child_finds_its_machine_code_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = [each for each in gc.get_objects() if isinstance(each, jit.Compiled)]
+    for each in every:
+        monkeypatch.setattr(each, "_direct", {})
+    load_bridge_code.cache_clear()
+    load_bridge_code("lossless", "rigid", True)
+
+    def missing(self: Any, *_: object) -> bytes:
+        raise AssertionError(f"{self.source.__name__} is not loaded")
+
+    monkeypatch.setattr(jit.Compiled, "_object_code", missing)
+    with fast("peg_in_hole", coupling=COUPLING, scene_rate=200.0) as bridge:
+        assert bridge.run(0.01).ticks == 10

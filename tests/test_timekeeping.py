@@ -313,6 +313,7 @@ def test_check_finds_a_rate_that_this_machine_cannot_hold(
     assert code == 1
     assert "cannot hold 1000 Hz here" in out
     assert "--rate 250" in out
+    assert "--scene-rate 250" in out
     monkeypatch.setattr("hapticbridge.cli.check.measure_cost", lambda *_a, **_k: slow(1e-5))
     code, out, _ = call("check", "virtual_wall")
     assert code == 0

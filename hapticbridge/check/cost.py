@@ -21,6 +21,7 @@ from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, publish, simulate
 from hapticbridge.plotting import new_figure
@@ -158,11 +159,14 @@ class Cost:
         highest = math.floor(self.highest_rate)
         p99, left = 1e6 * self.all_ticks.p99, 1e6 * TICK_SHARE * case.period
         lower = f"and run with --rate {highest}; or " if highest >= LOWEST_RATE else ""
+        ticks = math.ceil(self.all_ticks.p99 / (TICK_SHARE * case.period))
+        beside = f"{rate / min(max(ticks, 2), MAX_SCENE_TICKS):.3g}"
         return Fault(
             "rate",
             case.places.option("timestep"),
             f"cannot hold {rate:g} Hz here: 99 of 100 ticks take up to {p99:.3g} µs; beside the "
             f"device and late wake-ups {left:.3g} µs of a period are left for them",
+            f"'hapticbridge run' lets it step beside the loop, with --scene-rate {beside}; or "
             f"{case.places.option_change('timestep', f'{1.0 / max(highest, 1):.3g}')} {lower}"
             "see with 'hapticbridge check --lean' what may go",
         )

@@ -17,3 +17,4 @@ from hapticbridge.realtime.realtime import step_time as step_time
 from hapticbridge.realtime.realtime import stolen_time as stolen_time
 from hapticbridge.realtime.realtime import wants_real_time as wants_real_time
 from hapticbridge.realtime.realtime import warn_of_refusals as warn_of_refusals
+from hapticbridge.realtime.realtime import warn_of_slow_motion as warn_of_slow_motion

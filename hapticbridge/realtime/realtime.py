@@ -138,12 +138,24 @@ def check_pace(
     held = float(f"{rate_for(needed):.2g}")  # two digits, and no exponent
     message = (
         f"scene '{scene.name}' needs {needed * 1e3:.3g} ms of MuJoCo a tick at its start, the "
-        f"period is {period * 1e3:.3g} ms; it could hold about {held:g} Hz: lower the "
-        "rate, or find the cause with 'hapticbridge check'"
+        f"period is {period * 1e3:.3g} ms; it could hold about {held:g} Hz: "
+        f"{'leave out --scene-rate' if method.can_be_slow else 'choose another --method'}, lower "
+        "the rate, or find the cause with 'hapticbridge check'"
     )
     if is_real:
         raise SceneError(message)
     warnings.warn(message, stacklevel=2)
+
+
+def warn_of_slow_motion(scene: Scene, method: Method, period: float, substeps: int) -> None:
+    """Warns of a scene beside the loop whose ``substeps`` take longer than its own period in s."""
+    needed = substeps * step_time(scene, method)
+    if needed > period:
+        warnings.warn(
+            f"scene '{scene.name}' needs {needed * 1e3:.3g} ms for {period * 1e3:.3g} ms of its "
+            f"time, so it runs in slow motion; it can keep --scene-rate {SPARE / needed:.2g}",
+            stacklevel=2,
+        )
 
 
 def rate_for(needed: float) -> float:
