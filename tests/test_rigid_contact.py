@@ -358,6 +358,39 @@ def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
     assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
 
 
+COUPLED = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <default><geom type="box" size="0.01 0.01 0.01" mass="0.05" contype="0" conaffinity="0"/>
+  </default>
+  <worldbody>
+    <body name="tool"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/><geom/>
+      <site name="grip" pos="0.01 0 0"/></body>
+    <body name="other" pos="0 0.04 0"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/><geom/>
+    </body>
+  </worldbody>
+  <equality>{equality}</equality>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="tool" body2="other"/>',
+        '<connect body1="tool" body2="other" anchor="0 0.04 0"/>',
+    ],
+)
+def test_bodies_that_turn_at_a_dead_point_of_their_constraint_gain_no_energy(equality: str) -> None:
+    """MuJoCo adds −J̇v to these rows, which would give energy where J is near zero."""
+    for seed in (1, 2, 3):
+        for method in ("implicit", "lossless"):
+            loaded = load(COUPLED.format(equality=equality))
+            samples = jamming(seed)
+            samples["position"] *= 4.0
+            run = through(prepared(loaded, method, Coupling(1000.0, 0.5, 1.0, 5e-4)), samples)
+            assert strict(run), (seed, method)
+
+
 # Sharpness
 
 
