@@ -49,6 +49,7 @@ References:
 from __future__ import annotations
 
 import math
+from ctypes import sizeof
 
 import mujoco
 import numpy as np
@@ -57,7 +58,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
-from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at
+from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
@@ -114,6 +115,18 @@ LAST_TURNING = int(mujoco.mjtEq.mjEQ_WELD)
 LAST_RIGID = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
 
+STALLED = 1.0
+"""Gradient in m/s², as MuJoCo scales it, above which a solution has not converged. Ordinary steps
+end below 0.1, those that give energy above 100."""
+
+_SOLVER = struct_of("mjModel").opt.offset + struct_of("mjOption").solver.offset
+
+_GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct_of("mjSolverStat"))
+
+_MOST_KEPT = int(mujoco.mjNSOLVER)
+
+_NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
+
 _PARAMETERS = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
     *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
@@ -138,6 +151,10 @@ RIGID_DTYPE = np.dtype(
         ("is_aimed", "<i8"),
         ("corrections", "<i8"),
         ("is_shifted", "<i8"),
+        ("solver", "<i8"),
+        ("own_solver", "<i8"),
+        ("statistics", "<i8"),
+        ("warmstart", "<i8"),
         ("row_capacity", "<i8"),
         *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
@@ -147,6 +164,7 @@ RIGID_DTYPE = np.dtype(
         ("cap", "<f8"),
         ("last_energy", "<f8"),
         ("lift", "<f8"),
+        ("stalled", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
@@ -154,10 +172,11 @@ RIGID_DTYPE = np.dtype(
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
 last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it;
-``is_shifted`` is 1 if the step was repeated without −h J̇v. Of limits and equality constraints:
-largest count of rows (0 if there are none), and addresses of the model's parameters, of copies, of
-the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins: addresses and
-counts of the geoms that move, of pairs, and of the bodies' velocities."""
+``is_shifted`` is 1 if the step was repeated without −h J̇v. ``solver`` is the address of MuJoCo's
+choice, ``own_solver`` that of the scene; ``stalled`` is ``STALLED``. Of limits and equality
+constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
+of copies, of the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins:
+addresses and counts of the geoms that move, of pairs, and of the bodies' velocities."""
 
 
 def bind_contact(
@@ -166,6 +185,10 @@ def bind_contact(
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
+    contact["solver"], contact["own_solver"] = model._address + _SOLVER, model.opt.solver
+    contact["statistics"] = data._address + struct_of("mjData").solver.offset
+    contact["warmstart"] = data.qacc_warmstart.ctypes.data
+    contact["stalled"] = STALLED
     is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
@@ -360,8 +383,36 @@ def aim_contacts(s: State) -> None:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.share = 1.0 if has_energy else 0.0
         contact.corrections = contact.is_shifted = 0
+        ints(contact.solver, 1)[0] = contact.own_solver
         _aim(s)
         contact.is_aimed = 1
+
+
+@compiled
+def _change_solver(s: State) -> bool:
+    """Chooses the other solver, from a cold start, if the step that just ended did not converge.
+
+    In a jam at a friction of 1 and more, Newton's method may stop early or go round in circles with
+    forces of 1e8 N, where conjugate gradients converge in 50 iterations.
+
+    Returns:
+        True if it did, at most once in a step.
+    """
+    mj, contact, solver = s.mj, s.contact, ints(s.contact.solver, 1)
+    if solver[0] != contact.own_solver:
+        return False
+    worst, islands = 0.0, max(ints(mj.nisland, 1)[0], 1)
+    for island, iterations in enumerate(ints(mj.solver_niter, min(islands, 20))):
+        if iterations > 0:
+            last = island * _MOST_KEPT + min(iterations, _MOST_KEPT) - 1
+            worst = max(worst, floats(contact.statistics + last * _STATISTIC + _GRADIENT, 1)[0])
+    if worst <= contact.stalled:
+        return False
+    solver[0] = _CG if solver[0] == _NEWTON else _NEWTON
+    start = floats(contact.warmstart, mj.nv)
+    for i in range(mj.nv):
+        start[i] = 0.0
+    return True
 
 
 @compiled
@@ -409,7 +460,7 @@ def _has_sunk(s: State) -> bool:
 
 @compiled
 def aim_again(s: State) -> bool:
-    """Corrects what the step that just ended aimed at: less sinking, or less depenetration.
+    """Corrects the step that just ended: a solution that converges, less sinking, or less push.
 
     Contacts that sank aim higher. If the step spent more than the tank allows, the share is lower.
 
@@ -419,6 +470,9 @@ def aim_again(s: State) -> bool:
     contact = s.contact
     if not contact.is_aimed:
         return False
+    if _change_solver(s):
+        contact.repetitions += 1
+        return True
     if contact.corrections < MOST_CORRECTIONS and _has_sunk(s):
         contact.corrections += 1
         contact.repetitions += 1
@@ -444,6 +498,7 @@ def finish_contacts(s: State) -> None:
     if s.contact.is_aimed and s.contact.row_capacity > 0:
         _restore_rows(s)
     s.contact.is_aimed = 0
+    ints(s.contact.solver, 1)[0] = s.contact.own_solver
     count = ints(mj.nefc, 1)[0]
     positions = floats(pointer_at(mj.efc_pos), count)
     force = floats(pointer_at(mj.efc_force), count)
