@@ -158,9 +158,10 @@ def without_model(recording: Recording) -> Recording:
     return Recording(**{**vars(recording), "attachments": files})
 
 
-def without_share(recording: Recording) -> NDArray[np.void]:
-    """Returns the records as an earlier version wrote them."""
-    later = ("share", "contact_tank")
+def without_share(
+    recording: Recording, later: Sequence[str] = ("share", "contact_tank")
+) -> NDArray[np.void]:
+    """Returns the records as an earlier version wrote them, without some later fields."""
     names = [name for name in recording.ticks.dtype.names or () if name not in later]
     record = np.dtype([(name, recording.ticks.dtype[name]) for name in names])
     ticks = np.zeros(len(recording.ticks), record)

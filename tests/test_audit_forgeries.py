@@ -27,6 +27,7 @@ from audit_cases import (
     recorded,
     rewritten,
     verdict_of,
+    without_share,
 )
 
 from hapticbridge.audit import AuditReport, audit
@@ -420,6 +421,8 @@ FORGERIES: dict[str, Forgery] = {
     "rows exchanged": seen(hand, rows(lambda r: r[[*range(50), 51, 50, *range(52, len(r))]])),
     "wrench on the device": seen(hand, ticks("wrench_on_device", lambda v: 0.9 * v)),
     "wrench on the tool": seen(hand, ticks("wrench_on_tool", lambda v: 0.9 * v)),
+    "tank": seen(hand, ticks("contact_tank", lambda v: 0.9 * v)),
+    "no tank": seen(hand, lambda r: {"ticks": without_share(r, ("contact_tank",))}),
     "work of the coupling": seen(hand, ticks("coupling_work", lambda v: 0.9 * v)),
     "kinetic energy": seen(hand, ticks("kinetic", lambda v: 0.9 * v)),
     "environment energy": seen(hand, ticks("environment_energy", lambda v: v - 1e-3)),

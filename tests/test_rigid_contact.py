@@ -234,6 +234,27 @@ def test_a_jammed_peg_is_strict_where_the_contact_of_the_scene_creates_energy(co
         assert not strict(results["scene"]), (seed, mass, mu)
 
 
+PLANAR = PEG.replace(
+    "<freejoint/>",
+    '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>',
+)
+
+
+@pytest.mark.parametrize("seed", [1, 16, 26])
+def test_a_solution_that_does_not_converge_is_replaced_by_one_that_does(seed: int) -> None:
+    """Newton's method goes round in circles in these jams, or stops with a gradient of 200."""
+    results = {}
+    for stalled in (None, np.inf):
+        run = prepared(scene(PLANAR, mass=0.03, mu=2.0), coupling=Coupling(6000.0, 0.5, 6.0, 5e-4))
+        if stalled is not None:
+            run.binding.state["contact"]["stalled"] = stalled
+        own = run.scene.model.opt.solver
+        results[stalled] = through(run, jamming(seed))
+        assert run.scene.model.opt.solver == own
+    assert strict(results[None])
+    assert not strict(results[np.inf])
+
+
 @pytest.mark.parametrize(("iterations", "line_search"), [(100, 10), (3, 50), (3, 5)])
 def test_a_file_with_a_hasty_solver_is_solved_as_mujoco_does(
     iterations: int, line_search: int
@@ -243,6 +264,7 @@ def test_a_file_with_a_hasty_solver_is_solved_as_mujoco_does(
     for is_hasty, seed in product(results, range(4)):
         stiff = Coupling(6000.0, 0.5, 6.0, 5e-4)
         run = prepared(scene(xml, mass=0.05, g=-9.81), coupling=stiff)
+        run.binding.state["contact"]["stalled"] = np.inf  # no second solver helps
         if is_hasty:
             option = run.scene.model.opt
             option.iterations, option.ls_iterations = iterations, line_search
@@ -356,6 +378,39 @@ def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
     settled = load(RAILS)
     run = through(prepared(settled), pressed(1000, 15.0))
     assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
+
+
+COUPLED = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <default><geom type="box" size="0.01 0.01 0.01" mass="0.05" contype="0" conaffinity="0"/>
+  </default>
+  <worldbody>
+    <body name="tool"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/><geom/>
+      <site name="grip" pos="0.01 0 0"/></body>
+    <body name="other" pos="0 0.04 0"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/><geom/>
+    </body>
+  </worldbody>
+  <equality>{equality}</equality>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="tool" body2="other"/>',
+        '<connect body1="tool" body2="other" anchor="0 0.04 0"/>',
+    ],
+)
+def test_bodies_that_turn_at_a_dead_point_of_their_constraint_gain_no_energy(equality: str) -> None:
+    """MuJoCo adds −J̇v to these rows, which would give energy where J is near zero."""
+    for seed in (1, 2, 3):
+        for method in ("implicit", "lossless"):
+            loaded = load(COUPLED.format(equality=equality))
+            samples = jamming(seed)
+            samples["position"] *= 4.0
+            run = through(prepared(loaded, method, Coupling(1000.0, 0.5, 1.0, 5e-4)), samples)
+            assert strict(run), (seed, method)
 
 
 # Sharpness

@@ -158,6 +158,11 @@ class AuditedRun:
             method = method_of(meta)
         except HapticBridgeError as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
+        if method.is_rigid and "contact_tank" not in (recording.record.names or ()):
+            raise RecordingError(
+                "the run had rigid contacts, and its records lack contact_tank, the energy that "
+                "paid for them: the field was taken out"
+            )
         if meta.get("discretization") != method.discretization:
             raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
         linear, angular = info.dissipating_damping

@@ -32,7 +32,8 @@ margins follow the speed (``follow_speed``).
 Limits of joints and tendons are rows like a contact's without friction, and equality constraints
 rows with ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign, of which a moved mocap body
 adds δp; all share the tank. What they hold stretched at the start is thus not pushed together for
-nothing. Equality constraints of a flex stay MuJoCo's.
+nothing. MuJoCo subtracts h J̇v from ŵ of ``connect`` and ``weld``; a repeated step does not.
+Equality constraints of a flex stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With
@@ -48,6 +49,7 @@ References:
 from __future__ import annotations
 
 import math
+from ctypes import sizeof
 
 import mujoco
 import numpy as np
@@ -56,7 +58,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part, State
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
-from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at
+from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import add, cross, norm, subtract, vector_of
 
@@ -107,8 +109,23 @@ the velocity that is left in the rows of friction."""
 
 _IMPEDANCE = 1.0 / (1.0 + SOFTNESS)
 
+LAST_TURNING = int(mujoco.mjtEq.mjEQ_WELD)
+"""Last kind of equality constraint whose rows turn with the bodies: ``connect``, ``weld``."""
+
 LAST_RIGID = int(mujoco.mjtEq.mjEQ_TENDON)
 """Last kind of equality constraint that is rigid; the later ones are those of a flex."""
+
+STALLED = 1.0
+"""Gradient in m/s², as MuJoCo scales it, above which a solution has not converged. Ordinary steps
+end below 0.1, those that give energy above 100."""
+
+_SOLVER = struct_of("mjModel").opt.offset + struct_of("mjOption").solver.offset
+
+_GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct_of("mjSolverStat"))
+
+_MOST_KEPT = int(mujoco.mjNSOLVER)
+
+_NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
 
 _PARAMETERS = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
@@ -123,7 +140,7 @@ _OF_MODEL = (
 _OF_DATA = ("geom_xpos", "subtree_com", "cdof")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
-    *("eq_type", "row_positions", "end_velocity", "moving_geoms", "body_velocity"),
+    *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
 )
 
 RIGID_DTYPE = np.dtype(
@@ -133,6 +150,11 @@ RIGID_DTYPE = np.dtype(
         ("active_contacts", "<i8"),
         ("is_aimed", "<i8"),
         ("corrections", "<i8"),
+        ("is_shifted", "<i8"),
+        ("solver", "<i8"),
+        ("own_solver", "<i8"),
+        ("statistics", "<i8"),
+        ("warmstart", "<i8"),
         ("row_capacity", "<i8"),
         *((name, "<i8") for name in (*_PARAMETERS, *_OF_MODEL, *_OF_DATA, *_OWNED)),
         ("moving_count", "<i8"),
@@ -143,6 +165,7 @@ RIGID_DTYPE = np.dtype(
         ("last_energy", "<f8"),
         ("lift", "<f8"),
         ("ahead", "<f8"),
+        ("stalled", "<f8"),
     ]
 )
 """Sub-record ``contact``, written by this module alone. ``is_rigid`` is 1 if contacts are rigid;
@@ -150,10 +173,12 @@ RIGID_DTYPE = np.dtype(
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
 last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
-the time in s for which margins reach ahead. Of limits
-and equality constraints: largest count of rows (0 if there are none), and addresses of the model's
-parameters, of copies, of the rows' own positions and of J v⁺. Of margins: addresses and counts of
-the geoms that move, of pairs, and of the bodies' velocities."""
+the time in s for which margins reach ahead. ``is_shifted`` is 1 if the step was repeated without −h
+J̇v. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
+``STALLED``. Of limits and equality constraints: largest count of rows (0 if there are none), and
+addresses of the model's parameters, of copies, of the rows' own positions, of the velocities taken
+from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of pairs, and of the
+bodies' velocities."""
 
 
 def bind_contact(
@@ -163,6 +188,10 @@ def bind_contact(
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
     contact["ahead"] = parameters.steps_ahead * model.opt.timestep
+    contact["solver"], contact["own_solver"] = model._address + _SOLVER, model.opt.solver
+    contact["statistics"] = data._address + struct_of("mjData").solver.offset
+    contact["warmstart"] = data.qacc_warmstart.ctypes.data
+    contact["stalled"] = STALLED
     is_rigid = model.eq_type <= LAST_RIGID
     if np.any(is_rigid) or np.any(model.jnt_limited) or np.any(model.tendon_limited):
         flex_rows = data.ne if np.any(~is_rigid) else 0
@@ -173,7 +202,8 @@ def bind_contact(
         f"own_{name}": getattr(model, name).copy() for name in _PARAMETERS
     }
     owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
-    owned["row_positions"] = np.zeros(max(int(contact["row_capacity"]), 1))
+    for name in ("row_positions", "row_shifts"):
+        owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
     owned["end_velocity"] = np.zeros(MOST_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
@@ -276,12 +306,12 @@ def _aim_rows(s: State) -> None:
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
-    own = floats(contact.row_positions, count)
+    own, shifts = floats(contact.row_positions, count), floats(contact.row_shifts, count)
     before = floats(mj.equality_before, s.energy.equality_rows)
     has_moved = s.energy.mocap_has_moved and ints(mj.ne, 1)[0] == s.energy.equality_rows
     if not contact.is_aimed:
         for row in range(count):
-            own[row] = positions[row]
+            own[row], shifts[row] = positions[row], 0.0
     for row in range(count):
         kind, i = kinds[row], ids[row]
         if not _is_held(s, kind, i):
@@ -290,12 +320,40 @@ def _aim_rows(s: State) -> None:
         wanted = (-push if is_in_error else -1.0) * own[row] / h
         if kind == EQUALITY and has_moved:
             wanted -= (1.0 - contact.share) * (own[row] - before[row]) / h
+        wanted -= shifts[row]
         positions[row] = -(2.0 * wanted - velocities[row]) / (_EXACT * h * d)
         margins[row] = 0.0
         place, impedances, _, _ = _parameters_of(s, kind)
         solref, solimp = floats(place + 16 * i, 2), floats(impedances + 40 * i, 2)
         solref[0], solref[1] = -_EXACT * d * d, -d / h
         solimp[0] = solimp[1] = d
+
+
+@compiled
+def _shift_rows(s: State) -> bool:
+    """Notes the velocity beyond ŵ that MuJoCo aimed at in the step that just ended.
+
+    MuJoCo wants −J̇v of the rows of ``connect`` and ``weld``, which then end at ŵ − h J̇v.
+
+    Returns:
+        True if there are such rows, and none of them was shifted before.
+    """
+    mj, contact, h = s.mj, s.contact, s.run.timestep
+    count = min(ints(mj.nefc, 1)[0], contact.row_capacity)
+    if contact.is_shifted or count == 0:
+        return False
+    kinds, ids = ints(pointer_at(mj.efc_type), count), ints(pointer_at(mj.efc_id), count)
+    velocities = floats(pointer_at(mj.efc_vel), count)
+    positions = floats(pointer_at(mj.efc_pos), count)
+    reference = floats(pointer_at(mj.efc_aref), count)
+    shifts, found = floats(contact.row_shifts, count), False
+    for row in range(count):
+        if kinds[row] == EQUALITY and ints(contact.eq_type, ids[row] + 1)[ids[row]] <= LAST_TURNING:
+            wanted = 0.5 * (velocities[row] - positions[row] * _EXACT * h * _IMPEDANCE)
+            shifts[row] = velocities[row] + h * reference[row] - wanted
+            found = True
+    contact.is_shifted = found
+    return found
 
 
 @compiled
@@ -327,9 +385,37 @@ def aim_contacts(s: State) -> None:
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.share = 1.0 if has_energy else 0.0
-        contact.corrections = 0
+        contact.corrections = contact.is_shifted = 0
+        ints(contact.solver, 1)[0] = contact.own_solver
         _aim(s)
         contact.is_aimed = 1
+
+
+@compiled
+def _change_solver(s: State) -> bool:
+    """Chooses the other solver, from a cold start, if the step that just ended did not converge.
+
+    In a jam at a friction of 1 and more, Newton's method may stop early or go round in circles with
+    forces of 1e8 N, where conjugate gradients converge in 50 iterations.
+
+    Returns:
+        True if it did, at most once in a step.
+    """
+    mj, contact, solver = s.mj, s.contact, ints(s.contact.solver, 1)
+    if solver[0] != contact.own_solver:
+        return False
+    worst, islands = 0.0, max(ints(mj.nisland, 1)[0], 1)
+    for island, iterations in enumerate(ints(mj.solver_niter, min(islands, 20))):
+        if iterations > 0:
+            last = island * _MOST_KEPT + min(iterations, _MOST_KEPT) - 1
+            worst = max(worst, floats(contact.statistics + last * _STATISTIC + _GRADIENT, 1)[0])
+    if worst <= contact.stalled:
+        return False
+    solver[0] = _CG if solver[0] == _NEWTON else _NEWTON
+    start = floats(contact.warmstart, mj.nv)
+    for i in range(mj.nv):
+        start[i] = 0.0
+    return True
 
 
 @compiled
@@ -377,7 +463,7 @@ def _has_sunk(s: State) -> bool:
 
 @compiled
 def aim_again(s: State) -> bool:
-    """Corrects what the step that just ended aimed at: less sinking, or less depenetration.
+    """Corrects the step that just ended: a solution that converges, less sinking, or less push.
 
     Contacts that sank aim higher. If the step spent more than the tank allows, the share is lower.
 
@@ -387,17 +473,18 @@ def aim_again(s: State) -> bool:
     contact = s.contact
     if not contact.is_aimed:
         return False
+    if _change_solver(s):
+        contact.repetitions += 1
+        return True
     if contact.corrections < MOST_CORRECTIONS and _has_sunk(s):
         contact.corrections += 1
         contact.repetitions += 1
         _aim(s)
         return True
-    if contact.share <= 0.0:
-        return False
     allowed, returned = max(_spendable(s), 0.0), returned_energy(s)
     if s.energy.mocap_has_moved:
         allowed += mocap_work(s)  # the external port pays for it
-    if returned <= allowed:
+    if returned <= allowed or not (_shift_rows(s) or contact.share > 0.0):
         return False
     # C is nearly proportional to the share while the forces stay; a second excess ends it
     is_first = contact.share == 1.0 and allowed > 0.0
@@ -414,6 +501,7 @@ def finish_contacts(s: State) -> None:
     if s.contact.is_aimed and s.contact.row_capacity > 0:
         _restore_rows(s)
     s.contact.is_aimed = 0
+    ints(s.contact.solver, 1)[0] = s.contact.own_solver
     count = ints(mj.nefc, 1)[0]
     positions = floats(pointer_at(mj.efc_pos), count)
     force = floats(pointer_at(mj.efc_force), count)
