@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict, cast
+from typing import Any, Literal, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -137,7 +137,7 @@ _KINDS: dict[str, Any] = {
 }
 
 
-AUTO = "auto"
+AUTO: Literal["auto"] = "auto"
 """Rate of the scene that is chosen by what its step takes."""
 
 

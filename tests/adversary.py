@@ -21,7 +21,7 @@ from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import BAD_RESULT, CLUTCHED, FORCE_OFF, OK
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import advance, after_step, before_step, take_result, whole_tick
+from hapticbridge.kernel.tick import shown_tick, whole_tick
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import load_scene
@@ -168,22 +168,19 @@ def _attack(
             sample[0].position[i] = h.position[i]
         for i in range(4):
             sample[0].quaternion[i] = h.quaternion[i]
-        code = before_step(state, sample, row, 0, elapsed)
-        if code != OK:
-            return code
         if habits[13] == 0.0:
-            advance(state)
-        elif h.tick >= h.due:
+            is_done = whole_tick(state, sample, row, elapsed)
+        else:
             slow, slow_row, given = scene
-            if s.shown.waits and not whole_tick(slow, given, slow_row, slow[0].run.period):
-                return BAD_RESULT
-            take_result(state, slow, given)
-            h.due = h.tick + int(habits[13])
-            if rng.random() < 0.3:
+            is_due = h.tick >= h.due
+            own = row, slow_row, given
+            is_done = shown_tick((state, slow), own, sample, elapsed, is_due)
+            if is_due:
+                h.due = h.tick + int(habits[13])
+            if is_due and rng.random() < 0.3:
                 h.due += int(habits[13] * rng.random())
-        code = after_step(state, row, 0)
-        if code != OK:
-            return code
+        if not is_done:
+            return BAD_RESULT
         released = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
         # a force that was held too long may have given more than its spring held; that is owed
         owed = s.coupling.owed[0] + s.coupling.owed[1]

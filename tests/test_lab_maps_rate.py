@@ -69,6 +69,17 @@ def test_a_search_finds_the_bound() -> None:
         assert found["limit"] == pytest.approx(rate.wall_limit(name, 1e-3, delay), rel=2e-3)
 
 
+def test_behind_a_fast_loop_a_slow_scene_keeps_the_bound_of_the_loop() -> None:
+    full = 2 * rate.DEVICE_DAMPING / rate.UNEVEN_PERIOD
+    for ticks in rate.SCENE_TICKS:
+        assert not rate.behind_a_loop(1.02 * full, ticks).is_stable
+        assert rate.behind_a_loop(0.98 * full, ticks).is_stable
+    # the same scene in a loop as slow as itself bears a twentieth
+    slow = rate.wall_limit("lossless", 20 * rate.UNEVEN_PERIOD, 0)
+    assert slow < 1.01 * full / 20
+    assert not rate.worst_hand("lossless", 1.02 * slow, 20 * rate.UNEVEN_PERIOD, 0).is_stable
+
+
 def test_half_of_all_ticks_lost_costs_a_free_device_two_thirds_of_its_stiffness() -> None:
     # geometric gaps: E[T]/E[T²] = (1 − p)/(1 + p)/T, a third of the even ticks' 1/T
     even, lost = Timing(), Timing(drops=0.5, seed=1)

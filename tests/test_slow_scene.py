@@ -19,6 +19,7 @@ import hapticbridge as hb
 from hapticbridge import jit
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.clock import Clock
 from hapticbridge.commands import Couple, Reset
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.options import RunSetup, steady_stiffness
@@ -35,7 +36,7 @@ def stroke(tick: int) -> tuple[float, ...]:
 
 def audited(path: Path) -> Any:
     report = audit(path)
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit"), report.faults
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit"), report
     assert report.environment == "strict"
     return report
 
@@ -188,7 +189,7 @@ def test_a_step_that_stands_still_keeps_no_device(monkeypatch: pytest.MonkeyPatc
     began = time.monotonic()
     try:
         with bridge:
-            broken(bridge, lambda *_: release.wait(60.0) and None)
+            broken(bridge, lambda *_: print(release.wait(60.0)))
             summary = bridge.run(0.3)
         assert device.is_closed
         assert time.monotonic() - began < 30.0
@@ -219,7 +220,7 @@ def test_rates_that_no_scene_can_have_are_refused(options: dict[str, Any], words
 def test_a_scene_that_cannot_keep_the_rate_steps_beside_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def ticks_of(step: float, clock: hb.Clock, **options: Any) -> int:
+    def ticks_of(step: float, clock: Clock, **options: Any) -> int:
         monkeypatch.setattr("hapticbridge.options.step_time", lambda *_: step)
         return Bridge("point_mass", ScriptedDevice(still), clock=clock, **options).setup.scene_ticks
 

@@ -797,6 +797,33 @@ def take_result(state: NDArray[np.void], scene: NDArray[np.void], given: NDArray
     hand_over(state, given)
 
 
+@compiled
+def shown_tick(
+    states: tuple[NDArray[np.void], NDArray[np.void]],
+    own: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
+    sample: NDArray[np.void],
+    elapsed: float,
+    is_due: bool,
+) -> bool:
+    """Runs one tick in front of a slower scene; arguments as for ``simulate_shown``.
+
+    If the result of the scene is due, its step is done first.
+
+    Returns:
+        As ``whole_tick``.
+    """
+    state, scene = states
+    row, scene_row, given = own
+    if before_step(state, sample, row, 0, elapsed) != OK:
+        return False
+    waits = state[0].shown.waits
+    if is_due or not waits:
+        if waits and not whole_tick(scene, given, scene_row, scene[0].run.period):
+            return False
+        take_result(state, scene, given)
+    return after_step(state, row, 0) == OK
+
+
 @compiled_for_threads
 def simulate_shown(
     states: tuple[NDArray[np.void], NDArray[np.void]],
@@ -821,18 +848,11 @@ def simulate_shown(
     Returns:
         Count of completed ticks, as for ``simulate``.
     """
-    state, scene = states
-    row, scene_row, given = own
+    s, row = states[0][0], own[0]
     for k in range(samples.size):
-        state[0].loop.external_flags = external_flags[k]
-        if before_step(state, samples[k : k + 1], row, 0, elapsed[k]) != OK:
-            return k
-        waits = state[0].shown.waits
-        if not waits or scene_steps[k] > state[0].shown.scene_step:
-            if waits and not whole_tick(scene, given, scene_row, scene[0].run.period):
-                return k
-            take_result(state, scene, given)
-        if after_step(state, row, 0) != OK:
+        s.loop.external_flags = external_flags[k]
+        is_due = scene_steps[k] > s.shown.scene_step
+        if not shown_tick(states, own, samples[k : k + 1], elapsed[k], is_due):
             return k
         rows[k] = row[0]
     return int(samples.size)

@@ -26,7 +26,7 @@ from hapticbridge.jit import compiled, compiled_for_threads, direct
 from hapticbridge.kernel.codes import State
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
-from hapticbridge.kernel.tick import whole_tick
+from hapticbridge.kernel.tick import shown_tick, whole_tick
 from hapticbridge.options import RunSetup
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import Method, prepare, resolve_contact_stiffness
@@ -162,6 +162,7 @@ class ClosedLoop:
         period: float = 1e-3,
         ticks: int = 2000,
         substeps: int = 1,
+        scene_ticks: int = 0,
         knock: NDArray[np.float64] | None = None,
         timing: Timing | None = None,
         keep_records: bool = False,
@@ -175,6 +176,7 @@ class ClosedLoop:
             period: T in s.
             ticks: Number of ticks, >= 50.
             substeps: MuJoCo steps per tick.
+            scene_ticks: Ticks between two results of a slower scene; 0 steps it in every tick.
             knock: Displacement of the device before the first tick, shape (6,), in m and rad; no
                 number is beyond 1e30.
             timing: Late and missed ticks; None: every one on time.
@@ -189,7 +191,8 @@ class ClosedLoop:
             if knock.shape != (6,):
                 raise StudyError(f"knock has shape {knock.shape}; it must be 6 numbers")
         scene = self.scene
-        effective = prepare(scene, coupling, period, substeps, method, warns=False)
+        scene_period = max(scene_ticks, 1) * period
+        effective = prepare(scene, coupling, scene_period, substeps, method, warns=False)
         is_even = timing is None or timing.is_even
         sample = np.zeros(1, SAMPLE_DTYPE)
         sample[:] = device.start(period, 1 if is_even else PARTS)
@@ -200,9 +203,13 @@ class ClosedLoop:
             period=period,
             info=device.info,
             substeps=substeps,
+            scene_ticks=scene_ticks,
             contact_stiffness=resolve_contact_stiffness(method, coupling, None),
         )
-        binding = BoundKernel(scene.model, scene.data, setup.parameters(sample, effective))
+        parameters = setup.parameters(sample, effective)
+        binding = slow = BoundKernel(scene.model, scene.data, parameters)
+        if scene_ticks:
+            slow = BoundKernel(scene.model, scene.data, parameters.of_scene)
         if knock is not None:
             device.displace(knock)
         intervals = (
@@ -212,7 +219,13 @@ class ClosedLoop:
         signal, depths, most = np.zeros(ticks), np.zeros(ticks), np.zeros(1)
         outputs, began = (signal, depths, most, records), time.thread_time()
         done = _machine_code()(
-            binding.state, *device.stepper, sample, binding.row, intervals, *outputs
+            (binding.state, slow.state),
+            (binding.row, slow.row, np.zeros(1, SAMPLE_DTYPE)),
+            scene_ticks,
+            *device.stepper,
+            sample,
+            intervals,
+            *outputs,
         )
         seconds = time.thread_time() - began
         state, ledger = binding.state, Ledger.of(binding.state)
@@ -236,11 +249,12 @@ class ClosedLoop:
 
 @compiled_for_threads
 def _run(
-    state: NDArray[np.void],
+    states: tuple[NDArray[np.void], NDArray[np.void]],
+    own: tuple[NDArray[np.void], NDArray[np.void], NDArray[np.void]],
+    scene_ticks: int,
     devices: NDArray[np.void],
     motion: NDArray[np.float64],
     sample: NDArray[np.void],
-    row: NDArray[np.void],
     intervals: NDArray[np.int64],
     signal: NDArray[np.float64],
     depths: NDArray[np.float64],
@@ -248,13 +262,18 @@ def _run(
     records: NDArray[np.void],
 ) -> int:
     """Runs one tick per interval; returns how many were completed."""
+    state, row = states[0], own[0]
     s, written = state[0], devices[0].written
     for k in range(intervals.size):
         # the first sample is the start: no time passes before it
         for _ in range(intervals[k] if k > 0 else 1):
             next_sample(devices, motion, sample)
         elapsed = devices[0].period * intervals[k]
-        if not whole_tick(state, sample, row, elapsed):
+        if scene_ticks > 0:
+            is_done = shown_tick(states, own, sample, elapsed, k % scene_ticks == 0)
+        else:
+            is_done = whole_tick(state, sample, row, elapsed)
+        if not is_done:
             return k
         wrench = row[0].wrench_on_device
         for i in range(6):
@@ -289,11 +308,12 @@ def _machine_code() -> Callable[..., int]:
     none = np.zeros(0)
     return direct(
         _run,
-        np.zeros(1, STATE_DTYPE),
+        (np.zeros(1, STATE_DTYPE), np.zeros(1, STATE_DTYPE)),
+        (np.zeros(1, TICK_DTYPE), np.zeros(1, TICK_DTYPE), np.zeros(1, SAMPLE_DTYPE)),
+        0,
         np.zeros(1, DEVICE_DTYPE),
         np.empty((0, 8)),
         np.zeros(1, SAMPLE_DTYPE),
-        np.zeros(1, TICK_DTYPE),
         np.zeros(0, np.int64),
         none,
         none,

@@ -1,7 +1,8 @@
-"""Map ``rate``: largest stiffness of a wall against period, delay, jitter and lost ticks.
+"""Map ``rate``: largest stiffness of a wall against period, delay, jitter, lost ticks, slow scenes.
 
 At even ticks ``implicit``, ``compensated`` and ``lossless`` run with an equal requested B, each
-against the bound for the B' that its law uses.
+against the bound for the B' that its law uses. A scene that steps in every n-th tick runs behind a
+loop of ``UNEVEN_PERIOD``, whose bound it keeps, beside the bound of a loop as slow as the scene.
 """
 
 from __future__ import annotations
@@ -59,6 +60,12 @@ JITTER, DROPS = 0.9, 0.5
 UNEVEN = ("jitter", "drops")
 """Kinds of uneven ticks."""
 
+SCENE_TICKS = (2, 5, 10, 20)
+"""Ticks between two results of a slower scene."""
+
+SLOW_METHOD = "lossless"
+"""Method of a slower scene. With a spring alone its law is that of the others."""
+
 HANDS: Mapping[str, Hand | None] = {"no hand": None, "ordinary hand": Hand()}
 
 SEEDS = 3
@@ -92,7 +99,7 @@ DEFAULT_POINTS = 110
 
 
 def points(count: int) -> Sequence[Point]:
-    """Returns searches for the largest K: by method, period and delay, and by jitter and drops.
+    """Returns searches for the largest K: by method, period and delay; jitter and drops; scene.
 
     Even ticks get the smaller part of ``count`` for each line, because a limit over T is almost
     straight.
@@ -111,7 +118,10 @@ def points(count: int) -> Sequence[Point]:
         for hand in HANDS
         for share in np.linspace(0.0, most, shares)
     ]
-    return even + uneven
+    slow = [
+        _point("scene", SLOW_METHOD, "worst hand", UNEVEN_PERIOD, 0, float(n)) for n in SCENE_TICKS
+    ]
+    return even + uneven + slow
 
 
 def _point(what: str, method: str, hand: str, period: float, delay: int, share: float) -> Point:
@@ -136,6 +146,14 @@ def evaluate(point: Point) -> Mapping[str, float | str | bool]:
 
         limit = base.largest_stable(is_stable, *SEARCHED).middle
         return {"limit": limit} | unevenness([period])
+
+    if point["what"] == "scene":
+
+        def is_stable_behind(stiffness: float) -> bool:
+            return behind_a_loop(stiffness, round(share)).is_stable
+
+        limit = base.largest_stable(is_stable_behind, *SEARCHED).middle
+        return {"limit": limit} | unevenness([share * period])
 
     timings = [_timing(str(point["what"]), share, seed) for seed in range(SEEDS)]
     hand = str(point["hand"])
@@ -182,6 +200,25 @@ def worst_hand(name: str, stiffness: float, period: float, delay: int) -> LoopOu
     device = SimulatedDevice(damping=DEVICE_DAMPING, hand=hand, delay=delay)
     swing = 2 * np.pi / (frequency * period)
     return _run(name, device, coupling, period, ticks=max(TICKS, round(SWINGS * swing)))
+
+
+def behind_a_loop(stiffness: float, scene_ticks: int) -> LoopOutcome:
+    """Runs the worst hand of a spring as wall in a scene that steps once in some ticks."""
+    spring = Coupling(stiffness, 0.0, 0.0, 0.0)
+    theory = SampledLoop(spring, UNEVEN_PERIOD)
+    frequency = theory.worst_frequency()
+    response = complex(theory.response(frequency))
+    hand = WorstHand(DEVICE_DAMPING, frequency, UNEVEN_PERIOD, response)
+    device = SimulatedDevice(damping=DEVICE_DAMPING, hand=hand)
+    return base.wall_loop(WALL_MASS).run(
+        device,
+        spring,
+        METHODS[SLOW_METHOD],
+        period=UNEVEN_PERIOD,
+        ticks=TICKS,
+        scene_ticks=scene_ticks,
+        knock=KNOCK,
+    )
 
 
 def finite_hand(name: str, hand: str, stiffness: float, timing: Timing) -> LoopOutcome:
@@ -259,8 +296,9 @@ def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
         axes.tick_params(labelleft=not above)
         above.append(axes)
     above[0].set_ylabel("largest stable K (N/m)")
-    first = figure.add_subplot(grid[1, :3])
-    panels = (first, figure.add_subplot(grid[1, 3:], sharey=first))
+    first = figure.add_subplot(grid[1, :2])
+    panels = (first, figure.add_subplot(grid[1, 2:4], sharey=first))
+    _draw_slow(figure.add_subplot(grid[1, 4:], sharey=first), boundary["scene"])
     for axes, (what, words) in zip(panels, AXES.items(), strict=True):
         _draw_uneven(axes, boundary["uneven"][what], words)
     first.set_ylabel("largest stable K (N/m)")
@@ -271,6 +309,9 @@ def draw(_table: Table, boundary: Mapping[str, Any]) -> Figure:
     handles += [
         first.plot([], [], style, color=base.THEORY_COLOUR, label=label)[0]
         for label, style in STYLES.values()
+    ]
+    handles += [
+        first.plot([], [], "D", color="black", mfc="white", label="measured: slower scene")[0]
     ]
     figure.suptitle(
         f"Largest stable K on a wall: behind the coupling is a tool of {1e-3 * WALL_MASS:g} t, "
@@ -321,6 +362,21 @@ def _draw_delays(axes: Axes, name: str, by_delay: Mapping[str, Any]) -> None:
     axes.grid(visible=True, which="both", alpha=0.25)
 
 
+def _draw_slow(axes: Axes, found: Mapping[str, Any]) -> None:
+    axes.set(xscale="log", yscale="log")
+    if found:
+        period = 1e3 * np.array(found["period"])
+        axes.plot(period, _drawable(found["measured"]), "D", color="black", mfc="white", ms=5)
+        axes.plot(period, found["at_loop"], "-", color=base.THEORY_COLOUR)
+        axes.plot(period, found["at_scene"], ":", color=base.THEORY_COLOUR)
+    else:
+        base.say_missing(axes)
+    axes.set_xlabel("scene's period (ms)")
+    axes.set_xticks([2, 5, 10, 20], ["2", "5", "10", "20"])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(visible=True, which="both", alpha=0.25)
+
+
 def _draw_uneven(axes: Axes, found: Mapping[str, Any], words: str) -> None:
     axes.set_yscale("log")
     for name, selected in found.items():
@@ -359,6 +415,7 @@ def summarize(table: Table) -> dict[str, Any]:
         "damping": DAMPING,
         "methods": {name: _by_delay(name, table) for name in METHODS_SHOWN},
         "uneven": {what: _uneven(table.select(table["what"] == what)) for what in UNEVEN},
+        "scene": _slow(table.select(table["what"] == "scene")),
     }
 
 
@@ -400,6 +457,20 @@ def _uneven(rows: Table) -> dict[str, Any]:
     return found
 
 
+def _slow(rows: Table) -> dict[str, Any]:
+    if not len(rows):
+        return {}
+    limit, period = rows.numbers("limit"), rows.numbers("mean")
+    at_loop = uneven_bound(np.full(len(rows), UNEVEN_PERIOD))
+    return {
+        "period": period.tolist(),
+        "measured": limit.tolist(),
+        "at_loop": at_loop.tolist(),
+        "at_scene": uneven_bound(period).tolist(),
+        "worst_ratio_error": base.agreement(limit, at_loop),
+    }
+
+
 def sentences(boundary: Mapping[str, Any]) -> Sentences:
     """States the agreement with the bounds at even ticks, and the limits at uneven ones."""
     for name, by_delay in boundary["methods"].items():
@@ -412,6 +483,18 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         yield (
             "'{name}': without a delay K goes with T to the power {slope:.3f}",
             by_delay.get("0", {}) | {"name": name},
+        )
+    if slow := boundary["scene"]:
+        yield (
+            "a scene of {period:.0f} ms a step behind a loop of 1 ms: the worst hand turns the "
+            "wall unstable within {error:.2%} of 2b/T of the loop, {at_loop:.0f} N/m; one as slow as "
+            "the scene bears {at_scene:.0f} N/m",
+            {
+                "period": 1e3 * slow["period"][-1],
+                "error": slow["worst_ratio_error"],
+                "at_loop": slow["at_loop"][-1],
+                "at_scene": slow["at_scene"][-1],
+            },
         )
     for what, by_hand in boundary["uneven"].items():
         for hand, selected in by_hand.items():
