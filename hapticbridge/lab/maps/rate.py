@@ -487,7 +487,7 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     if slow := boundary["scene"]:
         yield (
             "a scene of {period:.0f} ms a step behind a loop of 1 ms: the worst hand turns the "
-            "wall unstable within {error:.2%} of 2b/T of the loop, {at_loop:.0f} N/m; one as slow as "
+            "wall unstable within {error:.2%} of the loop's 2b/T, {at_loop:.0f} N/m; one as slow as "
             "the scene bears {at_scene:.0f} N/m",
             {
                 "period": 1e3 * slow["period"][-1],
