@@ -487,8 +487,8 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
     if slow := boundary["scene"]:
         yield (
             "a scene of {period:.0f} ms a step behind a loop of 1 ms: the worst hand turns the "
-            "wall unstable within {error:.2%} of the loop's 2b/T, {at_loop:.0f} N/m; one as slow as "
-            "the scene bears {at_scene:.0f} N/m",
+            "wall unstable within {error:.2%} of the loop's 2b/T, {at_loop:.0f} N/m; a loop of its "
+            "own period bears {at_scene:.0f} N/m",
             {
                 "period": 1e3 * slow["period"][-1],
                 "error": slow["worst_ratio_error"],
