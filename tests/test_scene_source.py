@@ -285,6 +285,14 @@ def test_what_is_no_file_of_the_scene_is_refused_by_name_before_it_is_opened(
         load_scene(folder / "main.xml")
 
 
+def test_a_name_that_is_not_text_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/n\xff.xml"))
+    path.write_text(mjcf(MESHED.replace('type="mesh" mesh="m"', 'size="0.01"')))
+    with pytest.raises(SceneError, match="MuJoCo needs a name in UTF-8"):
+        load_scene(path)
+    load_scene(path.rename(tmp_path / "n.xml"))
+
+
 def test_links_within_a_scene_and_its_repository_are_followed(tmp_path: Path) -> None:
     scene = tmp_path / "repository" / "scenes" / "peg"
     scene.mkdir(parents=True)

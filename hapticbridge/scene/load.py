@@ -161,6 +161,10 @@ def read_scene(path_or_name: str | Path, **parameters: float) -> SceneSource:
     """
     path = scene_path(path_or_name)
     try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise SceneError(f"cannot read scene '{path}': MuJoCo needs a name in UTF-8") from None
+    try:
         sources = collect_sources(path)  # first: it refuses what MuJoCo must not open
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
