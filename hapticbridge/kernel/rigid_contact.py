@@ -123,6 +123,8 @@ _SOLVER = struct_of("mjModel").opt.offset + struct_of("mjOption").solver.offset
 
 _GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct_of("mjSolverStat"))
 
+_BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+
 _MOST_KEPT = int(mujoco.mjNSOLVER)
 
 _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
@@ -130,14 +132,15 @@ _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG
 _PARAMETERS = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
     *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
+    *("jnt_margin", "tendon_margin"),
 )
 """Arrays of the model that a run writes to, and puts back."""
 
 _OF_MODEL = (
-    *("geom_rbound", "pair_geom1", "pair_geom2"),
+    *("geom_rbound", "pair_geom1", "pair_geom2", "jnt_type", "jnt_dofadr"),
     *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
 )
-_OF_DATA = ("geom_xpos", "subtree_com", "cdof")
+_OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
@@ -516,7 +519,7 @@ def finish_contacts(s: State) -> None:
 def follow_speed(s: State) -> None:
     """Widens each geom's margin for the next collisions by the way that it goes in a step.
 
-    The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
+    Limits of joints and tendons follow theirs. The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
     bounding sphere, at most ``LARGEST_MARGIN``. Positions are those at the start of the last step.
     """
     contact, mj, h = s.contact, s.mj, s.run.timestep
@@ -544,6 +547,31 @@ def follow_speed(s: State) -> None:
             way += margins[geom] - at_rest[geom]
         at_rest_here = floats(contact.own_pair_margin + 8 * pair, 1)[0]
         floats(contact.pair_margin + 8 * pair, 1)[0] = at_rest_here + way
+    if contact.row_capacity > 0:
+        _follow_limits(s)
+
+
+@compiled
+def _follow_limits(s: State) -> None:
+    """Widens the margins of limits by ``MARGIN``, in m or rad, and the way of two steps.
+
+    In the first of these steps a lossless tool learns that it is near.
+    """
+    contact, mj, ahead = s.contact, s.mj, 2.0 * s.run.timestep
+    kinds, first = ints(contact.jnt_type, mj.njnt), ints(contact.jnt_dofadr, mj.njnt)
+    speeds = floats(mj.qvel, mj.nv)
+    margins, own = floats(contact.jnt_margin, mj.njnt), floats(contact.own_jnt_margin, mj.njnt)
+    for joint in range(mj.njnt):
+        dof = first[joint]
+        speed = abs(speeds[dof])
+        if kinds[joint] == _BALL:
+            speed = norm(vector_of(speeds[dof : dof + 3]))
+        margins[joint] = own[joint] + MARGIN + ahead * speed
+    margins = floats(contact.tendon_margin, mj.ntendon)
+    own = floats(contact.own_tendon_margin, mj.ntendon)
+    speeds = floats(contact.ten_velocity, mj.ntendon)
+    for tendon in range(mj.ntendon):
+        margins[tendon] = own[tendon] + MARGIN + ahead * abs(speeds[tendon])
 
 
 @compiled
