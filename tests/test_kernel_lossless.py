@@ -484,7 +484,7 @@ TENDON = '<tendon><spatial {}><site site="anchor"/><site site="grip"/></spatial>
 EQUAL = '<equality><joint joint1="{}" polycoef="0 0.5 0 0 0"/></equality>'
 STOPS = {
     "joint's limit": (f'limited="true" range="-1 {STOP}"', ""),
-    "tendon's limit": ("", TENDON.format(f'limited="true" range="-1 {STOP}"')),
+    "tendon's limit": ("", TENDON.format(f'limited="true" range="0 {STOP}"')),
 }
 HOLDS = {
     "friction in its joint": ('frictionloss="0.01"', ""),

@@ -519,9 +519,8 @@ def finish_contacts(s: State) -> None:
 def follow_speed(s: State) -> None:
     """Widens each geom's margin for the next collisions by the way that it goes in a step.
 
-    The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
+    Limits of joints and tendons follow theirs. The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
     bounding sphere, at most ``LARGEST_MARGIN``. Positions are those at the start of the last step.
-    Limits of joints and tendons follow their speeds.
     """
     contact, mj, h = s.contact, s.mj, s.run.timestep
     _move_bodies(s)
