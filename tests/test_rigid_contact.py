@@ -416,6 +416,20 @@ def test_a_fast_blow_on_a_limit_is_met_before_it_is_passed(speed: float, method:
     assert strict(run)
 
 
+@pytest.mark.parametrize("start", [0.0, 1e-4, 5e-4])
+def test_a_leash_lets_its_ends_meet(start: float) -> None:
+    xml = LEASH.replace('pos="0 0 0.1"', f'pos="0 {start} 0.01"')
+    places = np.zeros((300, 3))
+    places[:, 2] = np.minimum(0.1 * T * np.arange(300), 0.02)
+    runs = [
+        through(prepared(load(text)), samples_of(places))
+        for text in (xml, xml.replace('limited="true"', 'limited="false"'))
+    ]
+    heights = [run.ticks["tool_position"][:, 2] for run in runs]
+    assert heights[0][-1] == pytest.approx(0.02, abs=1e-4)
+    assert np.abs(heights[0] - heights[1]).max() < 1e-9
+
+
 COUPLED = """
 <mujoco>
   <option gravity="0 0 0"/>

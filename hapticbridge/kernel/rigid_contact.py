@@ -144,6 +144,7 @@ _OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
+    "leashes",
 )
 
 RIGID_DTYPE = np.dtype(
@@ -179,7 +180,8 @@ repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted 
 choice, ``own_solver`` that of the scene; ``stalled`` is ``STALLED``. Of limits and equality
 constraints: largest count of rows (0 if there are none), and addresses of the model's parameters,
 of copies, of the rows' own positions, of the velocities taken from ŵ and of J v⁺. Of margins:
-addresses and counts of the geoms that move, of pairs, and of the bodies' velocities."""
+addresses and counts of the geoms that move, of pairs, and of the bodies' velocities; ``leashes`` is
+1 for spatial tendons of no least length."""
 
 
 def bind_contact(
@@ -204,6 +206,8 @@ def bind_contact(
     owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     for name in ("row_positions", "row_shifts"):
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
+    is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
+    owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
     owned["end_velocity"] = np.zeros(MOST_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
@@ -519,8 +523,9 @@ def finish_contacts(s: State) -> None:
 def follow_speed(s: State) -> None:
     """Widens each geom's margin for the next collisions by the way that it goes in a step.
 
-    Limits of joints and tendons follow theirs. The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
+    The way is h (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
     bounding sphere, at most ``LARGEST_MARGIN``. Positions are those at the start of the last step.
+    Limits of joints and tendons follow their speeds.
     """
     contact, mj, h = s.contact, s.mj, s.run.timestep
     _move_bodies(s)
@@ -555,7 +560,8 @@ def follow_speed(s: State) -> None:
 def _follow_limits(s: State) -> None:
     """Widens the margins of limits by ``MARGIN``, in m or rad, and the way of two steps.
 
-    In the first of these steps a lossless tool learns that it is near.
+    In the first of these steps a lossless tool learns that it is near. A leash, a spatial tendon of
+    no least length, may pass through zero: its lower limit stays out of the step.
     """
     contact, mj, ahead = s.contact, s.mj, 2.0 * s.run.timestep
     kinds, first = ints(contact.jnt_type, mj.njnt), ints(contact.jnt_dofadr, mj.njnt)
@@ -570,8 +576,13 @@ def _follow_limits(s: State) -> None:
     margins = floats(contact.tendon_margin, mj.ntendon)
     own = floats(contact.own_tendon_margin, mj.ntendon)
     speeds = floats(contact.ten_velocity, mj.ntendon)
+    lengths, leashes = floats(mj.ten_length, mj.ntendon), ints(contact.leashes, mj.ntendon)
     for tendon in range(mj.ntendon):
-        margins[tendon] = own[tendon] + MARGIN + ahead * abs(speeds[tendon])
+        way = ahead * abs(speeds[tendon])
+        wide = MARGIN + way
+        if leashes[tendon]:
+            wide = min(wide, max(lengths[tendon] - way, 0.0))
+        margins[tendon] = own[tendon] + wide
 
 
 @compiled
