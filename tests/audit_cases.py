@@ -23,7 +23,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.record import LATER_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
 from hapticbridge.recording.seal import KEY, SIGNATURE
 from hapticbridge.run_description import SOURCE_PREFIX
@@ -158,9 +158,7 @@ def without_model(recording: Recording) -> Recording:
     return Recording(**{**vars(recording), "attachments": files})
 
 
-def without_share(
-    recording: Recording, later: Sequence[str] = ("share", "contact_tank")
-) -> NDArray[np.void]:
+def without_share(recording: Recording, later: Sequence[str] = LATER_FIELDS) -> NDArray[np.void]:
     """Returns the records as an earlier version wrote them, without some later fields."""
     names = [name for name in recording.ticks.dtype.names or () if name not in later]
     record = np.dtype([(name, recording.ticks.dtype[name]) for name in names])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hapticbridge.compare import compare
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import export
-from hapticbridge.record import TickFlag
+from hapticbridge.record import LATER_FIELDS, TickFlag
 from hapticbridge.recording import read_recording, reader
 
 
@@ -201,11 +201,12 @@ def test_a_recording_without_the_share_is_compared_and_exported_in_what_it_holds
 ) -> None:
     recording = read_recording(tap)
     old = rewritten(recording, tmp_path / "old.mcap", ticks=without_share(recording))
+    lacking = ", ".join(LATER_FIELDS)
     for pair in ((tap, old), (old, tap)):
         found = compare(*pair)
         assert found.is_same
         assert found.compared == len(recording.ticks)
-        assert found.notes == (f"{old} is of an earlier version, without share, contact_tank",)
+        assert found.notes == (f"{old} is of an earlier version, without {lacking}",)
     written = export(old, "csv").files[0].read_text().splitlines()
     assert len(written) == len(recording.ticks) + 1
     assert written[0].endswith("injected_rotational_damping")

@@ -380,6 +380,56 @@ def test_limits_of_joints_are_as_rigid_and_strict_as_contacts() -> None:
     assert run.ticks["tool_position"][-1, 2] == pytest.approx(-0.004, abs=2e-6)
 
 
+SWIVEL = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody><body name="tool"><joint type="ball" limited="true" range="0 5"/>
+    <geom type="box" size="0.01 0.01 0.02" mass="0.05"/><site name="grip"/></body></worldbody>
+</mujoco>"""
+LEASH = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody><body name="tool"><freejoint/><geom type="box" size="0.01 0.01 0.02" mass="0.01"/>
+    <site name="grip"/></body><site name="hook" pos="0 0 0.1"/></worldbody>
+  <tendon><spatial limited="true" range="0 0.104"><site site="grip"/><site site="hook"/></spatial>
+  </tendon>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("method", ["implicit", "lossless"])
+@pytest.mark.parametrize("speed", [0.05, 0.3, 1.0])
+def test_a_fast_blow_on_a_limit_is_met_before_it_is_passed(speed: float, method: str) -> None:
+    way = np.minimum(speed * T * np.arange(300), 0.02)
+    places, still = np.zeros((300, 3)), np.zeros((300, 3))
+    places[:, 2] = -way
+    turned = Rotation.from_rotvec(np.stack([20.0 * way, still[:, 0], still[:, 0]], axis=1))
+    coupling = Coupling(2400.0, 0.5, 0.6, 5e-5)
+    for xml in (RAILS, LEASH):
+        run = through(prepared(load(xml), method, coupling), samples_of(places))
+        passed = -0.004 - run.ticks["tool_position"][:, 2].min()
+        # 38 N press a tool of 10 g
+        assert 0.0 < passed < 10e-6, xml
+        assert strict(run)
+    run = through(prepared(load(SWIVEL), method, coupling), samples_of(still, turned))
+    passed = 2.0 * np.arccos(run.ticks["tool_quaternion"][:, 0].min()) - np.deg2rad(5.0)
+    assert 0.0 < passed < 1e-4
+    assert strict(run)
+
+
+@pytest.mark.parametrize("start", [0.0, 1e-4, 5e-4])
+def test_a_leash_lets_its_ends_meet(start: float) -> None:
+    xml = LEASH.replace('pos="0 0 0.1"', f'pos="0 {start} 0.01"')
+    places = np.zeros((300, 3))
+    places[:, 2] = np.minimum(0.1 * T * np.arange(300), 0.02)
+    runs = [
+        through(prepared(load(text)), samples_of(places))
+        for text in (xml, xml.replace('limited="true"', 'limited="false"'))
+    ]
+    heights = [run.ticks["tool_position"][:, 2] for run in runs]
+    assert heights[0][-1] == pytest.approx(0.02, abs=1e-4)
+    assert np.abs(heights[0] - heights[1]).max() < 1e-9
+
+
 COUPLED = """
 <mujoco>
   <option gravity="0 0 0"/>
@@ -430,15 +480,22 @@ def test_a_lifted_tool_is_released_within_10_ms() -> None:
     assert opened[0] <= 10
 
 
+ALONE = re.sub(r'<body name="other".*?</body>', "", BALL, flags=re.DOTALL)
+
+
 def blow(
-    start: float, velocity: tuple[float, float, float], mass: float = 0.1, force: float = 0.0
+    start: float,
+    velocity: tuple[float, float, float],
+    mass: float = 0.1,
+    force: float = 0.0,
+    xml: str = BALL,
 ) -> Array:
     """Returns the penetration in m per tick of a ball in a blow; negative is a gap.
 
     ``start`` is the ball's height in m above the floor; along x it meets a capsule at height 0. The
     hand presses with up to 0.3 of ``force`` in N.
     """
-    loaded = scene(BALL, mass=mass, mu=0.4)
+    loaded = scene(xml, mass=mass, mu=0.4)
     loaded.data.qpos[2] = start
     loaded.data.qvel[:3] = velocity
     speed = loaded.data.qvel.copy()
@@ -455,7 +512,18 @@ def blow(
 
 @pytest.mark.parametrize("speed", [0.3, 1.0, 4.0])
 def test_a_fast_blow_is_met_before_it_sinks_in(speed: float) -> None:
-    assert blow(0.011, (0.0, 0.0, -speed)).max() < 2e-6
+    depths = blow(2.4e-3 * speed, (0.0, 0.0, -speed), xml=ALONE)
+    assert -1e-5 < depths.max() < 2e-6
+
+
+@pytest.mark.parametrize(
+    ("flag", "geom"),
+    [("", 'gap="-0.0005"'), ("", 'margin="-0.002" gap="-0.001"'), ('override="enable"', "")],
+)
+def test_a_blow_is_met_whatever_margins_and_gaps_the_file_has(flag: str, geom: str) -> None:
+    xml = ALONE.replace('cone="{cone}"/>', f'cone="{{cone}}"><flag {flag}/></option>')
+    depths = blow(0.0024, (0.0, 0.0, -1.0), xml=xml.replace("<geom solref", f"<geom {geom} solref"))
+    assert -1e-5 < depths.max() < 2e-6
 
 
 @pytest.mark.parametrize("speed", [0.3, 1.0])

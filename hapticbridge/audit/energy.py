@@ -310,3 +310,6 @@ def energy_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[D
         yield Deviation(name, amount, allowed, "J", "recorded poses and wrenches")
     if block.scene_ticks:
         yield from _shown_deviations(block, balance)
+        return
+    for name in {"scene_tank", "scene_step"} & set(ticks.dtype.names or ()):
+        yield Deviation(name, np.abs(ticks[name]), 0.0, "", "a scene that steps in every tick")

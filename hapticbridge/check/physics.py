@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from hapticbridge.scene.contacts import impedance_at
 
@@ -29,11 +28,15 @@ def matrix_of(quaternion: ArrayLike) -> Array:
 
 def quaternion_of(matrix: Array) -> Array:
     """Returns the unit quaternion (w, x, y, z) of a rotation matrix."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s, and no run needs it
+
     return np.asarray(Rotation.from_matrix(matrix).as_quat(scalar_first=True))
 
 
 def rotation_vector(start: ArrayLike, now: ArrayLike) -> Array:
     """Returns the rotation vector in rad from one orientation to another."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - 0.3 s, and no run needs it
+
     before, after = (Rotation.from_quat(each, scalar_first=True) for each in (start, now))
     return np.asarray((after * before.inv()).as_rotvec())
 

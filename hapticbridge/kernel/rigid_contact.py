@@ -123,6 +123,8 @@ _SOLVER = struct_of("mjModel").opt.offset + struct_of("mjOption").solver.offset
 
 _GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct_of("mjSolverStat"))
 
+_BALL = int(mujoco.mjtJoint.mjJNT_BALL)
+
 _MOST_KEPT = int(mujoco.mjNSOLVER)
 
 _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
@@ -130,17 +132,19 @@ _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG
 _PARAMETERS = (
     *("eq_solref", "eq_solimp", "jnt_solref", "jnt_solimp"),
     *("tendon_solref_lim", "tendon_solimp_lim", "geom_margin", "pair_margin"),
+    *("jnt_margin", "tendon_margin"),
 )
 """Arrays of the model that a run writes to, and puts back."""
 
 _OF_MODEL = (
-    *("geom_rbound", "pair_geom1", "pair_geom2"),
+    *("geom_rbound", "pair_geom1", "pair_geom2", "jnt_type", "jnt_dofadr"),
     *("body_parentid", "body_rootid", "body_dofadr", "body_dofnum"),
 )
-_OF_DATA = ("geom_xpos", "subtree_com", "cdof")
+_OF_DATA = ("geom_xpos", "subtree_com", "cdof", "ten_velocity")
 _OWNED = (
     *(f"own_{name}" for name in _PARAMETERS),
     *("eq_type", "row_positions", "row_shifts", "end_velocity", "moving_geoms", "body_velocity"),
+    "leashes",
 )
 
 RIGID_DTYPE = np.dtype(
@@ -178,7 +182,7 @@ J̇v. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the s
 ``STALLED``. Of limits and equality constraints: largest count of rows (0 if there are none), and
 addresses of the model's parameters, of copies, of the rows' own positions, of the velocities taken
 from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of pairs, and of the
-bodies' velocities."""
+bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
 
 
 def bind_contact(
@@ -204,6 +208,8 @@ def bind_contact(
     owned["eq_type"] = np.ascontiguousarray(model.eq_type, dtype=np.int32)
     for name in ("row_positions", "row_shifts"):
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
+    is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
+    owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
     owned["end_velocity"] = np.zeros(MOST_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
@@ -521,7 +527,8 @@ def follow_speed(s: State) -> None:
 
     The way is t (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
     bounding sphere, at most ``LARGEST_MARGIN``. t is the time step, or three of them where a tool
-    is shown until two after the newest. Positions are those at the start of the last step.
+    is shown until two after the newest. Positions are those at the start of the last step. Limits
+    of joints and tendons follow their speeds.
     """
     contact, mj, ahead = s.contact, s.mj, s.contact.ahead
     _move_bodies(s)
@@ -548,6 +555,37 @@ def follow_speed(s: State) -> None:
             way += margins[geom] - at_rest[geom]
         at_rest_here = floats(contact.own_pair_margin + 8 * pair, 1)[0]
         floats(contact.pair_margin + 8 * pair, 1)[0] = at_rest_here + way
+    if contact.row_capacity > 0:
+        _follow_limits(s)
+
+
+@compiled
+def _follow_limits(s: State) -> None:
+    """Widens the margins of limits by ``MARGIN``, in m or rad, and the way of two steps.
+
+    In the first of these steps a lossless tool learns that it is near. A leash, a spatial tendon of
+    no least length, may pass through zero: its lower limit stays out of the step.
+    """
+    contact, mj, ahead = s.contact, s.mj, 2.0 * s.run.timestep
+    kinds, first = ints(contact.jnt_type, mj.njnt), ints(contact.jnt_dofadr, mj.njnt)
+    speeds = floats(mj.qvel, mj.nv)
+    margins, own = floats(contact.jnt_margin, mj.njnt), floats(contact.own_jnt_margin, mj.njnt)
+    for joint in range(mj.njnt):
+        dof = first[joint]
+        speed = abs(speeds[dof])
+        if kinds[joint] == _BALL:
+            speed = norm(vector_of(speeds[dof : dof + 3]))
+        margins[joint] = own[joint] + MARGIN + ahead * speed
+    margins = floats(contact.tendon_margin, mj.ntendon)
+    own = floats(contact.own_tendon_margin, mj.ntendon)
+    speeds = floats(contact.ten_velocity, mj.ntendon)
+    lengths, leashes = floats(mj.ten_length, mj.ntendon), ints(contact.leashes, mj.ntendon)
+    for tendon in range(mj.ntendon):
+        way = ahead * abs(speeds[tendon])
+        wide = MARGIN + way
+        if leashes[tendon]:
+            wide = min(wide, max(lengths[tendon] - way, 0.0))
+        margins[tendon] = own[tendon] + wide
 
 
 @compiled

@@ -32,12 +32,17 @@ def _rigid_options(option: mujoco.MjOption) -> dict[str, Any]:
         "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
         "impratio": IMPRATIO,
         "noslip_iterations": 0,
-        "o_margin": max(option.o_margin, MARGIN),
+        # it stands for all margins where the file overrides them, and cannot follow the speed
+        "o_margin": max(option.o_margin, LARGEST_MARGIN if _overrides(option) else MARGIN),
         **{
             name: (min if "tolerance" in name else max)(getattr(option, name), usual)
             for name, usual in _PRECISE.items()
         },
     }
+
+
+def _overrides(option: mujoco.MjOption) -> bool:
+    return bool(option.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE)
 
 
 def has_rigid_contact(model: mujoco.MjModel) -> bool:
@@ -171,7 +176,10 @@ class Scene:
     def _set_margins(self) -> None:
         """Sets the margins of rigid contacts at rest; in a run they follow the speed."""
         for name in _MARGINS if self._own_contact else ():
-            getattr(self.model, name)[:] = np.maximum(self._own_contact[name], MARGIN)
+            gap = getattr(self.model, name.replace("margin", "gap")) - self._reach
+            # a negative gap would let MuJoCo find a contact in penetration only
+            margin = np.maximum(self._own_contact[name], MARGIN) - np.minimum(gap, 0.0)
+            getattr(self.model, name)[:] = margin
         _widen_bodies(self.model, LARGEST_MARGIN if self._own_contact else 0.0)
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
