@@ -211,4 +211,4 @@ def test_a_recording_without_the_share_is_compared_and_exported_in_what_it_holds
     assert len(written) == len(recording.ticks) + 1
     assert written[0].endswith("injected_rotational_damping")
     target = export(tap, "csv", tmp_path / "new.csv").files[0]
-    assert target.read_text().splitlines()[0].endswith(",share,contact_tank")
+    assert target.read_text().splitlines()[0].endswith(f",{','.join(LATER_FIELDS)}")
