@@ -385,6 +385,21 @@ PATHS = {
         axes=(1, 1, 1, 1, 1, 1),
         seed=10,
     ),
+    # Dip the stick into the beads, stir twice round the bowl, hold, lift it out.
+    "beads": HandPath(
+        reaching(
+            Reach(0.5, 1.1, (0, 0, -45.0)),
+            Reach(1.6, 0.6, (20.0, 0, 0)),
+            *(
+                Reach(2.0 + 0.45 * quarter, 0.9, (20.0 * x, 20.0 * y, 0))
+                for quarter, (x, y) in enumerate(2 * ((-1, 1), (-1, -1), (1, -1), (1, 1)))
+            ),
+            Reach(6.1, 0.5, (-20.0, 0, 0)),
+            Reach(6.7, 1.1, (0, 0, 45.0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=11,
+    ),
 }
 """The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
 began."""

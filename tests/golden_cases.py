@@ -24,6 +24,7 @@ from unittest.mock import patch
 
 import numpy as np
 from audit_cases import ScriptedDevice, SlowClock, rewritten
+from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -414,7 +415,7 @@ def runs() -> dict[str, Run]:
     """Returns every frozen run by name."""
     found = {
         f"{scene}, {method}": Run(scene, options={"method": method}, seconds=1.0)
-        for scene in hb.scene_names()
+        for scene in LOOP_SCENES
         for method in METHODS
     }
     for method in COMPARED:

@@ -19,12 +19,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from hapticbridge.kernel.codes import HANDLE
+from hapticbridge.scene import scene_names
 
 Array: TypeAlias = NDArray[np.float64]
 Edit: TypeAlias = Callable[[Any], None]
 
 ROOT = Path(__file__).resolve().parent.parent
 MODELS = ROOT / "models"
+
+SLOW_SCENES = ("beads",)
+"""Scenes too slow to step in every tick: 8 s of the beads at 1 kHz take a minute, and they are not
+meant to run so. ``test_slow_scene`` runs them beside the loop."""
+
+LOOP_SCENES = tuple(name for name in scene_names() if name not in SLOW_SCENES)
 
 T = 1e-3
 K, B = 2400.0, 0.5

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, balance_of, recorded
+from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from report_runs import LOOSE, circling
 from scipy.spatial.transform import Rotation
@@ -25,7 +26,6 @@ from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.run_description import parameters_of
-from hapticbridge.scene import scene_names
 from hapticbridge.scene.load import scene_path
 
 
@@ -47,7 +47,7 @@ def energy_by_hand(recording: Recording) -> tuple[NDArray[Any], NDArray[Any]]:
     return stored - work - ticks["actuator_work"] - ticks["external_work"], slack
 
 
-@pytest.mark.parametrize("scene", scene_names())
+@pytest.mark.parametrize("scene", LOOP_SCENES)
 def test_shipped_scenes_are_passive_on_the_simulated_device(scene: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     motion = scene_path(scene).with_suffix(".csv")

@@ -35,7 +35,7 @@ from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError
-from hapticbridge.scene import load_scene, read_scene, scene_names
+from hapticbridge.scene import load_scene, read_scene
 from hapticbridge.scene.contacts import meeting_pairs
 
 COUPLING = Coupling(2400.0, 0.5, 2.4, 5e-4)
@@ -350,7 +350,7 @@ KEPT = {
 """What may go by the planted price, and why it stays in a shipped scene."""
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", model_runs.LOOP_SCENES)
 def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
     """No freedom, contact dimension, pair, cone or hull, but for the reasons above.
 

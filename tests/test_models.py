@@ -128,7 +128,7 @@ def test_meshes_are_small_and_convex() -> None:
         assert ((corners @ faces[:, :3].T + faces[:, 3]).max(axis=1) > -1e-9).all()
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", runs.LOOP_SCENES)
 def test_own_path_stays_below_ten_newtons_and_gains_no_more_than_the_slack(name: str) -> None:
     run = runs.run_of_own_path(name)
     assert run.warnings == 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model_runs import BOTTOMED_HEIGHT, HOME_HEIGHT, MODELS, Array
+from model_runs import BOTTOMED_HEIGHT, HOME_HEIGHT, LOOP_SCENES, MODELS, Array
 from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
@@ -182,7 +182,7 @@ def default_run(name: str, **values: float) -> Done:
     return Done(np.array(joints), np.array(deepest), sent, summary, warnings)
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", LOOP_SCENES)
 def test_default_run_is_passive_and_sends_what_the_device_can(name: str) -> None:
     done = default_run(name)
     assert done.summary.ticks == len(done.joints) == 8001
@@ -322,7 +322,7 @@ def test_a_scene_is_strict_in_its_own_hand_at_random(name: str) -> None:
         assert (outcome.environment, outcome.ticks) == ("strict", 5000), f"seed {seed}: {outcome}"
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", LOOP_SCENES)
 @pytest.mark.filterwarnings("ignore:.*stiffer than any:UserWarning")  # these rates are not its own
 def test_the_start_of_every_scene_creates_no_energy_at_any_rate(name: str) -> None:
     for rate in (250.0, 500.0, 1000.0):

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
 from hapticbridge.device import Motion, TrajectoryDevice
-from hapticbridge.scene import scene_names
 from hapticbridge.scene.parameters import apply_parameters
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
@@ -42,7 +41,7 @@ def test_task_in_the_bridge_ends_as_without_the_package(name: str, tmp_path: Pat
     assert ended == pytest.approx(reference.run_of_own_path(name).joints[-1], abs=3e-4)
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", reference.LOOP_SCENES)
 def test_own_path_followed_exactly_creates_no_energy_and_stays_sharp(name: str) -> None:
     deepest: list[float] = []
     device = f"trajectory:{reference.MODELS / name / name}.csv"

@@ -152,7 +152,7 @@ def test_both_ends_of_a_shipped_range_load_and_differ(
     assert low.parameters[parameter.name] == parameter.minimum
     assert compiled_model(low.model) != compiled_model(high.model)
     assert parameter.about
-    assert parameter.unit in {"", "m", "N", "N m", "kg", "N/m", "N m/rad", "rad", "s"}
+    assert parameter.unit in {"", "m", "N", "N m", "N s/m", "kg", "N/m", "N m/rad", "rad", "s"}
 
 
 @pytest.mark.parametrize("clearance", [0.05e-3, 1e-3])

@@ -14,6 +14,7 @@ import pytest
 from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, rewritten, verdict_of
 from bridge_runs import fast, still, sway
 from cli_cases import Called
+from random_hands import random_motion
 
 import hapticbridge as hb
 from hapticbridge import jit
@@ -21,6 +22,7 @@ from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import Clock
 from hapticbridge.commands import Couple, Reset
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.options import RunSetup, steady_stiffness
 from hapticbridge.recording import read_recording
@@ -55,6 +57,23 @@ def test_a_slower_scene_runs_and_is_audited(pressed: Path) -> None:
     assert np.abs(ticks["wrench_on_device"][:, 0]).max() > 1.0
     assert report.timekeeping.scene_rate == pytest.approx(200.0)
     assert report.timekeeping.scene_speed == 1.0
+
+
+BEADS: list[dict[str, float]] = [{"mass": 0.0005, "drag": 0.002}, {"mass": 0.01, "drag": 0.2}]
+
+
+@pytest.mark.filterwarnings("ignore:without a hand")  # beads that roll off each other are chaotic
+@pytest.mark.parametrize("values", BEADS, ids=str)
+@pytest.mark.parametrize("rate", [50.0, 80.0])
+def test_a_bowl_of_beads_is_stirred_beside_the_loop(
+    tmp_path: Path, values: dict[str, float], rate: float
+) -> None:
+    path, device = tmp_path / "run.mcap", SimulatedDevice(path=random_motion(0, first=-0.045))
+    scene = load_scene("beads", "grip", as_is=False, **values)
+    summary = recorded(path, scene, device, scene_rate=rate, duration=1.2)
+    assert summary.peak_force > 0.3  # the beads bear against the stick
+    assert read_recording(path).ticks["contacts"].max() > 300
+    audited(path)
 
 
 @pytest.mark.filterwarnings("ignore:.*time step 0.01 s")

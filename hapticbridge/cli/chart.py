@@ -14,8 +14,15 @@ from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_c
 from hapticbridge.lab.chart.engine_run import peer_settings
 from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
 from hapticbridge.lab.chart.setting import chosen_methods, chosen_periods, settings_for
-from hapticbridge.lab.chart.work import WORK_ENDINGS, measure_work, write_work
+from hapticbridge.lab.chart.work import (
+    WORK_ENDINGS,
+    measure_scene_rates,
+    measure_work,
+    write_scene_rates,
+    write_work,
+)
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
+from hapticbridge.scene import load_scene
 
 ALL = "all"
 
@@ -49,11 +56,15 @@ class Chart:
     """Folder to write to."""
     quick: bool = False
     """Three time steps and three rounds of timing: half a minute."""
+    scene_rates: bool = False
+    """Chart felt error and cost against the rate of a scene that steps slower than the loop."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print what the chart says as JSON."""
 
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
+        if self.scene_rates:
+            return self._execute_scene_rates()
         if self.scene == WORK:
             if self.methods is not None or self.steps is not None or self.engines:
                 raise StudyError(
@@ -88,6 +99,27 @@ class Chart:
             print_json(facts)
         else:
             out.print(plain(facts["paragraph"]))
+        err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
+        return 0
+
+    def _execute_scene_rates(self) -> int:
+        if self.methods is not None or self.steps is not None or self.engines or self.quick:
+            raise StudyError(
+                "--scene-rates has settings of its own; it takes neither --methods nor --steps nor "
+                "--engines nor --quick"
+            )
+        scene = load_scene(self.scene)
+        paths = prepared_files(self.out, f"{scene.path.stem}_rates", WORK_ENDINGS)
+        with err.status("running every rate …"):
+            facts = write_scene_rates(scene.path.stem, measure_scene_rates(scene), paths)
+        if self.as_json:
+            print_json(facts)
+        else:
+            for point in facts["points"]:
+                out.print(
+                    f"{point['rate']:4.0f} Hz: {point['jnd']:.2g} JND, a step costs "
+                    f"{1e3 * point['step']:.3g} ms, {plain(point['environment'])}"
+                )
         err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
         return 0
 
