@@ -53,7 +53,7 @@ from hapticbridge.kernel.parameters import (
     rotation_numbers,
 )
 from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.realtime import scene_ticks_for, step_time, wants_real_time
+from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
 from hapticbridge.rendering import (
     TIPPED,
     Method,
@@ -409,7 +409,7 @@ class RunSetup:
         is_real_clock = clock.name == RealClock.name
         ticks = options.scene_ticks
         if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:
-            ticks = scene_ticks_for(substeps * step_time(scene, method), period)
+            ticks = scene_ticks_for(substeps * busy_step_time(scene, method, period), period)
         scales, law_evaluations = (
             options.workspace.scales,
             1 if ticks else method.law_evaluations(substeps),

@@ -240,7 +240,7 @@ def test_a_scene_that_cannot_keep_the_rate_steps_beside_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def ticks_of(step: float, clock: Clock, **options: Any) -> int:
-        monkeypatch.setattr("hapticbridge.options.step_time", lambda *_: step)
+        monkeypatch.setattr("hapticbridge.options.busy_step_time", lambda *_: step)
         return Bridge("point_mass", ScriptedDevice(still), clock=clock, **options).setup.scene_ticks
 
     assert ticks_of(8e-3, hb.RealClock()) == 10  # a fifth of its time is to spare

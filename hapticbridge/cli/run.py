@@ -41,7 +41,7 @@ from hapticbridge.options import (
     Workspace,
     steady_stiffness,
 )
-from hapticbridge.realtime import scene_ticks_for, step_time
+from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method, method_named
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
@@ -450,7 +450,8 @@ class Run:
     def _scene_ticks(self, scene: Scene) -> int:
         if self.scene_rate != AUTO or self.fast:
             return BridgeOptions(rate=self.rate, scene_rate=self.scene_rate).scene_ticks
-        return scene_ticks_for(step_time(scene, default_method()), period_of(self.rate))
+        period = period_of(self.rate)
+        return scene_ticks_for(busy_step_time(scene, default_method(), period), period)
 
     def _feel(
         self,

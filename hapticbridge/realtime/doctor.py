@@ -285,12 +285,14 @@ def _cores() -> Finding:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if not count or count < 2:
-        return Finding(
-            name, False, "there is one core: loop and recorder share it", "provide at least two"
-        )
+        shared = "loop, recorder and a scene beside the loop (--scene-rate) share it"
+        return Finding(name, False, f"there is one core: {shared}", "provide at least two")
     sentence = f"{count} cores, {busy:.1f} processes wanted to run in the last minute"
     if busy > count:
         return Finding(name, False, f"{sentence}: more than there are cores", "end other programs")
+    if busy > count - 1:
+        beside = "none is free for a scene beside the loop (--scene-rate)"
+        return Finding(name, None, f"{sentence}: {beside}", "end other programs")
     return Finding(name, True, sentence)
 
 

@@ -25,9 +25,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticbridge.clock import Clock, RealClock
+from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.jit import direct
+from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
-from hapticbridge.rendering import Method
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import after_step, before_step
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.rendering import Method, unguarded_parameters
 from hapticbridge.scene import Scene
 
 # Time stolen by the host of a virtual machine
@@ -185,6 +191,59 @@ def step_time(scene: Scene, method: Method) -> float:
         step(scene.model, data)
         times.append(now() - started)
     return float(np.median(times)) * 1e-9
+
+
+CALM = 0.1
+"""Share of the period below which a scene's step at its start is no matter; a stirred scene takes
+up to 25 times as long, and one of a few bodies never a millisecond."""
+
+STIRRED_STEPS, STIRRED_TIME = 100, 1.0
+"""Steps of a rehearsal, and processor time in s after which it ends early."""
+
+STIR = (0.02, 0.02, 0.05)
+"""Way of the rehearsal's handle to both sides of the grip, and below it, in m."""
+
+_STIR_COUPLING = Coupling(800.0, 1.0)
+
+
+def busy_step_time(scene: Scene, method: Method, period: float) -> float:
+    """Returns the time in s of nine of ten of a scene's steps while a hand stirs in it.
+
+    A scene that steps within ``CALM`` of the period at its start is not stirred. Another one is
+    driven for a second of its time, by steps of ten periods, and reset.
+
+    Args:
+        scene: The loaded scene.
+        method: The rendering method, one that can be slow.
+        period: T in s.
+    """
+    at_start = step_time(scene, method)
+    if at_start < CALM * period:
+        return at_start
+    step = 10.0 * period
+    parameters = unguarded_parameters(scene, _STIR_COUPLING, step, 1, method)
+    bound, sample = BoundKernel(scene.model, scene.data, parameters), np.zeros(1, SAMPLE_DTYPE)
+    sample["quaternion"][0, 0] = 1.0
+    before = direct(before_step, bound.state, sample, bound.row, 0, 0.0)
+    end = direct(after_step, bound.state, bound.row, 0)
+    times = [at_start]
+    try:
+        for k in range(STIRRED_STEPS):
+            angle = 2.0 * math.pi * k / STIRRED_STEPS
+            shares = math.sin(3.0 * angle), math.sin(2.0 * angle), 0.5 * (math.cos(angle) - 1.0)
+            sample["position"][0] = np.multiply(STIR, shares)
+            began = time.thread_time()
+            is_done = before(bound.state, sample, bound.row, 0, step) == OK
+            if is_done:
+                bound.step(scene.model, scene.data)
+                is_done = end(bound.state, bound.row, 0) == OK
+            times.append(time.thread_time() - began)
+            if not is_done or sum(times) > STIRRED_TIME:
+                break
+    finally:
+        bound.release()
+        scene.reset()
+    return float(np.quantile(times, 0.9))
 
 
 # Commands that grant refused requests
