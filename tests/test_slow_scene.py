@@ -71,7 +71,7 @@ def test_a_bowl_of_beads_is_stirred_beside_the_loop(
     path, device = tmp_path / "run.mcap", SimulatedDevice(path=random_motion(0, first=-0.045))
     scene = load_scene("beads", "grip", as_is=False, **values)
     summary = recorded(path, scene, device, scene_rate=rate, duration=1.2)
-    assert summary.peak_force > 0.3  # the beads bear against the stick
+    assert summary.peak_force > 0.2  # the beads bear against the stick
     assert read_recording(path).ticks["contacts"].max() > 300
     audited(path)
 
