@@ -92,11 +92,30 @@ def test_the_scene_keeps_method_substeps_and_contact(
 
 
 def test_late_results_are_recorded_and_repeated(tmp_path: Path) -> None:
-    """The loop runs far ahead of the scene's thread, which no clock holds back."""
+    def delay(bridge: Bridge, tick: int) -> None:
+        time.sleep(1e-4)  # a tick; the scene has two, and takes ten
+        slow = bridge.session.slow
+        assert slow is not None
+        if tick == 0:
+            step = slow.step
+
+            def slowly(*scene: Any) -> None:
+                time.sleep(1e-3)
+                step(*scene)
+
+            slow.step = slowly
+
     path = tmp_path / "late.mcap"
-    device = ScriptedDevice(sway)
+    device, clock = ScriptedDevice(sway), SlowClock({})
     summary = recorded(
-        path, "point_mass", device, COUPLING, clock=SlowClock({}), scene_rate=500.0, duration=1.0
+        path,
+        "point_mass",
+        device,
+        COUPLING,
+        clock=clock,
+        scene_rate=500.0,
+        duration=0.5,
+        on_tick=delay,
     )
     kept = summary.timekeeping
     assert kept.scene_speed < 0.95

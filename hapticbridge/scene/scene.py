@@ -20,6 +20,7 @@ from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
 
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
+_LIMIT_MARGINS = ("jnt_margin", "tendon_margin")
 _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_tolerance": 0.01}
 """MuJoCo's own limits of its solver. Where a file's are laxer, the solver may stop so early that
 the energy of contacts cannot be computed from its forces: with ``ls_iterations`` 10, three boxes
@@ -166,7 +167,7 @@ class Scene:
         self.changes = said + self.changes
         needed = _rigid_options(model.opt)
         own = {name: getattr(model.opt, name) for name in needed}
-        own |= {name: getattr(model, name).copy() for name in _MARGINS}
+        own |= {name: getattr(model, name).copy() for name in (*_MARGINS, *_LIMIT_MARGINS)}
         self._own_contact = own  # a new object: copies of the scene share the old one
         for name, value in needed.items():
             setattr(model.opt, name, value)
@@ -180,11 +181,14 @@ class Scene:
             # a negative gap would let MuJoCo find a contact in penetration only
             margin = np.maximum(self._own_contact[name], MARGIN) - np.minimum(gap, 0.0)
             getattr(self.model, name)[:] = margin
+        for name in _LIMIT_MARGINS if self._own_contact else ():
+            getattr(self.model, name)[:] = self._own_contact[name]
         _widen_bodies(self.model, LARGEST_MARGIN if self._own_contact else 0.0)
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
         for name, value in self._own_contact.items():
-            setattr(model if name in _MARGINS else model.opt, name, value)
+            is_margin = name in (*_MARGINS, *_LIMIT_MARGINS)
+            setattr(model if is_margin else model.opt, name, value)
         _widen_bodies(model, 0.0)
         use_exact_points(model, is_used=False)
 
