@@ -242,6 +242,8 @@ class BoundKernel:
 
     def release(self) -> None:
         """Puts back what a step that was broken off left in the model, at the end of a run."""
+        if self._record["shown"]["is_shown"]:
+            return  # the scene's own loop writes to the model, and may still be in a step
         if self._restore_springs is not None:
             self._restore_springs(self._record)
         restore_model(self._model, self._owned)
