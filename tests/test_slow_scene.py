@@ -25,7 +25,9 @@ from hapticbridge.commands import Couple, Reset
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.options import RunSetup, steady_stiffness
+from hapticbridge.realtime import busy_step_time
 from hapticbridge.recording import read_recording
+from hapticbridge.rendering import METHODS
 from hapticbridge.scene import load_scene
 from hapticbridge.whatif import what_if
 from hapticbridge.whatif.replayed_hand import load_bridge_code
@@ -268,6 +270,20 @@ def test_a_scene_that_cannot_keep_the_rate_steps_beside_the_loop(
     assert ticks_of(8e-3, hb.SimulatedClock()) == 0
     assert ticks_of(8e-3, hb.RealClock(), method="weld") == 0
     assert ticks_of(8e-3, hb.RealClock(), scene_rate=1000.0) == 0
+
+
+def test_a_scene_of_doubtful_cost_is_stirred_and_left_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, method = load_scene("virtual_wall"), METHODS["lossless"]
+    start = scene.data.qpos.copy()
+    for at_start, is_stirred in ((0.05e-3, False), (0.2e-3, True)):
+        monkeypatch.setattr("hapticbridge.realtime.realtime.step_time", lambda *_, s=at_start: s)
+        found = busy_step_time(scene, method, 1e-3)
+        assert (found != at_start) == is_stirred
+        assert 1e-6 < found < 1e-3
+        assert np.array_equal(scene.data.qpos, start)
+        assert scene.data.time == 0.0
 
 
 def test_the_usual_coupling_to_a_slower_scene_does_not_shake() -> None:
