@@ -13,11 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import report_runs
+from audit_cases import ScriptedDevice, recorded
+from bridge_runs import still
 from chromium import browser
 from PIL import Image
 from report_runs import Made
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.parameters import DAMPER
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
@@ -303,3 +307,21 @@ def test_a_damper_beyond_the_device_is_called_so_and_no_rate_is_asked_for(made: 
         assert cause.kind == kind
         assert remedy in cause.remedy
         assert ("raise the rate" in cause.remedy) == (kind == "rate")
+
+
+def test_remedies_start_from_the_stiffest_coupling_that_commands_selected(tmp_path: Path) -> None:
+    stiff = {"stiffness": 4000.0, "damping": 0.0}
+    turned = {"rotational_stiffness": 0.5, "rotational_damping": 0.0}
+    event = {"event": "coupling", "ticks": 500, "by": "another run", **stiff, **turned}
+
+    def act(bridge: Bridge, tick: int) -> None:
+        if tick == 20:
+            bridge.repeat_commands([event])
+
+    path = tmp_path / "run.mcap"
+    weak, soft = ScriptedDevice(still, damping=1.0), Coupling(500.0, 0.0, 0.5, 0.0)
+    recorded(path, "point_mass", weak, soft, method="implicit", duration=0.6, on_tick=act)
+    evidence = Evidence.of(read_recording(path))
+    assert evidence is not None
+    # b = 1 N s/m bears K T/2 up to 2000 N/m, and has borne the coupling at the start
+    assert what_would_do(evidence) == "lower the stiffness to 2000 N/m, or raise the rate to 2000 Hz"
