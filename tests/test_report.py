@@ -324,4 +324,6 @@ def test_remedies_start_from_the_stiffest_coupling_that_commands_selected(tmp_pa
     evidence = Evidence.of(read_recording(path))
     assert evidence is not None
     # b = 1 N s/m bears K T/2 up to 2000 N/m, and has borne the coupling at the start
-    assert what_would_do(evidence) == "lower the stiffness to 2000 N/m, or raise the rate to 2000 Hz"
+    assert (
+        what_would_do(evidence) == "lower the stiffness to 2000 N/m, or raise the rate to 2000 Hz"
+    )
