@@ -328,3 +328,21 @@ def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
         assert time.monotonic() < limit
         time.sleep(0.01)
     assert not path.exists()
+
+
+def test_a_stop_while_the_process_starts_leaves_none(
+    ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    start = recorder_module.recorder_process
+
+    def struck() -> subprocess.Popen[bytes]:
+        started.append(start())
+        signal.raise_signal(signal.SIGINT)
+        return started[0]
+
+    monkeypatch.setattr(recorder_module, "recorder_process", struck)
+    with pytest.raises(KeyboardInterrupt):
+        Recorder(ring, tmp_path / "run.mcap", META, ())
+    assert started[0].poll() is not None
+    assert not (tmp_path / "run.mcap").exists()

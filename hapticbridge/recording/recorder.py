@@ -182,8 +182,17 @@ class Recorder:
         self._is_closed = False
         self.is_disk_full = False
         self.is_left = self._has_failed = False
-        with deferring_stops():  # an interrupted caller would not have the process to end it
-            self._process = recorder_process()
+        process = None
+        try:
+            with deferring_stops():
+                process = self._process = recorder_process()
+        except BaseException:  # a stop: the caller does not have the process to end it
+            if process is not None:
+                process.kill()
+                process.wait(STANDSTILL)
+                for stream in (process.stdin, process.stdout):
+                    cast(IO[bytes], stream).close()
+            raise
         self._input = cast(IO[bytes], self._process.stdin)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
