@@ -1,10 +1,11 @@
-"""``hapticbridge scenes``."""
+"""``hapticbridge scenes`` and ``hapticbridge new-scene``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from cli_cases import Called
+import pytest
+from cli_cases import Called, facts_of, one_sentence
 
 
 def test_the_next_command_of_a_scene_runs(call: Called) -> None:
@@ -28,3 +29,48 @@ def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
     code, _, err = call("scenes", path)
     assert code == 2
     assert "error: cannot compile scene" in err
+
+
+def test_a_new_scene_has_no_fault_and_runs(
+    call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = call("new-scene", "stylus")
+    assert code == 0
+    assert "next: hapticbridge run stylus/stylus.xml" in out
+    assert {path.name for path in Path("stylus").iterdir()} == {
+        "README.md",
+        "stylus.csv",
+        "stylus.toml",
+        "stylus.xml",
+    }
+    assert not any("NAME" in path.read_text(encoding="utf-8") for path in Path("stylus").iterdir())
+    code, out, _ = call("check", "stylus/stylus.xml")
+    assert code == 0
+    assert "nothing found" in out
+    code, facts = facts_of(call, "run", "stylus/stylus.xml", "--fast", "--set", "mass=0.2")
+    assert code == 0
+    assert facts["environment"] == "strict"
+    assert facts["ticks"] > 7000  # the whole motion of its hand
+
+
+@pytest.mark.parametrize("name", ["", "Stylus", "a/b", "../a", "1a", "a" * 65, "peg_in_hole"])
+def test_a_name_that_no_scene_can_have_is_refused(
+    call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, err = call("new-scene", name)
+    assert code == 2
+    assert "name" in one_sentence(err)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_new_scene_replaces_nothing(
+    call: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("stylus").write_text("mine", encoding="utf-8")
+    code, _, err = call("new-scene", "stylus")
+    assert code == 2
+    assert "'stylus' exists" in one_sentence(err)
+    assert Path("stylus").read_text(encoding="utf-8") == "mine"

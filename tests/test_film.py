@@ -17,6 +17,8 @@ from cli_cases import Called
 from PIL import Image
 from report_runs import circling
 
+import hapticbridge as hb
+from hapticbridge.cli import main
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, draw, still
 from hapticbridge.film_process import Stage, film_ticks, force_colour, write_film
@@ -231,3 +233,19 @@ def test_a_signal_ends_the_drawing_at_once(
         timer.start()
         draw(sway, tmp_path / "sway.png", Shot())
     assert time.monotonic() - began < 30.0
+
+
+def test_a_picture_without_a_time_is_that_of_the_largest_force(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    with hb.Bridge("virtual_wall", clock=hb.SimulatedClock(), recording=path) as bridge:
+        bridge.run(duration=1.5)
+    shots: list[Shot] = []
+    monkeypatch.setattr("hapticbridge.cli.view.draw", lambda *words, **_: shots.append(words[2]))
+    for name in ("run.png", "run.mp4"):
+        assert main(["render", str(path), str(tmp_path / name)]) == 0
+    force = np.linalg.norm(read_recording(path).ticks["wrench_on_tool"][:, :3], axis=1)
+    assert 0 < force.argmax() < len(force) - 1
+    assert shots[0].at == pytest.approx(1e-3 * (force.argmax() + 1))
+    assert shots[1].at is None

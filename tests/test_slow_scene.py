@@ -378,7 +378,7 @@ def test_a_scene_beside_the_loop_that_is_still_too_slow_is_warned_of(
 
 
 def test_a_bridge_in_a_child_finds_its_machine_code_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    every = [each for each in gc.get_objects() if isinstance(each, jit.Compiled)]
+    every = [each for each in gc.get_objects() if type(each) is jit.Compiled]
     for each in every:
         monkeypatch.setattr(each, "_direct", {})
     load_bridge_code.cache_clear()

@@ -30,6 +30,8 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.reader import CUT
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
+from hapticbridge.report.cause import excess_of
+from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep.results import Interrupted, Table
 from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
@@ -188,9 +190,24 @@ class Audit:
             out.print_json(json.dumps([json.loads(report.to_json())]))
         else:
             _print_report(report)
+            if report.verdict == "active":
+                self._print_cause(report)
         if self.plot is not None or self.report is not None:
             self._draw(report)
         return report.exit_code
+
+    def _print_cause(self, report: AuditReport) -> None:
+        """Prints the largest excess of an active run, its likely cause and what to change."""
+        evidence = Evidence.of(read_recording(report.path))
+        excess = evidence and excess_of(evidence, report, in_process=self.in_process)
+        if excess:
+            out.print(
+                f"most at tick {excess.worst_tick} ({excess.worst_time:.3f} s): "
+                f"{format_energy(excess.worst)} beyond the bound"
+            )
+            out.print(f"likely cause: {plain(f'{excess.cause.kind}. {excess.cause.evidence}')}")
+            out.print(f"what to change: {plain(excess.cause.remedy)}")
+        out.print("next: hapticbridge guide active-verdict")
 
     def _audit_many(self, files: list[Path]) -> int:
         if self.plot or self.report or self.what_if:

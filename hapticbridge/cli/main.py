@@ -28,8 +28,10 @@ DONE, READER_GONE, USAGE_ERROR, SAFETY_TRIP = 0, 1, 2, 3
 
 
 COMMANDS = {
+    "guide": "Read how to do something, and why it works.",
     "run": "Put a scene behind a haptic device and feel it.",
     "scenes": "List the scenes, or the parameters of one.",
+    "new-scene": "Write a commented scene to start from.",
     "check": "Find what is wrong with a scene, and what a tick of it costs.",
     "audit": "Judge recorded runs offline: passive, active, unverified, and why.",
     "view": "Show a recorded run in a browser.",
@@ -46,12 +48,13 @@ COMMANDS = {
     "chart": "Chart the cost of ways to simulate a scene against their error.",
 }
 """Summary of each command, in the order of the top-level help: the first line of the command's
-class, without importing it. The class has the command's name with a capital."""
+class, without importing it. The class has the command's name, each word with a capital."""
 
 _HEADINGS = {"run": "Scenes", "audit": "Recordings", "devices": "Devices", "bound": "Theory"}
 """Headings of the top-level help, by the command below."""
 
 _MODULES = {
+    "new-scene": "scenes",
     "compare": "recordings",
     "export": "recordings",
     "repair": "audit",
@@ -145,7 +148,7 @@ def command_class(name: str) -> type[Any]:
             f"the environment variable MUJOCO_GL is {os.environ.get('MUJOCO_GL')!r}, which MuJoCo "
             "does not know; unset it, or set it to 'egl', 'osmesa', 'glfw' or 'disable'"
         ) from None
-    command: type[Any] = getattr(module, name.capitalize())
+    command: type[Any] = getattr(module, name.title().replace("-", ""))
     return command
 
 
@@ -262,12 +265,12 @@ def _print_version() -> int:
 
 
 def _top_level_help() -> str:
-    lines = ["Feel a MuJoCo scene through a haptic device: hapticbridge COMMAND [OPTIONS]"]
+    lines = ["Feel a MuJoCo scene through a haptic device: hapticbridge COMMAND [--help]"]
     for name, summary in COMMANDS.items():
         if name in _HEADINGS:
             lines.append(_HEADINGS[name])
         lines.append(f"  {name:<11}{summary}")
-    return "\n".join([*lines, "Options of a command, with an example: hapticbridge COMMAND --help"])
+    return "\n".join(lines)
 
 
 def _refuse(word: str) -> int:

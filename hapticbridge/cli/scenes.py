@@ -1,14 +1,17 @@
-"""``hapticbridge scenes``."""
+"""``hapticbridge scenes`` and ``hapticbridge new-scene``."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import tyro
 from rich.table import Table
 
-from hapticbridge.cli.terminal import compiling, out, plain
+from hapticbridge.cli.terminal import compiling, out, plain, print_written
 from hapticbridge.device import DEFAULT_HAND, scene_hand
+from hapticbridge.errors import SceneError
 from hapticbridge.scene import (
     custom_text,
     load_scene,
@@ -81,3 +84,44 @@ def _show(scene: str) -> int:
     first, name = parameters[0], plain(scene)
     out.print(f"next: hapticbridge run {name} --set {first.name}={first.minimum:g}")
     return 0
+
+
+TEMPLATE = Path(__file__).parent.parent / "templates" / "scene"
+"""Files of a new scene, with NAME in place of its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewScene:
+    """Write a commented scene to start from.
+
+    A folder with the MJCF of a tool and a fixture, a hand's motion, a parameter and a page.
+
+    Example:
+        hapticbridge new-scene my_tool
+    """
+
+    name: tyro.conf.Positional[str]
+    """Name of the scene: small letters, digits and _, a letter first. The folder has it, too; it
+    must not exist."""
+
+    def execute(self) -> int:
+        """Writes the files; returns the exit code."""
+        if not re.fullmatch(r"[a-z][a-z0-9_]{0,63}", self.name):
+            raise SceneError(
+                f"'{self.name:.80}' is no name for a scene; use up to 64 small letters, digits and "
+                "_, a letter first"
+            )
+        if self.name in scene_names():
+            raise SceneError(f"a shipped scene is called '{self.name}'; choose another name")
+        folder = Path(self.name)
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            raise SceneError(f"'{folder}' exists; choose another name") from None
+        for source in sorted(TEMPLATE.iterdir()):
+            path = folder / source.name.replace("scene.", f"{self.name}.")
+            text = source.read_text(encoding="utf-8").replace("NAME", self.name)
+            path.write_text(text, encoding="utf-8")
+            print_written(path)
+        out.print(f"next: hapticbridge run {folder / self.name}.xml")
+        return 0

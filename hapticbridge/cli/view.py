@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,7 @@ import tyro
 from hapticbridge.cli.terminal import err, notify, out, plain, progress
 from hapticbridge.errors import RecordingError
 from hapticbridge.film import Shot, draw
+from hapticbridge.recording import read_recording
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view
 
@@ -73,7 +74,7 @@ class Render:
     output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
     """The picture (.png), or the film (.mp4, extra 'view')."""
     at: float | None = None
-    """Time of a picture in s from the start of the run; by default its last tick."""
+    """Time of a picture in s from the start of the run; by default that of the largest force."""
     start: float = 0.0
     """Start of a film in s of the run."""
     stop: float | None = None
@@ -99,6 +100,10 @@ class Render:
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
         shot = Shot(**{field.name: getattr(self, field.name) for field in fields(Shot)})
+        if self.at is None and self.output.suffix.lower() == ".png":
+            from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
+
+            shot = replace(shot, at=telling_time(read_recording(self.file)))
         with err.status("drawing …"), progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")

@@ -441,6 +441,46 @@ def _moved_bodies(evidence: Evidence, window: slice) -> int:
 # Search for the likely cause
 
 
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """Energy of an active run beyond its bound.
+
+    Attributes:
+        time: Time in s from which on it is above zero.
+        worst: Its largest value in J.
+        worst_tick: Tick of the largest value.
+        worst_time: Time in s of that tick.
+        cause: Likely cause of it.
+    """
+
+    time: float
+    worst: float
+    worst_tick: int
+    worst_time: float
+    cause: Cause
+
+
+def excess_of(
+    evidence: Evidence, report: AuditReport, *, in_process: bool = False
+) -> Excess | None:
+    """Returns the excess of an active run; None for any other run.
+
+    ``in_process`` is as for ``likely_cause``.
+    """
+    cause = likely_cause(evidence, report, in_process=in_process)
+    if cause is None or report.tick is None:
+        return None
+    energy, allowed = evidence.judged(report)
+    worst = int(np.argmax(energy - allowed))
+    return Excess(
+        time=float(evidence.time[report.tick]),
+        worst=float((energy - allowed)[worst]),
+        worst_tick=int(evidence.ticks["tick"][worst]),
+        worst_time=float(evidence.time[worst]),
+        cause=cause,
+    )
+
+
 def likely_cause(
     evidence: Evidence, report: AuditReport, *, in_process: bool = False
 ) -> Cause | None:

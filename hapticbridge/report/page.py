@@ -15,7 +15,7 @@ from hapticbridge.files import atomic_write
 from hapticbridge.plotting import inline_svg
 from hapticbridge.record import due_times
 from hapticbridge.recording import Recording
-from hapticbridge.report.cause import likely_cause
+from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence, draw_recording
 from hapticbridge.report.facts import (
     balance_of,
@@ -137,15 +137,15 @@ def _device_notes(report: AuditReport) -> list[str]:
     ]
 
 
-def telling_time(recording: Recording, report: AuditReport) -> float:
-    """Returns the time in s of the fault, or else of the largest force on the tool.
+def telling_time(recording: Recording, report: AuditReport | None = None) -> float:
+    """Returns the time in s of a report's fault, or else of the largest force on the tool.
 
     Raises:
         RecordingError: The recording has no tick or no period.
     """
     if not len(recording.ticks):
         raise RecordingError(f"'{recording.path}' holds no tick")
-    tick = report.tick
+    tick = None if report is None else report.tick
     if tick is None:
         tick = int(np.argmax(np.linalg.norm(recording.ticks["wrench_on_tool"][:, :3], axis=1)))
     due = due_times(recording.ticks, meta_float(recording.meta, "period_s"))
@@ -188,7 +188,7 @@ def write_report(
         scene=scene and base64.b64encode(scene).decode(),
         run=run,
         moment=moment,
-        lead=lead_sentence(report, None if moment is None else moment["worst"]),
+        lead=lead_sentence(report, None if moment is None else moment["excess"].worst),
         notes=notes(report),
         is_warned=is_warned(report),
         curves="" if evidence is not None else _bare_curves(recording),
@@ -221,19 +221,12 @@ def _evidence_parts(evidence: Evidence, report: AuditReport, in_process: bool) -
 def moment_of(
     evidence: Evidence, report: AuditReport, *, in_process: bool = False
 ) -> dict[str, Any] | None:
-    """Returns time, energy and cause of an active run's fault; None for any other run."""
-    cause = likely_cause(evidence, report, in_process=in_process)
-    if cause is None or report.tick is None:
+    """Returns picture, place and excess of an active run's fault; None for any other run."""
+    excess = excess_of(evidence, report, in_process=in_process)
+    if excess is None:
         return None
-    energy, allowed = evidence.judged(report)
-    excess = energy - allowed
-    worst = int(np.argmax(excess))
     return {
         "drawn": inline_svg(draw_moment(evidence, report)),
         "place": PLACES.get(report.port, report.port),
-        "time": float(evidence.time[report.tick]),
-        "cause": cause,
-        "worst": float(excess[worst]),
-        "worst_tick": int(evidence.ticks["tick"][worst]),
-        "worst_time": float(evidence.time[worst]),
+        "excess": excess,
     }

@@ -1,0 +1,77 @@
+"""``hapticbridge guide``."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.markdown import Markdown
+
+from hapticbridge.cli.terminal import out
+from hapticbridge.errors import HapticBridgeError
+
+FOLDER = Path(__file__).parent.parent / "guide"
+"""Folder of the pages, one Markdown file each, named after its topic."""
+
+TOPICS = {
+    "Tutorials": ("first-run", "own-scene", "own-device", "audit-in-ci"),
+    "How to": (
+        "devices",
+        "coupling",
+        "active-verdict",
+        "missed-deadlines",
+        "shaking-scene",
+        "many-recordings",
+    ),
+    "Explanation": ("passivity", "force-level", "rigid-contact", "slower-scenes", "audit"),
+    "Reference": ("recording-format", "recordings-from-others", "mjcf", "glossary"),
+}
+"""Topics of the guide by kind, in the order of reading."""
+
+WIDTH = 100
+"""Largest width of a page in columns. Longer lines of prose are hard to read."""
+
+
+def page(topic: str) -> str:
+    """Returns the Markdown text of a topic.
+
+    Raises:
+        HapticBridgeError: There is no such topic.
+    """
+    topics = [name for names in TOPICS.values() for name in names]
+    if topic not in topics:
+        near = difflib.get_close_matches(topic, topics, n=1)
+        advice = f"did you mean '{near[0]}'?" if near else "'hapticbridge guide' lists the topics"
+        raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
+    return (FOLDER / f"{topic.replace('-', '_')}.md").read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """Read how to do something, and why it works.
+
+    A pipe or a file gets the page as Markdown.
+
+    Example:
+        hapticbridge guide first-run
+    """
+
+    topic: tyro.conf.Positional[str | None] = None
+    """Topic of the page; without one, the topics are listed."""
+
+    def execute(self) -> int:
+        """Prints the page or the list; returns the exit code."""
+        if self.topic is None:
+            for kind, names in TOPICS.items():
+                out.print(f"[bold]{kind}[/bold]")
+                for name in names:
+                    title = page(name).partition("\n")[0].removeprefix("# ")
+                    out.print(f"  {name:<24}{title}")
+            out.print("next: hapticbridge guide TOPIC")
+        elif out.is_terminal:
+            out.print(Markdown(page(self.topic)), width=min(out.width, WIDTH), soft_wrap=False)
+        else:
+            print(page(self.topic), end="")
+        return 0
