@@ -6,6 +6,9 @@ import importlib
 import json
 import math
 import secrets
+import shlex
+import shutil
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +17,24 @@ from typing import Any
 from hapticbridge.errors import HapticBridgeError
 
 # Import of optional packages
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+"""Folder of ``pyproject.toml`` if the package runs from a checkout."""
+
+
+def install_command(extra: str) -> str:
+    """Returns the command that installs an extra where this program runs.
+
+    In a checkout it names the checkout, because no index may have the package. ``pip`` is called
+    through this program's Python if the shell's own belongs to another one.
+    """
+    found = shutil.which("pip")
+    is_ours = found is not None and Path(found).parent == Path(sys.executable).parent
+    pip = "pip" if is_ours else f"{shlex.quote(sys.executable)} -m pip"
+    if not (CHECKOUT / "pyproject.toml").is_file():
+        return f"{pip} install 'hapticbridge[{extra}]'"
+    target = "." if Path.cwd() == CHECKOUT else str(CHECKOUT)
+    return f"{pip} install -e {shlex.quote(f'{target}[{extra}]')}"
 
 
 def import_extra(
@@ -32,8 +53,7 @@ def import_extra(
     except ImportError:
         package = package or module.partition(".")[0]
         raise error(
-            f"{purpose} needs {package}, which is not installed: "
-            f"pip install 'hapticbridge[{extra}]'"
+            f"{purpose} needs {package}, which is not installed: {install_command(extra)}"
         ) from None
 
 

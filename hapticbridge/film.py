@@ -22,6 +22,7 @@ from typing import IO, Any, cast
 from hapticbridge.arguments import Arguments
 from hapticbridge.confinement import SHARE, ForeignSceneError, death
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.files import install_command
 
 RENDERERS = ("egl", "osmesa")
 """Renderers without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
@@ -194,7 +195,7 @@ def _check_target(target: Path, shot: Shot) -> None:
             "start, stop, speed and fps go with a film (.mp4); a picture has a time"
         )
     if ending == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise HapticBridgeError("a film needs the extra 'view': pip install 'hapticbridge[view]'")
+        raise HapticBridgeError(f"a film needs the extra 'view': {install_command('view')}")
 
 
 def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) -> bool:

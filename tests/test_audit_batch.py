@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import json
+import re
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -24,6 +25,7 @@ from hapticbridge.audit.batch import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, StudyError
+from hapticbridge.files import install_command
 from hapticbridge.recording import read_recording
 
 # their packages hold functions of these names
@@ -193,6 +195,6 @@ def test_a_table_that_cannot_be_written_is_refused_before_anything_is_audited(
         return found(name)
 
     monkeypatch.setattr(importlib, "import_module", without)
-    with pytest.raises(StudyError, match=r"pip install 'hapticbridge\[tables\]'"):
+    with pytest.raises(StudyError, match=re.escape(install_command("tables"))):
         check_table_name(runs / "table.parquet")
     check_table_name(runs / "table.json")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from hapticbridge.files import atomic_write, finite_or_null, read_json
+from hapticbridge.files import atomic_write, finite_or_null, install_command, read_json
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
@@ -81,3 +82,32 @@ def test_what_is_no_json_is_one_kind_of_error(text: str | bytes) -> None:
 def test_json_is_read_as_it_was_written() -> None:
     assert read_json(b'{"a": [1, 2.5, null]}') == read_json('{"a": [1, 2.5, null]}')
     assert read_json("[1]") == [1]
+
+
+@pytest.mark.parametrize(
+    ("is_checkout", "is_here", "has_pip", "expected"),
+    [
+        (True, True, True, "pip install -e '.[view]'"),
+        (True, False, True, "pip install -e '{checkout}[view]'"),
+        (True, True, False, "{python} -m pip install -e '.[view]'"),
+        (False, False, True, "pip install 'hapticbridge[view]'"),
+    ],
+)
+def test_the_command_for_an_extra_fits_the_place_of_the_program(
+    is_checkout: bool,
+    is_here: bool,
+    has_pip: bool,
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checkout, elsewhere = tmp_path / "checkout", tmp_path / "elsewhere"
+    checkout.mkdir()
+    elsewhere.mkdir()
+    if is_checkout:
+        (checkout / "pyproject.toml").touch()
+    pip = Path(sys.executable).parent / "pip" if has_pip else Path("/usr/bin/pip")
+    monkeypatch.setattr("shutil.which", lambda _: str(pip))
+    monkeypatch.setattr("hapticbridge.files.CHECKOUT", checkout)
+    monkeypatch.chdir(checkout if is_here else elsewhere)
+    assert install_command("view") == expected.format(checkout=checkout, python=sys.executable)

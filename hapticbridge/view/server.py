@@ -20,6 +20,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.files import install_command
 from hapticbridge.view.window import HOST, Address
 
 Process = Callable[[Any, Request], Response | Awaitable[Response | None] | None]
@@ -46,7 +47,7 @@ def serve(address: Address) -> viser.ViserServer:
         stop(server)
         raise HapticBridgeError(
             f"viser {viser.__version__} skips the check of the token or has unknown scripts: "
-            "pip install 'hapticbridge[view]' has one that does not"
+            f"'{install_command('view')}' installs one that does not"
         )
     # viser would forward the page to its server on the internet at a browser's request, and keep
     # files that a browser sends

@@ -25,6 +25,7 @@ from hapticbridge.commands import Command, command_of
 from hapticbridge.commands.command import LONGEST_LINE
 from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.errors import CommandError, HapticBridgeError
+from hapticbridge.files import install_command
 from hapticbridge.recording import Attachment
 from hapticbridge.signals import deferring_stops
 
@@ -132,7 +133,7 @@ def check_view() -> None:
         HapticBridgeError: The extra 'view' is not installed.
     """
     if importlib.util.find_spec("viser") is None:
-        raise HapticBridgeError("a page needs the extra 'view': pip install 'hapticbridge[view]'")
+        raise HapticBridgeError(f"a page needs the extra 'view': {install_command('view')}")
 
 
 class Window:

@@ -37,9 +37,10 @@ from hapticbridge.device.driver import Driver, FoundDevice, Notify, ignore_messa
 from hapticbridge.device.haply import messages
 from hapticbridge.device.haply.messages import SERVICE, Listed
 from hapticbridge.device.transport.trace import HexLog
-from hapticbridge.device.transport.websocket import EXTRA, Link, WebSocketLink, websocket_client
+from hapticbridge.device.transport.websocket import MISSING, Link, WebSocketLink, websocket_client
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector
 from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.files import install_command
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 # Measured timing of the service
@@ -335,7 +336,7 @@ def find(place: tuple[str, int] = PLACE) -> list[FoundDevice]:
 def medium(place: tuple[str, int] = PLACE) -> str:
     """Returns a sentence on whether the service runs."""
     if websocket_client() is None:
-        return EXTRA
+        return f"{MISSING}: {install_command('haply')}"
     try:
         WebSocketLink.open(*place, SERVICE, HexLog("")).close()
     except DeviceError as error:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.transport.usb import SWITCH_INTERVAL
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.files import read_json
+from hapticbridge.files import install_command, read_json
 
 OPEN_TIMEOUT = 1.0
 """Longest time in s for the connection and for the handshake, each. A local program answers in
@@ -23,7 +23,7 @@ CLOSE_TIMEOUT = 0.2
 LARGEST_MESSAGE = 1 << 20
 """Largest message in bytes. A service with ten devices lists them in some 20 kB."""
 
-EXTRA = "the Python package websockets is not installed: pip install 'hapticbridge[haply]'"
+MISSING = "the Python package websockets is not installed"
 
 
 class Link(Protocol):
@@ -80,7 +80,7 @@ class WebSocketLink:
         """
         client = websocket_client()
         if client is None:
-            raise DeviceError(EXTRA)
+            raise DeviceError(f"{MISSING}: {install_command('haply')}")
         try:
             # a socket of our own, so that a proxy of the environment is not used
             local_socket = socket.create_connection((host, port), OPEN_TIMEOUT)

@@ -19,6 +19,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion, pose_at
 from hapticbridge.errors import StudyError, choices
+from hapticbridge.files import install_command
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -436,7 +437,7 @@ def open_engine(name: str) -> Engine:
     except ImportError as error:
         # a system library (such as libGL) may be missing although the package is installed
         raise StudyError(
-            f"engine '{name}' is not installed ({error}): pip install hapticbridge[peers]"
+            f"engine '{name}' is not installed ({error}): {install_command('peers')}"
         ) from None
     found: tuple[Engine, ...] = module.engines()
     return next(engine for engine in found if engine.name == name)
