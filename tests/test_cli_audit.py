@@ -15,6 +15,8 @@ from cli_cases import Called, one_sentence
 
 from hapticbridge.audit import audit
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.report.evidence import Evidence
+from hapticbridge.units import format_energy
 
 
 def test_active_and_invalid_recordings_are_exit_code_1(
@@ -224,3 +226,37 @@ def test_a_run_that_was_not_simulated_again_is_unverified_everywhere(
     assert code == 1
     assert "2 recordings: 1 passive, 1 unverified" in out
     assert call("audit", tmp_path, run_file, "--accept-unverified")[0] == 0
+
+
+def test_an_active_run_is_printed_with_its_worst_moment_cause_and_remedy(
+    call: Called, tmp_path: Path
+) -> None:
+    path = tmp_path / "kick.mcap"
+    code, _, _ = call(
+        *("run", "virtual_wall", "--method", "implicitfast", "--stiffness", 4000, "--damping", 0),
+        *("--i-know", "--duration", 1.5, "--fast", "--record", path),
+    )
+    assert code == 1
+    code, out, _ = call("audit", path)
+    assert code == 1
+    report = audit(path)
+    assert report.tick is not None
+    evidence = Evidence.of(read_recording(path))
+    assert evidence is not None
+    energy, allowed = evidence.judged(report)
+    worst = int((energy - allowed).argmax())
+    assert worst > report.tick
+    assert f"most at tick {worst} " in out
+    assert f"{format_energy(float((energy - allowed)[worst]))} beyond the bound" in out
+    assert "likely cause: method. " in out
+    assert "what to change: use method 'lossless' or 'implicit'" in out
+
+
+def test_a_tripped_run_is_not_called_passive_alone(call: Called, tmp_path: Path) -> None:
+    path = tmp_path / "trip.mcap"
+    run = ("run", "virtual_wall", "--fast", "--stretch-limit", 0.0005, "--record", path)
+    assert call(*run)[0] == 3
+    code, out, _ = call("audit", path)
+    assert code == 1
+    assert out.splitlines()[0].endswith("passive (strict) until the guard tripped")
+    assert "likely cause" not in out

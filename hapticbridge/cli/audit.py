@@ -291,7 +291,8 @@ class Audit:
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
     judged = "environment " if report.environment and not report.port else ""
-    out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]")
+    tripped = " [bold yellow]until the guard tripped[/]" if "trip" in report.events else ""
+    out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]{tripped}")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")

@@ -25,7 +25,14 @@ TOPICS = {
         "shaking-scene",
         "many-recordings",
     ),
-    "Explanation": ("passivity", "force-level", "rigid-contact", "slower-scenes", "audit"),
+    "Explanation": (
+        "passivity",
+        "force-level",
+        "rigid-contact",
+        "slower-scenes",
+        "faults",
+        "audit",
+    ),
     "Reference": ("recording-format", "recordings-from-others", "mjcf", "glossary"),
 }
 """Topics of the guide by kind, in the order of reading."""
