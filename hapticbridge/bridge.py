@@ -24,6 +24,7 @@ from hapticbridge.commands import Command, Repeat
 from hapticbridge.commands.command import Stop
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
+from hapticbridge.device.base import checked_read
 from hapticbridge.errors import CommandError, DeviceError, HapticBridgeError, SceneError
 from hapticbridge.guard import trip_reason
 from hapticbridge.inputs import Write, input_writes
@@ -103,6 +104,11 @@ class Bridge:
         signer = None if options.sign is None else Signer.load(options.sign)
         self.output = RecordOutput(path, observer, options.live, signer)
         self.clock = clock or RealClock()
+        if isinstance(self.clock, type):
+            raise HapticBridgeError(
+                f"clock is the class {self.clock.__name__}; it must be an object of it: "
+                f"{self.clock.__name__}()"
+            )
         loaded = scene if isinstance(scene, Scene) else load_scene(scene)
         with device_for_run(loaded, device, self.clock) as self.device:
             self.setup = RunSetup.resolve(
@@ -175,7 +181,7 @@ class Bridge:
         """Runs the ticks until the end; returns the reason of a trip, or an empty text."""
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
-        read_device, write_device = self.device.read, self.device.write
+        read_device, write_device = checked_read(self.device), self.device.write
         state, row, sample = kernel.bound.state, kernel.bound.row, kernel.sample
         before, answer, finish = kernel.before, kernel.answer, kernel.finish
         step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half

@@ -324,10 +324,15 @@ def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator
     A device that was opened here is closed if the body raises. One that the caller opened is not.
 
     Raises:
-        DeviceError: The device cannot be opened, or is bound to real time and the clock is
-            simulated.
+        DeviceError: The device cannot be opened, is no device, or is bound to real time and the
+            clock is simulated.
     """
     if not isinstance(device, str):
+        if not isinstance(getattr(device, "info", None), DeviceInfo):
+            raise DeviceError(
+                f"device is {shown(device)}; it must be a string such as 'simulated', or an object "
+                "with the calls of hapticbridge.Device and its data sheet 'info'"
+            )
         yield device
         return
     refuse_simulated_time(device, clock)

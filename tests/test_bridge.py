@@ -7,17 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import TAP, ScriptedDevice, recorded
+from audit_cases import COUPLING, TAP, ScriptedDevice, recorded
 from bridge_runs import fast, still
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.commands import Couple, Switch
-from hapticbridge.errors import DeviceError, HapticBridgeError
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip, SceneError
 from hapticbridge.guard import Limits
 from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
+from hapticbridge.scene import load_scene
 
 
 def payloads(path: Path) -> NDArray[np.void]:
@@ -266,3 +269,31 @@ def test_a_free_mass_is_strict_with_substeps_too(substeps: int) -> None:
     device = ScriptedDevice(shake)
     with fast("point_mass", device, substeps=substeps) as bridge:
         assert bridge.run(1.0).environment == "strict"
+
+
+class Silent(ScriptedDevice):
+    """Its ``read`` forgets to answer."""
+
+    def read(self, sample: np.ndarray) -> int:
+        super().read(sample)
+        return None  # type: ignore[return-value]
+
+
+def test_what_is_no_scene_device_or_clock_is_refused_in_a_sentence() -> None:
+    with pytest.raises(DeviceError, match=r"device is None; it must be a string such as"):
+        Bridge("point_mass", None)  # type: ignore[arg-type]
+    with pytest.raises(HapticBridgeError, match=r"clock is the class .*; .*: SimulatedClock\(\)"):
+        Bridge("point_mass", clock=SimulatedClock)  # type: ignore[arg-type]
+    for source in (None, 5):
+        with pytest.raises(SceneError, match=rf"scene is {source}; it must be an MJCF file"):
+            load_scene(source)
+
+
+def test_a_device_whose_read_answers_nothing_ends_the_run_with_zero_force() -> None:
+    device = Silent(still)
+    with (
+        Bridge("point_mass", device, COUPLING, clock=SimulatedClock()) as bridge,
+        pytest.raises(SafetyTrip, match=r"read returned None; it must be 0 for a new sample"),
+    ):
+        bridge.run(duration=0.01)
+    assert not np.any(device.writes[-1])

@@ -343,3 +343,25 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Releases the device; may be called more than once."""
+
+
+def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
+    """Returns the device's ``read``; for a device of another package, one that checks its answers.
+
+    Raises:
+        DeviceError: By the returned function, if the answer is not a whole number, such as None.
+    """
+    if type(device).__module__.startswith("hapticbridge."):
+        return device.read
+    read, name = device.read, device.info.name
+
+    def checked(sample: NDArray[np.void]) -> int:
+        flags = read(sample)
+        if not isinstance(flags, int | np.integer):
+            raise DeviceError(
+                f"device '{name}': read returned {shown(flags)}; it must be 0 for a new sample, or "
+                "TickFlag.STALE_SAMPLE"
+            )
+        return int(flags)
+
+    return checked

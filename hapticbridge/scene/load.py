@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mujoco
 
+from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, choices
 from hapticbridge.scene.checks import (
     check_model,
@@ -138,6 +139,11 @@ def load_scene(
     Warns:
         UserWarning: The run deviates from the file in a detail.
     """
+    if not isinstance(source, mujoco.MjSpec | str | Path):
+        raise SceneError(
+            f"scene is {shown(source)}; it must be an MJCF file, the name of a shipped scene or an "
+            "MjSpec"
+        )
     if not isinstance(source, mujoco.MjSpec):
         return compile_scene(read_scene(source, **parameters), grip, as_is=as_is, stacklevel=3)
     if parameters:
