@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults.catalogue import FINGERS
+from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from random_hands import random_motion
 from swing_cases import GRIPS, VERY_FIRM, alarms, shakes, taps
@@ -24,10 +25,9 @@ from hapticbridge.device import (
 )
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
-from hapticbridge.scene import scene_names
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", LOOP_SCENES)
 def test_random_hands_are_no_alarm(name: str) -> None:
     """One hand per grip here, 20 with ``scripts/swing_report``."""
     for seed, grip in enumerate(GRIPS.values()):
