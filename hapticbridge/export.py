@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra
-from hapticbridge.record import Column, Timeline, columns_of, due_times
+from hapticbridge.record import FLAG_LEGEND, TableColumns, Timeline, due_times
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.reader import CUTTING_EVENTS
 from hapticbridge.run_description import meta_float
@@ -35,12 +35,6 @@ class Sink(Protocol):
         """Finishes the file."""
 
 
-def column_values(ticks: NDArray[np.void], column: Column) -> NDArray[Any]:
-    """Returns one column of records, contiguous, int64 or float64, to the bit."""
-    field = ticks[column.field]
-    return np.ascontiguousarray(field if column.part is None else field[:, column.part])
-
-
 # CSV format
 
 SIDECAR = ".json"
@@ -56,25 +50,26 @@ class CsvSink:
     """CSV writer whose numbers read back bit for bit; only a NaN loses its payload.
 
     The header has names only. Units, metadata and events go to ``NAME.csv.json`` as one object
-    ``{"units", "meta", "events"}``, because most programs cannot read comments in a CSV.
+    ``{"units", "flags", "meta", "events"}``, because most programs cannot read comments in a CSV.
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
-        self._columns = columns_of(recording.record)
+        self._columns = TableColumns(recording.record, recording.period)
         about = {
-            "units": {column.name: column.unit for column in self._columns},
+            "units": self._columns.units,
+            "flags": FLAG_LEGEND,
             "meta": recording.meta,
             "events": recording.events,
         }
         text = json.dumps(about, indent=1, ensure_ascii=False)
         sidecar_of(path).write_text(text + "\n", encoding="utf-8")
         self._file = path.open("w", encoding="ascii", newline="")
-        self._file.write(",".join(column.name for column in self._columns) + "\n")
+        self._file.write(",".join(self._columns.units) + "\n")
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
         # repr of a float is the shortest text that reads back to it
-        texts = [map(repr, column_values(ticks, column).tolist()) for column in self._columns]
+        texts = [map(repr, values.tolist()) for values in self._columns.values(ticks)]
         self._file.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
     def close(self) -> None:
@@ -96,7 +91,8 @@ minutes at 1 kHz, 0.4 GB for all columns, and nothing is read again here."""
 class Hdf5Sink:
     """HDF5 writer: ``/ticks/NAME`` per column, ``/meta/KEY`` per metadata text, and ``/events``.
 
-    Each data set of ``/ticks`` has the attribute ``unit``. Events are JSON texts. Metadata are text
+    Each data set of ``/ticks`` has the attribute ``unit``, and ``flags`` the attribute ``bits``, a
+    JSON object of their names. Events are JSON texts. Metadata are text
     data sets, because an attribute is limited to 64 kB.
 
     Raises:
@@ -115,21 +111,23 @@ class Hdf5Sink:
         self._file.create_dataset("events", (len(events),), text, data=events)
         ticks = self._file.create_group("ticks")
         self._count = 0
-        self._columns = []
-        for column in columns_of(recording.record):
-            kind = recording.record[column.field].base
+        self._columns, self._sets = TableColumns(recording.record, recording.period), []
+        for (name, unit), kind in zip(
+            self._columns.units.items(), self._columns.kinds, strict=True
+        ):
             data = ticks.create_dataset(
-                column.name, (0,), kind, maxshape=(None,), chunks=(_CHUNK,), compression="gzip"
+                name, (0,), f"<{kind}8", maxshape=(None,), chunks=(_CHUNK,), compression="gzip"
             )
-            data.attrs["unit"] = column.unit
-            self._columns.append((column, data))
+            data.attrs["unit"] = unit
+            self._sets.append(data)
+        ticks["flags"].attrs["bits"] = json.dumps(FLAG_LEGEND)
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
         end = self._count + len(ticks)
-        for column, data in self._columns:
+        for data, values in zip(self._sets, self._columns.values(ticks), strict=True):
             data.resize((end,))
-            data[self._count :] = column_values(ticks, column)
+            data[self._count :] = values
         self._count = end
 
     def close(self) -> None:
@@ -144,7 +142,8 @@ class ParquetSink:
     """Parquet writer with one row group per block.
 
     Column metadata hold ``unit``. Schema metadata hold ``hapticbridge.meta`` (the recording's
-    metadata as a JSON object of texts) and ``hapticbridge.events`` (its events as a JSON list).
+    metadata as a JSON object of texts), ``hapticbridge.events`` (its events as a JSON list) and
+    ``hapticbridge.flags`` (names of the bits of ``flags``).
 
     Raises:
         RecordingError: pyarrow is not installed.
@@ -153,20 +152,18 @@ class ParquetSink:
     def __init__(self, path: Path, recording: RecordingFile) -> None:
         self._arrow = import_extra("pyarrow", "Parquet", "tables", RecordingError)
         parquet = import_extra("pyarrow.parquet", "Parquet", "tables", RecordingError)
-        self._columns = columns_of(recording.record)
+        self._columns = TableColumns(recording.record, recording.period)
         kinds = {"i": self._arrow.int64(), "f": self._arrow.float64()}
         fields = [
-            self._arrow.field(
-                column.name,
-                kinds[recording.record[column.field].base.kind],
-                nullable=False,
-                metadata={"unit": column.unit},
+            self._arrow.field(name, kinds[kind], nullable=False, metadata={"unit": unit})
+            for (name, unit), kind in zip(
+                self._columns.units.items(), self._columns.kinds, strict=True
             )
-            for column in self._columns
         ]
         about = {
             "hapticbridge.meta": json.dumps(recording.meta),
             "hapticbridge.events": json.dumps(recording.events),
+            "hapticbridge.flags": json.dumps(FLAG_LEGEND),
         }
         self._schema = self._arrow.schema(fields, metadata=about)
         # values rarely repeat, so a dictionary would only take space
@@ -176,7 +173,7 @@ class ParquetSink:
 
     def add(self, ticks: NDArray[np.void]) -> None:
         """Implements ``Sink.add``."""
-        arrays = [self._arrow.array(column_values(ticks, column)) for column in self._columns]
+        arrays = [self._arrow.array(values) for values in self._columns.values(ticks)]
         self._writer.write_table(self._arrow.Table.from_arrays(arrays, schema=self._schema))
 
     def close(self) -> None:
@@ -241,7 +238,7 @@ def export(
     span: tuple[float, float] = EVERYTHING,
     overwrite: bool = False,
 ) -> Exported:
-    """Writes a recording as a table: a row per tick, a column per number, with units.
+    """Writes a recording as a table: a row per tick, a column per number and one of seconds.
 
     Vectors become columns with the suffixes ``_x`` and so on (a wrench's ``_fx`` to ``_tz``).
     Doubles keep every bit (in CSV all but the payload of a NaN). Metadata and events are included,

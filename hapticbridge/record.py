@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from enum import IntFlag
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -257,3 +257,40 @@ class Timeline:
     def row_at(self, time: float) -> int:
         """Returns the row of the tick due nearest to a time in s, from 0 to ``duration``."""
         return round(float(np.interp(time, self._times, self._rows)))
+
+
+# Tables of ticks
+
+SECONDS = "seconds"
+"""Name of the first column of a table: due time of the tick in s of the run's clock."""
+
+FLAG_LEGEND = {str(flag.value): flag.name for flag in TickFlag}
+"""Names of the bits of the column ``flags``, by value."""
+
+
+class TableColumns:
+    """Columns of a table of ticks: ``SECONDS``, then one per number of a record.
+
+    Args:
+        record: Fields of a record, ``TICK_DTYPE`` or those of an earlier version.
+        period: T in s.
+
+    Attributes:
+        units: Unit of each column, by name, in order.
+        kinds: Kind of each column, ``i`` or ``f``, in order.
+    """
+
+    def __init__(self, record: np.dtype[np.void], period: float) -> None:
+        self._columns, self._period = columns_of(record), period
+        self.units = {SECONDS: "s"} | {column.name: column.unit for column in self._columns}
+        self.kinds = ["f", *(record[column.field].base.kind for column in self._columns)]
+
+    def values(self, ticks: NDArray[np.void]) -> list[NDArray[Any]]:
+        """Returns the columns of some records, each contiguous, (n,), int64 or float64."""
+        found: list[NDArray[Any]] = [due_times(ticks, self._period)]
+        for column in self._columns:
+            field = ticks[column.field]
+            found.append(
+                np.ascontiguousarray(field if column.part is None else field[:, column.part])
+            )
+        return found

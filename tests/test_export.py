@@ -6,20 +6,24 @@ import csv
 import importlib
 import json
 import math
+import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from audit_cases import SlowClock
 from cli_cases import Called
 from recording_cases import EPOCH, META, random_rows, write
 
+from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import export, sidecar_of
 from hapticbridge.files import install_command
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.recording import reader
+from hapticbridge.record import TICK_DTYPE, TickFlag
+from hapticbridge.recording import read_recording, reader
 
 h5py: Any = importlib.import_module("h5py")
 pq: Any = importlib.import_module("pyarrow.parquet")
@@ -100,10 +104,12 @@ def test_every_number_comes_back_to_the_bit(
     done = export(recording, form)
     columns, units, meta, events = read(done.files[0])
     assert not done.damage
+    assert columns.pop("seconds").shape == (COUNT,)
     rows, position = rows_to_keep(), 0
     names = list(columns)
     if form == "hdf5":  # in the order of the alphabet
         names = list(from_parquet(export(recording, "parquet").files[0])[0])
+        names.remove("seconds")
     for field in TICK_DTYPE.names or ():
         values = rows[field].reshape(COUNT, -1)
         for index in range(values.shape[1]):
@@ -174,7 +180,7 @@ def test_hdf5_keeps_no_more_chunks_than_it_writes(
 
     monkeypatch.setattr(h5py, "File", File)
     export(recording, "hdf5")
-    assert len(caches) == TICK_DTYPE.itemsize // 8
+    assert len(caches) == TICK_DTYPE.itemsize // 8 + 1  # and the seconds
     assert sum(caches) < 10e6
 
 
@@ -242,3 +248,51 @@ def test_a_piece_is_cut_where_deadlines_were_not_where_ticks_are_counted(tmp_pat
     write(tmp_path / "late.mcap", rows)
     done = export(tmp_path / "late.mcap", "csv", span=(0.3, 0.56))
     assert from_csv(done.files[0])[0]["tick"].tolist() == list(range(40, 59))
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that meets a wall, with two missed deadlines."""
+    path = tmp_path_factory.mktemp("wall") / "run.mcap"
+    clock = SlowClock({100: 2})
+    with Bridge("virtual_wall", recording=path, clock=clock) as bridge:
+        bridge.run(duration=0.5)
+    return path
+
+
+@pytest.mark.parametrize(("form", "read"), FORMATS)
+def test_seconds_are_due_times_and_the_bits_of_the_flags_have_names(
+    form: str, read: Callable[[Path], tuple[Columns, Any, Any, Any]], wall: Path, tmp_path: Path
+) -> None:
+    target = export(wall, form, tmp_path / f"out.{form if form != 'hdf5' else 'h5'}").files[0]
+    columns, units, _, _ = read(target)
+    ticks = read_recording(wall).ticks
+    assert np.array_equal(columns["seconds"], 1e-9 * ticks["deadline_ns"])
+    assert units["seconds"] == "s"
+    if form == "csv":
+        legend = json.loads(sidecar_of(target).read_text(encoding="utf-8"))["flags"]
+    elif form == "hdf5":
+        with h5py.File(target) as file:
+            legend = json.loads(file["ticks/flags"].attrs["bits"])
+    else:
+        legend = json.loads(pq.read_schema(target).metadata[b"hapticbridge.flags"])
+    assert legend["64"] == "CONTACT"
+    assert all(TickFlag[name].value == int(bit) for bit, name in legend.items())
+
+
+def test_a_data_frame_has_the_columns_of_the_table(wall: Path) -> None:
+    recording = read_recording(wall)
+    frame = recording.to_pandas()
+    assert frame.index.name == "seconds"
+    assert np.array_equal(frame.index, 1e-9 * recording.ticks["deadline_ns"])
+    assert np.array_equal(frame["wrench_on_device_fz"], recording.ticks["wrench_on_device"][:, 2])
+    assert frame.attrs["units"]["wrench_on_device_fz"] == "N"
+    assert frame.attrs["flags"]["64"] == "CONTACT"
+
+
+def test_without_pandas_a_sentence_says_how_to_get_it(
+    wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(RecordingError, match=re.escape(install_command("tables"))):
+        read_recording(wall).to_pandas()

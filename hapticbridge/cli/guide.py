@@ -33,7 +33,7 @@ TOPICS = {
         "faults",
         "audit",
     ),
-    "Reference": ("recording-format", "recordings-from-others", "mjcf", "glossary"),
+    "Reference": ("examples", "recording-format", "recordings-from-others", "mjcf", "glossary"),
 }
 """Topics of the guide by kind, in the order of reading."""
 

@@ -15,8 +15,8 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.files import read_json
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.files import import_extra, read_json
+from hapticbridge.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
@@ -262,6 +262,14 @@ class RecordingFile:
         return self.seal.get(DIGEST)
 
     @property
+    def period(self) -> float:
+        """T in s as the metadata state it; NaN if they are damaged."""
+        try:
+            return float(self.meta["period_s"])
+        except (KeyError, ValueError):
+            return math.nan
+
+    @property
     def computed_digest(self) -> str:
         """SHA-256 of the contents that were read."""
         return self.computed_seal[DIGEST]
@@ -321,6 +329,22 @@ class Recording(RecordingFile):
     """
 
     ticks: NDArray[np.void]
+
+    def to_pandas(self) -> Any:
+        """Returns the ticks as a ``pandas.DataFrame`` with the index ``seconds``.
+
+        It has a row per tick and a column per number, as an exported table. ``DataFrame.attrs``
+        holds ``units`` by column and ``flags`` by bit.
+
+        Raises:
+            RecordingError: pandas is not installed.
+        """
+        pandas = import_extra("pandas", "a data frame", "tables", RecordingError)
+        columns = TableColumns(self.record, self.period)
+        values = zip(columns.units, columns.values(self.ticks), strict=True)
+        frame = pandas.DataFrame(dict(values)).set_index(SECONDS)
+        frame.attrs = {"units": columns.units, "flags": FLAG_LEGEND}
+        return frame
 
 
 def read_recording(path: str | Path) -> Recording:
