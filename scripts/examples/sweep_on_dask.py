@@ -4,12 +4,13 @@ python sweep_on_dask.py [SCHEDULER]      # such as tcp://host:8786
 """
 
 import sys
+from typing import Any
 
 import hapticbridge as hb
 from hapticbridge.sweep import grid, sweep
 
 
-def dissipated(point: dict[str, float]) -> dict[str, float]:
+def dissipated(point: dict[str, Any]) -> dict[str, float]:
     """Returns the energy in J that the peg scene took in three seconds."""
     with hb.Bridge(hb.load_scene("peg_in_hole", **point), clock=hb.SimulatedClock()) as bridge:
         bridge.run(duration=3.0)
