@@ -43,6 +43,7 @@ REASONS = {
     "realtime/doctor.py: wait()": "a clock's: at most one period",
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
+    "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",
     "device/watchdog.py: select.select([ready], [], [], START_PATIENCE)": "its last argument",
     # records, and the processes that read them
     "recording/recorder.py: for line in answers": f"{DAEMON} longer than STANDSTILL",
