@@ -14,22 +14,22 @@ static void (*tick)() = 0;
 static unsigned tick_period_us = 0;
 
 enum { LOW, HIGH, OUTPUT, INPUT_PULLUP };
-static void pinMode(int, int) {}
-static void analogWriteResolution(int) {}
-static void analogWriteFrequency(int, float) {}
-static void analogWrite(int pin, int value) { pins[pin] = value; }
-static void digitalWrite(int pin, int value) { pins[pin] = value; }
-static int digitalRead(int) { return HIGH; }
+static inline void pinMode(int, int) {}
+static inline void analogWriteResolution(int) {}
+static inline void analogWriteFrequency(int, float) {}
+static inline void analogWrite(int pin, int value) { pins[pin] = value; }
+static inline void digitalWrite(int pin, int value) { pins[pin] = value; }
+static inline int digitalRead(int) { return HIGH; }
 // As on a Teensy 3: micros() switches interrupts on again, whatever they were before.
 static bool is_masked = false;
 static int sections = 0, broken_sections = 0;
-static void noInterrupts() { is_masked = true; }
-static void interrupts() {
+static inline void noInterrupts() { is_masked = true; }
+static inline void interrupts() {
   sections++;
   if (!is_masked) broken_sections++;
   is_masked = false;
 }
-static unsigned micros() {
+static inline unsigned micros() {
   is_masked = false;
   return now_us;
 }
@@ -47,7 +47,36 @@ struct RawHidPort {
     return 64;
   }
 };
-static RawHidPort RawHID;
+// each sketch uses one of them
+__attribute__((unused)) static RawHidPort RawHID;
+
+// A serial port at 1 Mbaud, one byte per 10 us each way, with an AVR's buffers of 63 bytes.
+enum { A2 = 16 };
+static int sensor = 500;
+static inline int analogRead(int) { return sensor; }
+static std::deque<unsigned char> line_in, received, sending, line_out;
+struct SerialPort {
+  void begin(unsigned long) {}
+  int available() { return (int)received.size(); }
+  int availableForWrite() { return 63 - (int)sending.size(); }
+  int read() {
+    const int byte = received.front();
+    received.pop_front();
+    return byte;
+  }
+  void write(unsigned char byte) { sending.push_back(byte); }
+};
+__attribute__((unused)) static SerialPort Serial;
+static inline void move_lines() {
+  if (!line_in.empty()) {
+    if (received.size() < 63) received.push_back(line_in.front());
+    line_in.pop_front();
+  }
+  if (!sending.empty()) {
+    line_out.push_back(sending.front());
+    sending.pop_front();
+  }
+}
 
 struct IntervalTimer {
   bool begin(void (*function)(), unsigned microseconds) {
@@ -64,10 +93,23 @@ void sketch_setup() { setup(); }
 // Lets time pass; `loops` false: loop() hangs and only the timer's interrupt runs.
 void sketch_run(unsigned microseconds, int loops) {
   for (unsigned end = now_us + microseconds; now_us != end; now_us += 10) {
+    move_lines();
     if (loops) loop();
-    if (now_us % tick_period_us == 0) tick();
+    if (tick && now_us % tick_period_us == 0) tick();
   }
 }
+void sketch_line(const unsigned char* bytes, unsigned count) {
+  line_in.insert(line_in.end(), bytes, bytes + count);
+}
+int sketch_take(unsigned char* bytes, unsigned space) {
+  unsigned count = 0;
+  for (; count < space && !line_out.empty(); count++) {
+    bytes[count] = line_out.front();
+    line_out.pop_front();
+  }
+  return (int)count;
+}
+void sketch_sense(int reading) { sensor = reading; }
 void sketch_send(const unsigned char* frame) { to_device.push_back(Report(frame, frame + 64)); }
 int sketch_fetch(unsigned char* frame) {
   if (to_host.empty()) return 0;
@@ -95,6 +137,11 @@ void shim_reset() {
 }
 int shim_receive(const unsigned char* frame, unsigned now_us) {
   return device->receive(frame, now_us);
+}
+unsigned shim_line(const unsigned char* bytes, unsigned count, unsigned now_us) {
+  unsigned frames = 0;
+  for (unsigned i = 0; i < count; i++) frames += device->receive_byte(bytes[i], now_us);
+  return frames;
 }
 int shim_answer(unsigned char* frame) { return device->answer(frame); }
 void shim_state(const float* numbers, unsigned buttons, unsigned status, unsigned now_us,

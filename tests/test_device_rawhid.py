@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.base import AXES
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
@@ -285,3 +286,10 @@ def test_arbitrary_numbers_give_a_finite_pose_or_end_the_run(numbers: tuple[floa
     else:
         assert np.isfinite(sample["position"]).all()
         assert np.linalg.norm(sample["quaternion"]) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_board_of_any_vendor_is_found_by_its_usage_page() -> None:
+    model = RawHid(SimulatedDevice())
+    model.vendor, model.product, model.product_name = 0x303A, 0x4004, "my board"
+    device = open_rawhid({}, ignore_message, HidSeam(model))
+    assert device.info.name == "test bench"

@@ -5,15 +5,14 @@ from __future__ import annotations
 import ctypes
 import math
 import re
-import shutil
 import struct
-import subprocess
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from emulated.rawhid_model import crc
+from firmware_build import COMPILER, FIRMWARE, built
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -184,25 +183,11 @@ def test_a_frame_of_another_version_is_told_from_noise() -> None:
     assert protocol.version_of(frame[:-1] + bytes([frame[-1] ^ 1])) is None
 
 
-FIRMWARE = Path(driver.__file__).with_name("firmware")
-SHIM = Path(__file__).with_name("rawhid_firmware_shim.cpp")
-COMPILER = shutil.which("g++") or shutil.which("clang++")
 WRENCH = (1.0, -0.5, 0.25, 0.01, -0.02, 0.03)
 
 pytestmark = pytest.mark.skipif(
     COMPILER is None, reason="neither g++ nor clang++ is here to compile the firmware with"
 )
-
-
-def built(folder: Path, *options: str) -> ctypes.CDLL:
-    library = folder / "firmware.so"
-    subprocess.run(
-        [str(COMPILER), "-std=c++11", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC",
-         f"-I{FIRMWARE}", f"-I{folder}", *options, "-o", str(library),
-         str(SHIM), str(FIRMWARE / "hb_protocol.cpp")],
-        check=True,
-    )  # fmt: skip
-    return ctypes.CDLL(str(library))
 
 
 @pytest.fixture(scope="module", name="shim")

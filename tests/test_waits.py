@@ -43,6 +43,7 @@ REASONS = {
     "realtime/doctor.py: wait()": "a clock's: at most one period",
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
+    "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",
     "device/watchdog.py: select.select([ready], [], [], START_PATIENCE)": "its last argument",
     # records, and the processes that read them
     "recording/recorder.py: for line in answers": f"{DAEMON} longer than STANDSTILL",
@@ -57,10 +58,11 @@ REASONS = {
     "view/process.py: for line in stream": DAEMON,
     "view/process.py: stream.readline()": "the bridge's end closes it",
     "view/process.py: time.sleep(due - now)": "until the bridge closes its end, or is dead",
-    "view/controls.py: time.sleep(PACE)": DAEMON,
+    "view/controls.py: time.sleep(pace)": DAEMON,
     "view/window.py: stream.readline()": DAEMON,
     "view/window.py: stream.readline(LONGEST_LINE + 1)": DAEMON,
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
+    "view/window.py: time.sleep(HAND_INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
     "film.py: lines.readline(LONGEST_LINE)": "a timer kills the process that draws",

@@ -43,7 +43,7 @@ def udev_rules() -> str:
 
     A HID device is matched by its kernel name, ``BUS:VENDOR:PRODUCT.NUMBER``. It exists over
     Bluetooth too, where there is no USB parent. A rule cannot read a device's capabilities, so a
-    driver that is a device class gets one rule per connected device.
+    driver that finds devices of any vendor gets one rule per connected device.
     """
     lines = [
         "# Lets the user at the machine's own seat open haptic devices. Written by",
@@ -53,10 +53,14 @@ def udev_rules() -> str:
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
     for driver in all_drivers():
-        if not driver.ids and driver.recognises is None:
-            continue  # no node to open: a program of the maker's has it
+        if driver.transport in ("service", "library", "view") and not driver.ids:
+            continue  # no node to open: a program has it
         lines += ["", f"# {driver.name}: {driver.about}"]
-        ids = driver.ids if driver.recognises is None else _ids_plugged_in(driver)
+        ids = driver.ids
+        if driver.usage is not None or driver.recognises is not None or not ids:
+            listed = {(one.vendor, one.product) for one in ids}
+            found = _ids_plugged_in(driver)
+            ids += tuple(one for one in found if (one.vendor, one.product) not in listed)
         if not ids:
             lines.append("# none is connected: plug it in, and write these rules again")
         for usb_id in ids:
@@ -64,6 +68,11 @@ def udev_rules() -> str:
             if driver.transport == "hid":
                 kernels = f"*:{vendor}:{product}.*".upper()
                 match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
+            elif driver.transport == "serial":  # and a modem's manager must not write to it
+                match = (
+                    f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", '
+                    f'ATTRS{{idProduct}}=="{product}", ENV{{ID_MM_DEVICE_IGNORE}}="1"'
+                )
             else:
                 match = (
                     'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", '

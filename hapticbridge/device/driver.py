@@ -53,8 +53,8 @@ class Driver:
         name: Name in ``open_device``.
         about: Description, in a few words.
         ids: Every product of the driver; empty for a device class.
-        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``service`` (the maker's background program)
-            or ``library`` (the maker's library).
+        transport: ``hid`` (hidapi), ``usb`` (pyusb), ``serial`` (pyserial), ``service`` (the
+            maker's background program), ``library`` (the maker's library) or ``view`` (the page).
         axes: Axes in words, because they may differ between units.
         force: Available force, in words.
         rate: Rate of reports, in words.
@@ -64,10 +64,12 @@ class Driver:
             hangs (``watchdog.ForceOffGuardian``); the device must allow two owners.
         options: Options of ``open``, with their types.
         open: Finds and opens the device; its arguments are the options and a receiver of messages.
-        usage: Usage page and usage of the HID collection with the protocol, if a product has
-            several; None if any fits.
+        usage: Usage page and usage of the HID collection with the protocol, by which a device of
+            any vendor is found; None if the ids alone tell it.
         find: Lists the connected devices if neither hidapi nor pyusb can.
         medium: Returns a sentence on whether the service or library is present.
+        first: Option that a value without a name sets, as in ``serial:/dev/ttyACM0``; empty if
+            every option is named.
         products: Description of the devices looked for, if USB ids do not describe them.
         recognises: Recognises a device class by its HID report descriptor; None for drivers with a
             list of products.
@@ -76,7 +78,7 @@ class Driver:
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Literal["hid", "usb", "service", "library"]
+    transport: Literal["hid", "usb", "serial", "service", "library", "view"]
     axes: str
     force: str
     rate: str
@@ -87,6 +89,7 @@ class Driver:
     usage: tuple[int, int] | None = None
     find: Callable[[], list[FoundDevice]] | None = None
     medium: Callable[[], str] | None = None
+    first: str = ""
     products: str = ""
     recognises: Callable[[bytes], bool] | None = None
 

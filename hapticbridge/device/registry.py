@@ -21,9 +21,11 @@ from hapticbridge.scene import Scene
 # Table of the hardware drivers; a driver is imported when one of its devices is opened
 
 DRIVERS = {
+    "mouse": "hapticbridge.device.mouse",
     "falcon": "hapticbridge.device.falcon.device",
     "spacemouse": "hapticbridge.device.spacemouse",
     "rawhid": "hapticbridge.device.rawhid.device",
+    "serial": "hapticbridge.device.rawhid.serial",
     "pid": "hapticbridge.device.pid.device",
     "haply": "hapticbridge.device.haply.device",
     "forcedimension": "hapticbridge.device.force_dimension.device",
@@ -48,16 +50,19 @@ def all_drivers() -> tuple[Driver, ...]:
 # Options of a device specification: ``name=value,name=value``
 
 
-def parsed(device: str, text: str, valid: Options) -> dict[str, object]:
+def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str, object]:
     """Parses the options after a device's name, separated by commas.
 
-    A ``Path`` takes all remaining text, commas included.
+    A ``Path`` takes all remaining text, commas included. If ``first`` names an option, the text may
+    begin with its value alone.
 
     Raises:
         DeviceError: A part is not ``name=value``, a name occurs twice or is unknown, or a value is
             not a number.
     """
     values: dict[str, object] = {}
+    if first and text and "=" not in text.partition(",")[0]:
+        text = f"{first}={text}"
     while text:
         name, equals, text = text.partition("=")
         name = name.strip()
@@ -114,10 +119,12 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
       the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All text after the colon is the file's name, with commas and colons.
+    - ``mouse``: a handle that is dragged in the view, ``mouse:speed=0.5``.
     - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
       options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
-      ``rawhid:serial=12345,damping=2``, ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``,
-      ``haply:serial=049D``, ``forcedimension:library=FILE``. ``serial`` selects one of several,
+      ``rawhid:serial=12345,damping=2``, ``serial:/dev/ttyACM0,baud=115200``,
+      ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``, ``haply:serial=049D``,
+      ``forcedimension:library=FILE``. ``serial`` selects one of several,
       ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
       profile of the unit or its model, or from ``profile=NAME`` (or a file, or ``none``).
 
@@ -141,7 +148,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     if (driver := driver_named(name)) is not None:
         valid: Options = {**driver.options, "profile": str}
         refuse_unknown(name, options, valid)
-        requested = {**options, **parsed(name, rest, valid)}
+        requested = {**options, **parsed(name, rest, valid, driver.first)}
         profile_option = requested.get("profile")
         if "profile" not in driver.options:
             requested.pop("profile", None)

@@ -69,8 +69,8 @@ class ForceOffGuardian:
     from a call runs no code of its own any more. The child holds a second handle to the device
     node. It writes the reports once it detects the closed pipe or a new parent, and if ``beat`` was
     not called for ``HANG`` while force was on. This requires a node that two processes can hold,
-    such as hidraw. A USB interface belongs to one process; there the device's own watchdog is the
-    only protection.
+    such as hidraw or a serial port. A USB interface belongs to one process; there the device's own
+    watchdog is the only protection.
 
     Beats are counted in checks of the child, not in time. A machine that is suspended, or frozen
     with all its processes, stops the checks too, and no force is ended by mistake. A loop that
@@ -151,6 +151,10 @@ class ForceOffGuardian:
             process.wait(PATIENCE)
 
 
+_SHARED_NODES = "/dev/hidraw", "/dev/tty", "/dev/pts/"
+"""Beginnings of the nodes that two processes can hold: raw HID, serial ports, pseudo-terminals."""
+
+
 def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
     """Starts a guardian with these reports, or returns None if only one process may hold the node.
 
@@ -158,7 +162,7 @@ def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
 
     Without it, the device's own watchdog or the limited duration of its effects ends the force.
     """
-    if not path.startswith("/dev/hidraw"):
+    if not path.startswith(_SHARED_NODES):
         return None
     try:
         return ForceOffGuardian(path, *reports)

@@ -232,7 +232,7 @@ LOST_GAIN = 0.05
 PRECISION = 0.2
 """Largest usable half-width of the mass, relative to its value, without unit."""
 
-MAX_STALE = 0.5
+MAX_STALE = 1 / 3
 """Largest share of ticks without a new sample, without unit. Beyond it the loop is too fast for the
 device."""
 

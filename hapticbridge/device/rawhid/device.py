@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from hapticbridge.device.rawhid.protocol import (
     force_frame,
     version_of,
 )
-from hapticbridge.device.transport.hid import HidApi, HidLink, opened
+from hapticbridge.device.transport.hid import HidApi, opened
 from hapticbridge.device.watchdog import (
     SHORTEST_WATCHDOG,
     ForceOffGuardian,
@@ -44,6 +44,23 @@ from hapticbridge.device.watchdog import (
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import canonical, quaternion_exp
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+
+
+class FrameLink(Protocol):
+    """Link that carries frames: a ``HidLink``, or a ``serial.SerialLink``."""
+
+    def take(self) -> list[bytes]:
+        """Returns the frames since the last call, oldest first, without waiting."""
+
+    def wait(self, timeout_ms: int) -> bytes:
+        """Returns the next frame; empty after ``timeout_ms``, >= 1."""
+
+    def write(self, report: bytes) -> None:
+        """Sends a frame after a byte 0, which hidapi requires for reports without a number."""
+
+    def close(self) -> None:
+        """Sends the remaining frame and releases the device."""
+
 
 # Data sheet of a raw HID device
 
@@ -59,7 +76,7 @@ CHANGES = tuple(name for name in Numbers._fields if name not in ("axes", "rate",
 """Numbers of the data sheet that the user may replace."""
 
 
-def request_sheet(link: HidLink, name: str) -> tuple[Numbers, str]:
+def request_sheet(link: FrameLink, name: str) -> tuple[Numbers, str]:
     """Requests both pages of a device's sheet.
 
     Raises:
@@ -71,7 +88,7 @@ def request_sheet(link: HidLink, name: str) -> tuple[Numbers, str]:
     return numbers, str(title)
 
 
-def _page(link: HidLink, name: str, page: int) -> Numbers | str:
+def _page(link: FrameLink, name: str, page: int) -> Numbers | str:
     for _ in range(ASKS):
         link.write(b"\0" + ask_frame(page, page))
         for report in reports(link, ASK_WAIT_MS):
@@ -88,7 +105,7 @@ def _page(link: HidLink, name: str, page: int) -> Numbers | str:
     )
 
 
-def reports(link: HidLink, timeout_ms: int) -> Iterator[bytes]:
+def reports(link: FrameLink, timeout_ms: int) -> Iterator[bytes]:
     """Yields reports as they come, for about ``timeout_ms``; a report counts as 1 ms."""
     left = timeout_ms
     while left > 0:
@@ -98,8 +115,18 @@ def reports(link: HidLink, timeout_ms: int) -> Iterator[bytes]:
             yield report
 
 
-def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any]) -> DeviceInfo:
+def data_sheet(
+    name: str,
+    numbers: Numbers,
+    title: str,
+    changes: dict[str, Any],
+    round_trip: float | None = None,
+) -> DeviceInfo:
     """Returns the data sheet from the device's numbers, its title and the user's changes.
+
+    The delay is the device's own plus ``round_trip``, the measured time in s from a written force
+    to the state that confirms it. A measured delay includes what the device does not report.
+    Without a measurement it is one period of the device and two polling intervals.
 
     Raises:
         DeviceError: A required number is missing, or one is out of range.
@@ -115,15 +142,13 @@ def data_sheet(name: str, numbers: Numbers, title: str, changes: dict[str, Any])
     must = [*_MUST_SAY, *["force_limit"] * moves, *["torque_limit"] * turns]
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
-    # the device's own delay, plus a state up to one of its periods old, plus the bus both ways
     delay = known.pop("delay")
     try:
-        return DeviceInfo(
-            name=title or name,
-            axes=axes,
-            delay=None if delay is None else delay + 1.0 / known["rate"] + 2.0 * POLLING,
-            **known,
-        )
+        if round_trip is not None:
+            delay = (delay or 0.0) + round_trip
+        elif delay is not None:
+            delay += 1.0 / known["rate"] + 2.0 * POLLING
+        return DeviceInfo(name=title or name, axes=axes, delay=delay, **known)
     except (DeviceError, ZeroDivisionError) as error:
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
@@ -196,6 +221,7 @@ class RawHidDevice:
         name: Name of the device in messages.
         changes: Numbers of the data sheet that replace those of the device.
         now: Returns the time of a monotonic clock in s.
+        round_trip: Measured delay of the link in s; None for USB's own.
 
     Attributes:
         info: Its data sheet.
@@ -210,15 +236,16 @@ class RawHidDevice:
 
     def __init__(
         self,
-        link: HidLink,
+        link: FrameLink,
         name: str,
         changes: Mapping[str, Any] | None = None,
         now: Callable[[], float] = time.monotonic,
+        round_trip: float | None = None,
     ) -> None:
         self._link, self._name, self._now = link, name, now
         self._sequence = 0
         self.states = StateStream(name)
-        self.info = data_sheet(name, *request_sheet(link, name), dict(changes or {}))
+        self.info = data_sheet(name, *request_sheet(link, name), dict(changes or {}), round_trip)
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
         self._sample = np.zeros(1, SAMPLE_DTYPE)
         self._watch = SilenceDetector(now())

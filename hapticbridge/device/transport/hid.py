@@ -75,12 +75,14 @@ def find(driver: Driver, api: HidApi | None = None) -> list[FoundDevice]:
         # hidapi lists a node once per top-level collection
         if path in found or driver.usage not in (None, usage):
             continue
-        if driver.recognises is None:
-            model = driver.model(vendor, product)
-        elif usage in CONTROLLERS and driver.recognises(report_descriptor(path, module)):
-            model = driver.about
-        else:
-            model = None
+        model = driver.model(vendor, product)
+        if driver.usage is not None:
+            model = model or driver.about  # the collection is the protocol's, whatever the vendor
+        elif driver.recognises is not None:
+            is_of_class = usage in CONTROLLERS and driver.recognises(
+                report_descriptor(path, module)
+            )
+            model = driver.about if is_of_class else None
         if model is None:
             continue
         is_node = api is None and path.startswith("/")

@@ -3,6 +3,7 @@
 //
 //   HbDevice device(sheet);
 //   device.receive(frame, now_us);              // any report from the host, 64 bytes
+//   device.receive_byte(byte, now_us);          // or, on a serial line, every byte from it
 //   if (device.answer(frame)) send(frame);      // the host has requested the data sheet
 //   device.state(motion, now_us, frame);        // once per period: its motion
 //   HbWrench wrench = device.wrench(now_us);    // wrench for the motors; call it often
@@ -100,6 +101,11 @@ class HbDevice {
   // damaged, of another version, or with a non-finite number changes no force.
   bool receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us);
 
+  // Takes one byte of a serial line, on which frames follow each other without a gap. Returns true at
+  // the end of a valid frame. If the 64 bytes from a magic byte on are not one, it searches the next
+  // magic byte among them; so a lost, doubled or damaged byte costs only the frames it touched.
+  bool receive_byte(uint8_t byte, uint32_t now_us);
+
   // Fills in the requested page of the sheet; returns false without a request.
   bool answer(uint8_t frame[HB_FRAME_BYTES]);
 
@@ -121,6 +127,8 @@ class HbDevice {
   uint16_t asked_sequence_;
   int16_t asked_page_;
   bool is_damaged_;
+  uint8_t fill_;                  // bytes in line_
+  uint8_t line_[HB_FRAME_BYTES];  // of a serial line, from a magic byte on
 };
 
 #endif
