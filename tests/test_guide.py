@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 import shlex
 import sys
@@ -168,3 +169,15 @@ def test_a_wrong_topic_is_one_sentence(call: Called, topic: str, advice: str) ->
     code, out, err = call("guide", topic)
     assert (code, out) == (2, "")
     assert advice in err
+
+
+def test_the_reference_of_the_site_names_classes_and_functions_that_exist() -> None:
+    script = ROOT / "scripts" / "build_docs.py"
+    spec = importlib.util.spec_from_file_location("build_docs", script)
+    assert spec is not None and spec.loader is not None
+    builder = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(builder)
+    for names in builder.INTERFACE.values():
+        for name in names:
+            module, _, member = f"hapticbridge.{name}".rpartition(".")
+            assert getattr(importlib.import_module(module), member).__doc__, name
