@@ -17,7 +17,7 @@ from hapticbridge.device.registry import all_drivers, driver_named, is_driver
 from hapticbridge.errors import DeviceError
 from hapticbridge.testing.device_contract import CONTRACT
 
-GUIDE = Path(hb.__file__).parent / "guide/your_own_device.md"
+GUIDE = Path(hb.__file__).parent / "guide/device_package.md"
 
 
 def blocks() -> dict[str, str]:

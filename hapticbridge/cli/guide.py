@@ -19,6 +19,7 @@ TOPICS = {
     "Tutorials": ("first-run", "own-scene", "own-device", "audit-in-ci"),
     "How to": (
         "devices",
+        "device-package",
         "coupling",
         "active-verdict",
         "missed-deadlines",

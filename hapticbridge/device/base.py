@@ -256,7 +256,7 @@ class Device(Protocol):
     a slow transport reads in a thread of its own, and ``read`` returns its newest sample.
 
     An object with these calls can be given to a ``Bridge``. A package of its own selects it by a
-    name (``guide/your_own_device.md``); ``testing.device_contract`` tests it.
+    name (``guide/device_package.md``); ``testing.device_contract`` tests it.
 
     A whole device, a handle on a rail in a hand that swings it::
 
