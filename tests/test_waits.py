@@ -58,10 +58,11 @@ REASONS = {
     "view/process.py: for line in stream": DAEMON,
     "view/process.py: stream.readline()": "the bridge's end closes it",
     "view/process.py: time.sleep(due - now)": "until the bridge closes its end, or is dead",
-    "view/controls.py: time.sleep(PACE)": DAEMON,
+    "view/controls.py: time.sleep(pace)": DAEMON,
     "view/window.py: stream.readline()": DAEMON,
     "view/window.py: stream.readline(LONGEST_LINE + 1)": DAEMON,
     "view/window.py: time.sleep(INTERVAL)": DAEMON,
+    "view/window.py: time.sleep(HAND_INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
     "film.py: lines.readline(LONGEST_LINE)": "a timer kills the process that draws",

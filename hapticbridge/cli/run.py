@@ -24,6 +24,7 @@ from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
+from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import (
     USUAL_ENERGY,
@@ -295,7 +296,8 @@ class Run:
     By default it is changed, with a line for each change."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
-    (CSV or recording), or a device from the list of 'hapticbridge devices'."""
+    (CSV or recording), 'mouse' (drag the handle in the view, which it shows by itself), or a device
+    from the list of 'hapticbridge devices'."""
     duration: float | None = None
     """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
     default the run ends with the device's motion, or with Ctrl-C."""
@@ -408,9 +410,10 @@ class Run:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
-        if self.port is not None and not self.view:
+        is_viewed = self.view or self.device.partition(":")[0] == "mouse"
+        if self.port is not None and not is_viewed:
             raise HapticBridgeError("--port without --view has no effect")
-        window = self._window() if self.view else None
+        window = self._window() if is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading and trying the scene …"):
@@ -471,6 +474,8 @@ class Run:
         )
         if window is not None:
             window.on_command = partial(bridge.command, by="view")
+            if isinstance(device, MouseDevice):
+                window.on_hand = device.aim
         if not self.as_json:
             announce(bridge.setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about a minute) …"):

@@ -53,8 +53,8 @@ def udev_rules() -> str:
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
     for driver in all_drivers():
-        if driver.transport in ("service", "library") and not driver.ids:
-            continue  # no node to open: a program of the maker's has it
+        if driver.transport in ("service", "library", "view") and not driver.ids:
+            continue  # no node to open: a program has it
         lines += ["", f"# {driver.name}: {driver.about}"]
         ids = driver.ids
         if driver.usage is not None or driver.recognises is not None or not ids:

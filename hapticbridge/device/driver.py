@@ -54,7 +54,7 @@ class Driver:
         about: Description, in a few words.
         ids: Every product of the driver; empty for a device class.
         transport: ``hid`` (hidapi), ``usb`` (pyusb), ``serial`` (pyserial), ``service`` (the
-            maker's background program) or ``library`` (the maker's library).
+            maker's background program), ``library`` (the maker's library) or ``view`` (the page).
         axes: Axes in words, because they may differ between units.
         force: Available force, in words.
         rate: Rate of reports, in words.
@@ -78,7 +78,7 @@ class Driver:
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Literal["hid", "usb", "serial", "service", "library"]
+    transport: Literal["hid", "usb", "serial", "service", "library", "view"]
     axes: str
     force: str
     rate: str

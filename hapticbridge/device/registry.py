@@ -21,6 +21,7 @@ from hapticbridge.scene import Scene
 # Table of the hardware drivers; a driver is imported when one of its devices is opened
 
 DRIVERS = {
+    "mouse": "hapticbridge.device.mouse",
     "falcon": "hapticbridge.device.falcon.device",
     "spacemouse": "hapticbridge.device.spacemouse",
     "rawhid": "hapticbridge.device.rawhid.device",
@@ -118,6 +119,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
       the file's name.
     - ``trajectory:FILE``: follows a CSV file (``read_motion``) or repeats the device motion of a
       recording. All text after the colon is the file's name, with commas and colons.
+    - ``mouse``: a handle that is dragged in the view, ``mouse:speed=0.5``.
     - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
       options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``serial:/dev/ttyACM0,baud=115200``,

@@ -11,10 +11,11 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import viser
 
 from hapticbridge.commands import Command, Couple, CouplingLimits, Mark, Reset, Switch
@@ -23,11 +24,21 @@ from hapticbridge.commands.command import Stop, line_of
 from hapticbridge.commands.execution import INTERVAL
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.device.mouse import REST, Pose, line_of_pose
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.pose import (
+    conjugate,
+    product,
+    quaternion_exp,
+    quaternion_of,
+    rotation_between,
+)
 from hapticbridge.rendering import RunCoupling
 from hapticbridge.run_description import method_of, parameters_of
 from hapticbridge.view.page import quoted
+from hapticbridge.view.window import HAND_INTERVAL
 
 PACE = 2.0 * INTERVAL
 """Smallest time in s between two commands to the bridge. At the bridge's own limit a delayed
@@ -74,7 +85,9 @@ def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
 
 
 class Outlet:
-    """Sends the page's commands to the bridge at a limited rate; of each kind only the newest.
+    """Sends the page's commands and its hand to the bridge at a limited rate.
+
+    Of each kind of command, and of the hand's poses, only the newest is sent.
 
     Args:
         file: Descriptor of the pipe to the bridge.
@@ -83,7 +96,14 @@ class Outlet:
     def __init__(self, file: int) -> None:
         self._file = file
         self._waiting: dict[str, Command] = {}
+        self._pose: Pose | None = None
         self._has_news = threading.Condition()
+
+    def drag(self, pose: Pose) -> None:
+        """Queues the hand's pose; never waits for the bridge."""
+        with self._has_news:
+            self._pose = pose
+            self._has_news.notify()
 
     def ask(self, command: Command) -> None:
         """Queues a command; never waits for the bridge."""
@@ -102,12 +122,18 @@ class Outlet:
         with contextlib.suppress(OSError):
             while True:
                 with self._has_news:
-                    self._has_news.wait_for(lambda: self._waiting)
-                    # a stop is sent first
-                    kind = "Stop" if "Stop" in self._waiting else next(iter(self._waiting))
-                    command = self._waiting.pop(kind)
-                os.write(self._file, line_of(command))
-                time.sleep(PACE)
+                    self._has_news.wait_for(lambda: self._waiting or self._pose)
+                    line, pace = self._next()
+                os.write(self._file, line)
+                time.sleep(pace)
+
+    def _next(self) -> tuple[bytes, float]:
+        """Returns the next line and the pause after it; a stop first, the hand last."""
+        if self._waiting:
+            kind = "Stop" if "Stop" in self._waiting else next(iter(self._waiting))
+            return line_of(self._waiting.pop(kind)), PACE
+        pose, self._pose = self._pose or REST, None
+        return line_of_pose(pose), HAND_INTERVAL
 
 
 class Sliders:
@@ -285,6 +311,60 @@ class Controls:
 
     def _show_switches(self) -> None:
         self._force.value, self._clutch.value = self._is_forced, self._is_clutched
+
+
+# Hand on the page, for the device ``mouse``
+
+SIZE = 0.35
+"""Size of the hand's arrows as a share of the scene's extent: beside the tool, within the
+picture."""
+
+
+def device_pose(
+    parameters: RunParameters, position: Sequence[float], quaternion: Sequence[float]
+) -> Pose:
+    """Returns the pose of the device that puts the handle at a pose in the scene.
+
+        p = p_0 + Aᵀ (h − h_0) / scale,    R = Aᵀ (R_h R_h0ᵀ) A R_0
+
+    the inverse of ``kernel.handle.handle_pose``.
+
+    Raises:
+        ValueError: The pose is not finite, or not three and four numbers.
+    """
+    handle = np.asarray(position, dtype=np.float64)
+    turned = np.asarray(quaternion, dtype=np.float64)
+    if handle.shape != (3,) or turned.shape != (4,) or not np.isfinite([*handle, *turned]).all():
+        raise ValueError("a pose is three and four finite numbers")
+    axes = np.reshape(parameters.axes, (3, 3))
+    start, origin = np.array(parameters.handle_origin), np.array(parameters.device_origin)
+    moved = axes.T @ (handle - start[:3]) / parameters.scale + origin[:3]
+    size = float(np.linalg.norm(turned))
+    turn = product(quaternion_of(turned / size), conjugate(quaternion_of(start[3:])))
+    x, y, z = (axes.T @ rotation_between((1.0, 0.0, 0.0, 0.0), turn)).tolist()
+    w, a, b, c = product(quaternion_exp((x, y, z)), quaternion_of(origin[3:]))
+    return float(moved[0]), float(moved[1]), float(moved[2]), w, a, b, c
+
+
+def add_hand(
+    server: viser.ViserServer,
+    parameters: RunParameters,
+    extent: float,
+    drag: Callable[[Pose], None],
+) -> None:
+    """Adds arrows and rings at the handle's start; ``drag`` is called as they are dragged."""
+    start = parameters.handle_origin
+    hand = server.scene.add_transform_controls(
+        "/hand", scale=SIZE * extent, depth_test=False, position=start[:3], wxyz=start[3:]
+    )
+    server.gui.add_markdown("drag the arrows at the tool: the hand follows, and feels nothing")
+
+    async def dragged(_: viser.TransformControlsEvent) -> None:  # in order, unlike threads
+        # a browser may send anything
+        with contextlib.suppress(ValueError, TypeError):
+            drag(device_pose(parameters, hand.position.tolist(), hand.wxyz.tolist()))
+
+    hand.on_update(dragged)
 
 
 def by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent[Any]], None]:

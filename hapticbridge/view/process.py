@@ -27,7 +27,7 @@ from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
-from hapticbridge.view.controls import Controls, Outlet, allowance_of
+from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
 from hapticbridge.view.page import Page, Sight, Trace, quoted
 from hapticbridge.view.server import serve
@@ -195,6 +195,8 @@ def run() -> None:
         outlet = Outlet(answers.fileno())
         page = Page(server, live.scenery, live.parameters, dict(run.meta))
         controls = Controls(server, allowance_of(run.meta), outlet.ask)
+        if job["has_hand"]:
+            add_hand(server, live.parameters, live.scenery.extent, outlet.drag)
         page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)

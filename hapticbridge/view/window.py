@@ -24,6 +24,7 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.commands import Command, command_of
 from hapticbridge.commands.command import LONGEST_LINE
 from hapticbridge.commands.execution import INTERVAL
+from hapticbridge.device.mouse import Pose, pose_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.recording import Attachment
 from hapticbridge.signals import deferring_stops
@@ -37,6 +38,10 @@ PATIENCE = 2.0
 START_PATIENCE = 60.0
 """Longest wait in s for the page to be served. The process imports for some seconds, and longer on
 a busy machine; a shorter wait would refuse a page there."""
+
+HAND_INTERVAL = 0.02
+"""Shortest time in s between two poses of the hand. A pose costs the loop a single store; 50 a
+second are more than a browser sends while its hand is dragged."""
 
 _LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?")
 
@@ -146,6 +151,8 @@ class Window:
 
     Attributes:
         address: Port and token of the page.
+        on_hand: Called from a thread with each pose, in the device's frame, to which the hand on
+            the page is dragged; None: the page has no hand.
         on_command: Called from a thread with each command of the page. It raises a
             ``CommandError`` to refuse one, and the page then shows the reason.
         url: Address to open in a browser, once the page is served.
@@ -162,6 +169,7 @@ class Window:
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
         self.on_command: Callable[[Command], None] | None = None
+        self.on_hand: Callable[[Pose], None] | None = None
 
     def start(
         self,
@@ -183,6 +191,7 @@ class Window:
             "attachments": [[name, len(data)] for name, data in files.items()],
             "port": self.address.port,
             "token": self.address.token,
+            "has_hand": self.on_hand is not None,
         }
         package = str(Path(__file__).resolve().parents[2])
         with deferring_stops():  # an interrupted caller would not have the process to end it
@@ -243,6 +252,10 @@ class Window:
             while line := stream.readline(LONGEST_LINE + 1):
                 if not line.endswith(b"\n"):
                     return  # longer than any command, so not from the process that was started
+                if self.on_hand is not None and (pose := pose_of_line(line)) is not None:
+                    self.on_hand(pose)
+                    time.sleep(HAND_INTERVAL)
+                    continue
                 try:
                     command = command_of(line)
                     if self.on_command is not None:
