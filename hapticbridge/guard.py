@@ -13,7 +13,7 @@ from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import AXES, Device, DeviceInfo
-from hapticbridge.device.registry import DRIVERS
+from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
@@ -246,7 +246,7 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
     """
     if isinstance(device, str):
         name = device.partition(":")[0]
-        is_bound = name in DRIVERS
+        is_bound = is_driver(name)
     else:
         name = device.name
         follows = device.is_prescribed and device.delay != 0.0 and device.duration is None

@@ -20,7 +20,8 @@ from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam, Timed
 from emulated.pid_layouts import ODD
 from emulated.pid_model import PidStick
-from emulated.rawhid_model import RawHid
+from emulated.rawhid_model import Claims, RawHid
+from emulated.serial_seam import SerialSeam, VirtualPort
 from emulated.spacemouse_model import SpaceMouse
 from hypothesis import given
 from hypothesis import strategies as st
@@ -37,13 +38,14 @@ from hapticbridge.device import (
     open_device,
 )
 from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.rawhid.device import open_rawhid
+from hapticbridge.device.rawhid.serial import open_serial
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-
-TICKS = 300
+from hapticbridge.record import TICK_DTYPE
+from hapticbridge.testing.device_contract import CONTRACT
 
 
 def written(path: Path) -> Path:
@@ -134,6 +136,23 @@ def force_dimension(kind: int) -> Device:
     return Ticking(build)
 
 
+def serial(_: Path) -> Device:
+    def build() -> tuple[Device, Timed]:
+        seam = SerialSeam(RawHid(SimulatedDevice(), Claims(rate=500.0)))
+        return open_serial({}, ignore_message, seam), VirtualPort(seam)
+
+    return Ticking(build)
+
+
+class Dragged(MouseDevice):
+    """A mouse that is dragged aside as soon as it is started."""
+
+    def start(self, period: float) -> NDArray[np.void]:
+        sample = super().start(period)
+        self.aim((0.02, 0.0, -0.01, 0.8, 0.0, 0.6, 0.0))
+        return sample
+
+
 DEVICES: dict[str, Callable[[Path], Device]] = {
     "simulated": lambda _: open_device("simulated"),
     "free": lambda _: open_device("simulated:hand=none,damping=0"),
@@ -145,6 +164,8 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "replay": replayed,
     "rawhid": lambda _: ticking(lambda: RawHid(SimulatedDevice()), open_rawhid),
     "paddle": lambda _: ticking(paddle, open_rawhid),
+    "serial": serial,
+    "mouse": lambda _: Dragged(),
     "spacemouse": lambda _: ticking(lambda: SpaceMouse(pushed), open_spacemouse),
     "new spacemouse": lambda _: ticking(
         lambda: SpaceMouse(pushed, has_long_reports=True), open_spacemouse
@@ -158,62 +179,79 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
 }
 
 
-@pytest.fixture(params=DEVICES, name="device")
-def _device(request: pytest.FixtureRequest, tmp_path: Path) -> Device:
-    return DEVICES[request.param](tmp_path)
+@pytest.mark.parametrize("name", DEVICES)
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_a_device_fulfils_the_contract(
+    check: Callable[[Device], None], name: str, tmp_path: Path
+) -> None:
+    check(DEVICES[name](tmp_path))
 
 
-def run(device: Device, seed: int) -> NDArray[np.void]:
-    wrenches = np.random.default_rng(seed).normal(size=(TICKS, 6)) * ([5.0] * 3 + [0.1] * 3)
-    samples = np.zeros(TICKS, SAMPLE_DTYPE)
-    device.start(PERIOD)
-    for k in range(TICKS):
-        device.read(samples[k : k + 1])
-        device.write(wrenches[k])
-    return samples
+class Crooked(SimulatedDevice):
+    """A device with one fault."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self.fault, self.starts, self.closings, self.reads = fault, 0, 0, 0
+        if fault == "prescribed":
+            self.info = dataclasses.replace(self.info, is_prescribed=True)
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        if self.fault == "period":
+            period = 1e-3
+        self.starts += 1
+        return super().start(period, parts)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if self.fault == "before" and not self.starts:
+            return 0
+        buttons = sample["buttons"].copy()
+        flags = super().read(sample)
+        self.reads += 1
+        if self.fault == "infinite" and self.reads == 200:
+            sample["position"][0, 1] = math.inf
+        if self.fault == "norm":
+            sample["quaternion"] *= 1.0 + 1e-9
+        if self.fault == "sign":
+            sample["quaternion"] *= -1.0
+        if self.fault == "still":
+            sample["position"] = 0.0
+        if self.fault == "unwritten":
+            sample["buttons"] = buttons
+        if self.fault == "again":
+            sample["position"][0, 0] += 1e-9 * self.starts
+        return flags
+
+    def close(self) -> None:
+        self.closings += 1
+        if self.fault == "close" and self.closings > 1:
+            raise DeviceError("closed twice")
+        super().close()
 
 
-def test_samples_are_finite_poses_with_unit_quaternions(device: Device) -> None:
-    samples = run(device, 1)
-    assert np.isfinite(samples["position"]).all()
-    norms = np.linalg.norm(samples["quaternion"], axis=1)
-    np.testing.assert_allclose(norms, 1.0, atol=1e-12)
-    assert (samples["quaternion"][:, 0] >= 0.0).all()
-    assert np.ptp(samples["position"], axis=0).max() > 0.0
-
-
-def test_a_read_overwrites_the_whole_sample(device: Device) -> None:
-    clean, dirty = np.zeros(1, SAMPLE_DTYPE), np.full(1, -7, SAMPLE_DTYPE)
-    device.start(PERIOD)
-    device.read(clean)
-    device.start(PERIOD)
-    device.read(dirty)
-    assert clean.tobytes() == dirty.tobytes()
-
-
-def test_starting_again_repeats_the_run_to_the_bit(device: Device) -> None:
-    if device.info.is_real:
-        pytest.skip("time goes on for what stands in somebody's hand")
-    first = run(device, 2)
-    run(device, 3)
-    assert run(device, 2).tobytes() == first.tobytes()
-
-
-def test_force_moves_a_device_unless_its_motion_is_prescribed(device: Device) -> None:
-    is_same = run(device, 4).tobytes() == run(device, 5).tobytes()
-    assert is_same == device.info.is_prescribed
-
-
-def test_the_data_sheet_survives_json(device: Device) -> None:
-    text = device.info.to_json()
-    assert DeviceInfo.from_json(text) == device.info
-    assert set(json.loads(text)) == {f.name for f in dataclasses.fields(DeviceInfo)}
-
-
-def test_closing_twice_is_allowed(device: Device) -> None:
-    device.start(PERIOD)
-    device.close()
-    device.close()
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("infinite", "a position is not finite"),
+        ("norm", "a quaternion has the norm 1.000000001"),
+        ("sign", "a quaternion has qw < 0; negate it"),
+        ("still", "the device did not move within 300 ticks"),
+        ("unwritten", "read() leaves 'buttons' unwritten"),
+        ("again", "a second run differs; start() must reset all"),
+        ("prescribed", "is_prescribed is True, but the wrench moved it"),
+        ("close", "closed twice"),
+        ("period", "start(0.0) must raise DeviceError"),
+        ("before", "read before start() must raise DeviceError"),
+    ],
+)
+def test_the_contract_names_what_a_device_breaks(fault: str, words: str) -> None:
+    broken = []
+    for check in CONTRACT:
+        try:
+            check(Crooked(fault))
+        except (AssertionError, DeviceError) as error:
+            broken.append(str(error))
+    assert words in broken
 
 
 @pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "stick"])
@@ -224,14 +262,6 @@ def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_pat
     for axis in (0, 1):
         with pytest.raises(DeviceError, match="that is not finite was not sent"):
             device.write(np.where(np.arange(6) == axis, value, 0.0))
-
-
-def test_an_impossible_period_and_a_read_before_the_start_are_refused(device: Device) -> None:
-    with pytest.raises(DeviceError, match="before it was started"):
-        device.read(np.zeros(1, SAMPLE_DTYPE))
-    for period in (0.0, -1e-3, math.nan, math.inf):
-        with pytest.raises(DeviceError, match=r"the loop's period = .*: must be a finite number"):
-            device.start(period)
 
 
 INFO = SimulatedDevice().info

@@ -255,9 +255,8 @@ class Device(Protocol):
     acts until the next write. No call may block the loop for longer than a fraction of the period:
     a slow transport reads in a thread of its own, and ``read`` returns its newest sample.
 
-    An object with these calls can be given to a ``Bridge``. To select it by a name, write a module
-    with a ``driver.Driver`` and add it to ``registry.DRIVERS``; ``tests/test_device_contract.py``
-    then tests it.
+    An object with these calls can be given to a ``Bridge``. A package of its own selects it by a
+    name (``guide/your_own_device.md``); ``testing.device_contract`` tests it.
 
     A whole device, a handle on a rail in a hand that swings it::
 

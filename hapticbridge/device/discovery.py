@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 from hapticbridge.device.driver import Driver, FoundDevice, UsbId
-from hapticbridge.device.registry import all_drivers
+from hapticbridge.device.registry import all_drivers, broken_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_search
 
@@ -35,7 +37,11 @@ def blind_spots() -> list[str]:
         spots.append(
             "libusb cannot be loaded, so USB devices cannot be opened: 'pip install libusb-package'"
         )
-    return spots
+    if find_spec("serial") is None:
+        spots.append(
+            "pyserial cannot be loaded, so serial ports are not seen: 'pip install pyserial'"
+        )
+    return spots + broken_drivers()
 
 
 def udev_rules() -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +36,73 @@ DRIVERS = {
 holds the ``Driver`` as ``DRIVER``."""
 
 
+GROUP = "hapticbridge.devices"
+"""Entry points by which other packages add drivers. The name is the device's, the object a
+``Driver`` of that name. A name of this package cannot be replaced."""
+
+
+def installed_drivers() -> dict[str, EntryPoint]:
+    """Returns the entry points of other packages by name, without importing them."""
+    found = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+    return {entry.name: entry for entry in found if not is_own(entry.name)}
+
+
+def is_own(name: str) -> bool:
+    """Returns whether a device's name is of this package."""
+    return name in DRIVERS or name in _OPENERS
+
+
+def is_driver(name: str) -> bool:
+    """Returns whether a name is that of a hardware driver, own or installed; imports none."""
+    return name in DRIVERS or (not is_own(name) and name in installed_drivers())
+
+
 def driver_named(name: str) -> Driver | None:
-    """Returns the driver that ``open_device`` knows by a name, or None."""
-    if name not in DRIVERS:
+    """Returns the driver that ``open_device`` knows by a name, or None.
+
+    Raises:
+        DeviceError: The driver is of another package, which cannot be imported or holds no
+            ``Driver`` of that name.
+    """
+    if name in DRIVERS:
+        driver: Driver = import_module(DRIVERS[name]).DRIVER
+        return driver
+    if is_own(name) or (entry := installed_drivers().get(name)) is None:
         return None
-    driver: Driver = import_module(DRIVERS[name]).DRIVER
-    return driver
+    package = entry.dist.name if entry.dist is not None else entry.module
+    try:
+        found = entry.load()
+    except Exception as error:
+        raise DeviceError(
+            f"the device '{name}' of the package {package} cannot be imported: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if not isinstance(found, Driver) or found.name != name:
+        raise DeviceError(
+            f"the package {package} names {entry.value} as the device '{name}'; it must be a "
+            "hapticbridge.device.driver.Driver of that name"
+        )
+    return found
 
 
 def all_drivers() -> tuple[Driver, ...]:
-    """Returns every driver; imports all drivers."""
-    return tuple(driver for name in DRIVERS if (driver := driver_named(name)) is not None)
+    """Returns every driver that can be imported, those of this package first; imports them."""
+    drivers = []
+    for name in (*DRIVERS, *installed_drivers()):
+        with suppress(DeviceError):  # broken_drivers() has the reason
+            drivers.append(driver_named(name))
+    return tuple(driver for driver in drivers if driver is not None)
+
+
+def broken_drivers() -> list[str]:
+    """Returns a sentence for each driver of another package that cannot be used."""
+    reasons = []
+    for name in installed_drivers():
+        try:
+            driver_named(name)
+        except DeviceError as error:
+            reasons.append(str(error))
+    return reasons
 
 
 # Options of a device specification: ``name=value,name=value``
@@ -164,7 +222,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
                 device.info = profile.fill(device.info)
         return device
     if name not in _OPENERS:
-        names = choices([*_OPENERS, *DRIVERS])
+        names = choices([*_OPENERS, *DRIVERS, *installed_drivers()])
         raise DeviceError(f"unknown device '{name}'; choose one of {names}")
     return _OPENERS[name](rest, options)
 

@@ -1,0 +1,109 @@
+"""Devices of other packages: the guide's template as it stands, and packages that are broken."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from cli_cases import Called
+
+import hapticbridge as hb
+from hapticbridge.device import Device, open_device
+from hapticbridge.device.discovery import blind_spots
+from hapticbridge.device.registry import all_drivers, driver_named, is_driver
+from hapticbridge.errors import DeviceError
+from hapticbridge.testing.device_contract import CONTRACT
+
+GUIDE = Path(hb.__file__).parent / "guide/your_own_device.md"
+
+
+def blocks() -> dict[str, str]:
+    """Returns the guide's files by name."""
+    text = GUIDE.read_text(encoding="utf-8")
+    return dict(re.findall(r"\n`([\w.]+)`[^\n]*:\n\n```\w+\n(.*?)```", text, re.DOTALL))
+
+
+def install(folder: Path, points: str, **modules: str) -> None:
+    """Writes a package as pip would have installed it."""
+    info = folder / "hapticbridge_rail-0.1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: hapticbridge-rail\nVersion: 0.1.0")
+    (info / "entry_points.txt").write_text(points)
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(text)
+
+
+@pytest.fixture(name="rail")
+def _rail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = blocks()
+    table = files["pyproject.toml"].partition('[project.entry-points."hapticbridge.devices"]\n')[2]
+    points = "[hapticbridge.devices]\n" + table.replace('"', "")
+    install(tmp_path, points, hapticbridge_rail=files["hapticbridge_rail.py"])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "hapticbridge_rail", raising=False)
+
+
+def test_the_template_is_a_page_long() -> None:
+    module = blocks()["hapticbridge_rail.py"]
+    assert 40 <= len([line for line in module.splitlines() if line]) <= 60
+
+
+@pytest.mark.usefixtures("rail")
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_template_fulfils_the_contract(check: Callable[[Device], None]) -> None:
+    check(open_device("rail"))
+
+
+@pytest.mark.usefixtures("rail")
+def test_the_template_is_listed_opened_and_run_by_its_name(call: Called) -> None:
+    code, out, _ = call("devices")
+    assert code == 0
+    assert "a handle on a rail" in out
+    assert open_device("rail:damping=3").info.damping == 3.0
+    with pytest.raises(DeviceError, match="unknown option 'colour' of the rail device; choose"):
+        open_device("rail:colour=red")
+    with pytest.raises(DeviceError, match=r"unknown device 'ral'; choose one of .*'rail'"):
+        open_device("ral")
+    with pytest.raises(DeviceError, match="'rail' moves in real time"):
+        hb.Bridge("point_mass", "rail", clock=hb.SimulatedClock())
+    names: dict[str, object] = {}
+    exec(blocks()["test_rail.py"], names)
+    assert "test_the_rail_fulfils_the_contract" in names
+
+
+@pytest.mark.parametrize(
+    ("value", "module", "words"),
+    [
+        ("broken:DRIVER", "1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
+        ("broken:DRIVER", "", "cannot be imported: AttributeError"),
+        ("missing:DRIVER", "", "cannot be imported: ModuleNotFoundError"),
+        ("broken:DRIVER", "DRIVER = 7", "names broken:DRIVER as the device 'rail'; it must be a"),
+    ],
+)
+def test_a_broken_package_costs_its_own_device_only(
+    call: Called,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    value: str,
+    module: str,
+    words: str,
+) -> None:
+    install(tmp_path, f"[hapticbridge.devices]\nrail = {value}\nmouse = {value}", broken=module)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken", raising=False)
+    with pytest.raises(DeviceError, match=f"the .*hapticbridge-rail.*{words}"):
+        open_device("rail")
+    assert [driver.name for driver in all_drivers()].count("mouse") == 1
+    assert [spot for spot in blind_spots() if words in spot]
+    code, out, err = call("devices")
+    assert code == 0
+    assert words.partition(":")[0] in " ".join((out + err).split())
+    assert open_device("mouse").info.name == "mouse"  # a name of ours is not replaced
+
+
+def test_without_other_packages_there_are_our_own_names_alone() -> None:
+    assert (driver_named("rail"), driver_named("simulated")) == (None, None)
+    assert [is_driver(name) for name in ("falcon", "simulated", "rail", "")] == [True] + [False] * 3
