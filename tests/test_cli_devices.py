@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from cli_cases import Called
 from emulated.hid_seam import HidSeam
 from emulated.pid_model import PidStick
+from emulated.rawhid_model import RawHid
 
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
@@ -24,6 +26,7 @@ from hapticbridge.device.driver import (
 )
 from hapticbridge.device.force_dimension.dhd import VARIABLE
 from hapticbridge.device.haply import device as haply
+from hapticbridge.device.rawhid import serial
 from hapticbridge.device.registry import all_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_bus
@@ -86,7 +89,7 @@ def test_a_spacenavigator_without_a_node_is_listed_with_the_module_it_wants(
     plug(bus, "1-1000", "256f:c654", name="CadMouse")
     code, out, _ = call("devices")
     assert code == 0
-    assert "spacemouse: SpaceNavigator (046d:c626) at /dev/bus/usb/001/003" in out
+    assert "not usable       SpaceNavigator (046d:c626) at /dev/bus/usb/001/003" in out
     assert "'sudo modprobe hid_logitech'" in out
     assert "CadMouse" not in out
     assert "Teensyduino RawHID" not in out  # it has a node: hidapi lists it, where it is there
@@ -99,6 +102,30 @@ def listed(problem: str | None, serial: str = "") -> FoundDevice:
     )  # fmt: skip
 
 
+def port(problem: str | None) -> FoundDevice:
+    return FoundDevice(
+        driver="serial", name="Arduino Uno", serial="A1", path="/dev/ttyACM0", vendor=0x2341,
+        product=0x43, transport="serial", problem=problem,
+    )  # fmt: skip
+
+
+def test_serial_ports_and_boards_of_any_vendor_get_a_rule_each(
+    bus: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seam = HidSeam(RawHid())
+    seam.plugged[0].vendor, seam.plugged[0].product = 0x303A, 0x4004
+    monkeypatch.setattr(hid_search, "hid_api", lambda: seam)
+    monkeypatch.setattr(serial.SystemPorts, "found", lambda _: [port(None), port(None)])
+    rules = [line for line in udev_rules().splitlines() if line.startswith("SUBSYSTEM")]
+    assert rules.count(
+        'SUBSYSTEM=="tty", ATTRS{idVendor}=="2341", ATTRS{idProduct}=="0043", '
+        'ENV{ID_MM_DEVICE_IGNORE}="1", TAG+="uaccess"'
+    ) == 1  # fmt: skip
+    for numbers in ("16C0:0486", "303A:4004"):
+        rule = f'SUBSYSTEM=="hidraw", KERNELS=="*:{numbers}.*", TAG+="uaccess"'
+        assert rules.count(rule) == 1
+
+
 @pytest.mark.parametrize(
     ("plugged", "words"),
     [
@@ -106,11 +133,15 @@ def listed(problem: str | None, serial: str = "") -> FoundDevice:
         ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A --force-limit 2\n"),
         (
             [listed(permission_problem("/dev/hidraw0"))],
-            "local users of the machine\nnext: hapticbridge devices",
+            "local users of the machine\n  next: hapticbridge devices",
         ),
         # no rule would help, and one of two can be used
         ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
         ([listed("no node")], "  not usable: no node\n"),
+        ([listed("no node")], "\nnext: hapticbridge run peg_in_hole --device mouse\n"),
+        ([], "\nnext: hapticbridge run peg_in_hole --device mouse\n"),
+        ([port(None)], "next: hapticbridge run peg_in_hole --device serial:/dev/ttyACM0 --force"),
+        ([port(None), listed(None)], "--device rawhid --force-limit 2\n"),
     ],
 )
 def test_it_says_what_to_do_next(
@@ -120,8 +151,24 @@ def test_it_says_what_to_do_next(
     code, out, _ = call("devices")
     assert code == 0
     assert words in out
-    assert ("udevadm" in out) is (RULES_COMMAND in (plugged[0].problem or ""))
-    assert f"rawhid: {plugged[0]}".replace("\x1b", "�") in out
+    is_refused = any(RULES_COMMAND in (device.problem or "") for device in plugged)
+    assert ("udevadm" in out) is is_refused
+    assert ("--device mouse" in out) is not (is_refused or any(d.problem is None for d in plugged))
+    rows = [line.split()[0] for line in out.splitlines() if line[0] != " "]
+    first = [device.driver for device in plugged]
+    assert rows[: len(first) + 4] == ["device", *first, "simulated", "trajectory", "mouse"]
+    for device in plugged:
+        assert f"{device} at {device.path}\n".replace("\x1b", "�") in out
+    assert f"permissions on Linux: {RULES_COMMAND} | sudo tee /etc/udev/rules.d/70-" in out
+    for head in ("to build one: ", "; firmware: ", "to add one by name: "):
+        path = re.split(r"[;\n]", out.partition(head)[2])[0]
+        assert Path(path).is_absolute()  # what a pip user has
+        assert Path(path).exists()
+    code, out, _ = call("devices", "--json")
+    told = [device["next"] for device in json.loads(out)["plugged"]]
+    assert [device.problem is None or RULES_COMMAND in device.problem for device in plugged] == [
+        bool(command) for command in told
+    ]
 
 
 def test_a_usb_device_is_listed_by_the_kernels_word_where_libusb_is_missing(bus: Path) -> None:

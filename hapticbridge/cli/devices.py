@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -20,7 +21,8 @@ from hapticbridge.errors import HapticBridgeError
 class Devices:
     """List the haptic devices plugged in and supported.
 
-    For a device that cannot be opened, says what is missing. Moves no motor.
+    Those plugged in come first, with the next command to type; for one that cannot be opened, says
+    what is missing. Moves no motor, and opens no serial port.
 
     Example:
         hapticbridge devices --udev-rules | sudo tee /etc/udev/rules.d/70-hapticbridge.rules
@@ -42,41 +44,91 @@ class Devices:
         if self.as_json:
             print_json(_facts(plugged, unseen))
             return 0
-        out.print("[bold]supported[/bold]")
-        for driver in all_drivers():
-            out.print(f"{driver.name}: {plain(driver.about)}")
-            out.print(f"  axes {driver.axes}; force on the hand {driver.force}; rate {driver.rate}")
-            for sentence in _standstill(driver):
-                out.print(f"  {plain(sentence)}")
-            if driver.medium is not None:
-                out.print(f"  {plain(driver.medium())}")
-        out.print("[bold]plugged in[/bold]")
+        drivers = all_drivers()
+        width = max(len(name) for name in ("simulated", *(driver.name for driver in drivers)))
+        _print_row("device", "state", "what it is", width)
         for device in plugged:
-            out.print(f"{device.driver}: {plain(str(device))} at {plain(device.path)}")
-            if device.problem:
-                out.print(f"  [yellow]not usable:[/yellow] {plain(device.problem)}")
-        if not plugged:
-            out.print("none; 'simulated' and 'trajectory:FILE' need none")
+            _print_plugged(device, plugged, drivers, width)
+        for name, about in _WITHOUT_HARDWARE:
+            _print_row(name, "ready", about, width)
+        for driver in drivers:
+            _print_supported(driver, plugged, width)
         for sentence in unseen:
             out.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
-        usable = [device for device in plugged if device.problem is None]
-        if any(RULES_COMMAND in (device.problem or "") for device in plugged):
-            out.print(
-                f"next: {RULES_COMMAND} | sudo tee {RULES_FILE}, "
-                "then sudo udevadm control --reload && sudo udevadm trigger"
-            )
-        elif usable:
-            specification = _specification(usable[0], plugged)
-            out.print(
-                f"next: hapticbridge run peg_in_hole --device {specification} --force-limit 2"
-            )
+        for document in sorted({driver.document for driver in drivers if driver.document}):
+            firmware = document.with_suffix("") / "firmware"
+            out.print(f"to build one: {plain(str(document))}; firmware: {plain(str(firmware))}")
+        out.print(f"to add one by name: {plain(str(GUIDE))}")
+        if any(driver.ids for driver in drivers):
+            out.print(f"permissions on Linux: {RULES_COMMAND} | sudo tee {RULES_FILE}")
+        if not any(_next(device, plugged) for device in plugged):
+            out.print(f"next: {RUN} mouse")
         return 0
 
 
-def _specification(first: FoundDevice, plugged: list[FoundDevice]) -> str:
-    """Returns what to type for a device; its serial where there are more like it."""
-    is_only = sum(device.driver == first.driver for device in plugged) == 1
-    return first.driver if is_only else f"{first.driver}:serial={first.serial or first.path}"
+RUN = "hapticbridge run peg_in_hole --device"
+"""Command to try a device with, without the device's name."""
+
+GUIDE = Path(__file__).parents[1] / "guide/your_own_device.md"
+
+_WITHOUT_HARDWARE = (
+    ("simulated", "a simulated device in the scene's own hand; the default"),
+    ("trajectory", "trajectory:FILE follows a CSV file, or repeats the motion of a recording"),
+)
+
+
+def _print_row(name: str, state: str, what: str, width: int) -> None:
+    out.print(f"[bold]{name:{width}}[/bold]  {state:15}  {plain(what)}")
+
+
+def _print_plugged(
+    device: FoundDevice, plugged: list[FoundDevice], drivers: tuple[Driver, ...], width: int
+) -> None:
+    state = "not usable" if device.problem else "plugged in"
+    _print_row(device.driver, state, f"{device} at {device.path}", width)
+    if device.problem:
+        out.print(f"  [yellow]not usable:[/yellow] {plain(device.problem)}")
+    elif device.transport == "serial":
+        out.print("  a serial port, not opened: a board of ours is recognised when it answers")
+    driver = next(driver for driver in drivers if driver.name == device.driver)
+    for sentence in () if device.problem else _standstill(driver):
+        out.print(f"  {plain(sentence)}")
+    if command := _next(device, plugged):
+        out.print(f"  next: {plain(command)}")
+
+
+def _print_supported(driver: Driver, plugged: list[FoundDevice], width: int) -> None:
+    facts = f"{driver.about}; axes {driver.axes}; force {driver.force}; rate {driver.rate}"
+    is_ready = driver.transport == "view"
+    is_plugged = any(device.driver == driver.name for device in plugged)
+    _print_row(
+        driver.name,
+        "ready" if is_ready else "see above" if is_plugged else "none plugged in",
+        facts,
+        width,
+    )
+    if driver.medium is not None:
+        out.print(f"  {plain(driver.medium())}")
+
+
+def _next(device: FoundDevice, plugged: list[FoundDevice]) -> str:
+    """Returns the command to type for a device; empty if its problem has another remedy."""
+    if device.problem is None:
+        return f"{RUN} {_specification(device, plugged)} --force-limit 2"
+    if RULES_COMMAND in device.problem:
+        return (
+            f"{RULES_COMMAND} | sudo tee {RULES_FILE}, "
+            "then sudo udevadm control --reload && sudo udevadm trigger"
+        )
+    return ""
+
+
+def _specification(device: FoundDevice, plugged: list[FoundDevice]) -> str:
+    """Returns what to type for a device: its port, or its serial where there are more like it."""
+    if device.transport == "serial":
+        return f"{device.driver}:{device.path}"
+    is_only = sum(other.driver == device.driver for other in plugged) == 1
+    return device.driver if is_only else f"{device.driver}:serial={device.serial or device.path}"
 
 
 def _standstill(driver: Driver) -> Iterator[str]:
@@ -100,10 +152,13 @@ def _facts(plugged: list[FoundDevice], unseen: list[str]) -> dict[str, Any]:
                 **{name: getattr(driver, name) for name in _FACTS},
                 "options": list(driver.options),
                 "medium": None if driver.medium is None else driver.medium(),
+                "document": str(driver.document) if driver.document else None,
                 "ids": [{"id": str(usb_id), "model": usb_id.model} for usb_id in driver.ids],
             }
             for driver in all_drivers()
         ],
-        "plugged": [asdict(device) for device in plugged],
+        "plugged": [
+            {**asdict(device), "next": _next(device, plugged) or None} for device in plugged
+        ],
         "warnings": unseen,
     }

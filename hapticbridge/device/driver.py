@@ -71,6 +71,8 @@ class Driver:
         first: Option that a value without a name sets, as in ``serial:/dev/ttyACM0``; empty if
             every option is named.
         products: Description of the devices looked for, if USB ids do not describe them.
+        document: File of this installation that says how to build the device; None if there is
+            nothing to build.
         recognises: Recognises a device class by its HID report descriptor; None for drivers with a
             list of products.
     """
@@ -90,6 +92,7 @@ class Driver:
     find: Callable[[], list[FoundDevice]] | None = None
     medium: Callable[[], str] | None = None
     first: str = ""
+    document: Path | None = None
     products: str = ""
     recognises: Callable[[bytes], bool] | None = None
 

@@ -20,6 +20,7 @@ from hapticbridge.device.base import (
 )
 from hapticbridge.device.driver import Driver, Notify, UsbId
 from hapticbridge.device.rawhid.protocol import (
+    DOCUMENT,
     LARGEST,
     LONGEST_WATCHDOG_MS,
     NAME_PAGE,
@@ -100,9 +101,7 @@ def _page(link: FrameLink, name: str, page: int) -> Numbers | str:
                     f"{name} speaks version {version} of the raw HID protocol; "
                     f"version {VERSION} is required, so update its firmware"
                 )
-    raise DeviceError(
-        f"{name} does not answer by the protocol hapticbridge/device/rawhid.md; check its firmware"
-    )
+    raise DeviceError(f"{name} does not answer by the protocol of {DOCUMENT}; check its firmware")
 
 
 def reports(link: FrameLink, timeout_ms: int) -> Iterator[bytes]:
@@ -406,7 +405,7 @@ def open_rawhid(
 
 DRIVER = Driver(
     name="rawhid",
-    about="home-made devices with the protocol hapticbridge/device/rawhid.md (as on Teensy)",
+    about="home-made devices with our open protocol over USB HID (as on Teensy)",
     ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
     transport="hid",
     axes="1 to 6, as built",
@@ -418,6 +417,7 @@ DRIVER = Driver(
     "to the protocol",
     has_guardian=True,
     usage=(0xFFAB, 0x0200),
+    document=DOCUMENT,
 )
 """Driver of home-made devices with Teensy's raw HID interface. Its second interface (usage page
 FFC9) is an emulated serial port."""

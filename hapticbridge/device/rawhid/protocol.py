@@ -6,12 +6,16 @@ import math
 import struct
 from binascii import crc_hqx
 from enum import IntEnum, IntFlag
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from hapticbridge.device.base import AXES
 from hapticbridge.device.driver import printable
+
+DOCUMENT = Path(__file__).parents[1] / "rawhid.md"
+"""Description of the protocol in this installation; the firmware is beside this module."""
 
 FRAME_BYTES = 64
 """Bytes per frame: the limit of a full-speed interrupt transfer and of Teensy's raw HID report."""

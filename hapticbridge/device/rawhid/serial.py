@@ -31,6 +31,7 @@ from hapticbridge.device.driver import (
 )
 from hapticbridge.device.rawhid.device import CHANGES, NO_WRENCH, RawHidDevice
 from hapticbridge.device.rawhid.protocol import (
+    DOCUMENT,
     NUMBERS_PAGE,
     FrameReader,
     State,
@@ -337,12 +338,12 @@ def connect(
         tried = " or ".join(f"{baud}" for baud in bauds)
         if link.received:
             raise DeviceError(
-                f"{plugged} at {plugged.path} sends bytes, but no frames of hapticbridge/device/"
-                f"rawhid.md at {tried} baud; set its own rate with baud=, or load the firmware"
+                f"{plugged} at {plugged.path} sends bytes, but no frames of {DOCUMENT} "
+                f"at {tried} baud; set its own rate with baud=, or load the firmware"
             )
         raise DeviceError(
             f"{plugged} at {plugged.path} is silent at {tried} baud; load the firmware of "
-            "hapticbridge/device/rawhid.md, or check power and cable"
+            f"{DOCUMENT.parent / 'rawhid' / 'firmware'}, or check power and cable"
         )
 
 
@@ -464,8 +465,7 @@ def find() -> list[FoundDevice]:
 
 DRIVER = Driver(
     name="serial",
-    about="home-made devices with the protocol hapticbridge/device/rawhid.md on a serial port "
-    "(Hapkit, Arduino, ESP32)",
+    about="home-made devices with our open protocol on a serial port (Hapkit, Arduino, ESP32)",
     ids=(),
     transport="serial",
     axes="1 to 6, as built",
@@ -484,6 +484,7 @@ DRIVER = Driver(
     has_guardian=True,
     find=find,
     first="port",
+    document=DOCUMENT,
     products="a serial port on USB",
 )
 """Driver of home-made devices on a serial port."""
