@@ -160,7 +160,8 @@ def test_it_says_what_to_do_next(
     for device in plugged:
         assert f"{device} at {device.path}\n".replace("\x1b", "�") in out
     assert f"permissions on Linux: {RULES_COMMAND} | sudo tee /etc/udev/rules.d/70-" in out
-    for head in ("to build one: ", "; firmware: ", "to add one by name: "):
+    assert "to add one by name: hapticbridge guide device-package\n" in out
+    for head in ("to build one: ", "; firmware: "):
         path = re.split(r"[;\n]", out.partition(head)[2])[0]
         assert Path(path).is_absolute()  # what a pip user has
         assert Path(path).exists()

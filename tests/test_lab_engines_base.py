@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from engine_tasks import COUPLING
 
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
+from hapticbridge.files import install_command
 from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.base import (
     ENGINES,
@@ -248,7 +250,8 @@ def test_an_engine_that_is_not_there_names_what_to_install(monkeypatch: pytest.M
         raise ImportError("No module named 'pydrake'")
 
     monkeypatch.setattr(base, "import_module", missing)
-    with pytest.raises(StudyError, match=r"'drake_point' is not installed .*hapticbridge\[peers\]"):
+    hint = re.escape(install_command("peers"))
+    with pytest.raises(StudyError, match=rf"'drake_point' is not installed .*{hint}"):
         open_engine("drake_point")
     with pytest.raises(StudyError, match=r"no engine 'havok'; engines: 'drake_hydroelastic'"):
         open_engine("havok")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -58,7 +57,7 @@ class Devices:
         for document in sorted({driver.document for driver in drivers if driver.document}):
             firmware = document.with_suffix("") / "firmware"
             out.print(f"to build one: {plain(str(document))}; firmware: {plain(str(firmware))}")
-        out.print(f"to add one by name: {plain(str(GUIDE))}")
+        out.print("to add one by name: hapticbridge guide device-package")
         if any(driver.ids for driver in drivers):
             out.print(f"permissions on Linux: {RULES_COMMAND} | sudo tee {RULES_FILE}")
         if not any(_next(device, plugged) for device in plugged):
@@ -69,7 +68,6 @@ class Devices:
 RUN = "hapticbridge run peg_in_hole --device"
 """Command to try a device with, without the device's name."""
 
-GUIDE = Path(__file__).parents[1] / "guide/your_own_device.md"
 
 _WITHOUT_HARDWARE = (
     ("simulated", "a simulated device in the scene's own hand; the default"),
