@@ -204,17 +204,17 @@ class SerialLink:
         """
         before = self.received
         self._receive()
-        if self.received - before >= FULL and (fresh := self._next(FRESH_MS)):
-            self._waiting.append(fresh)
+        if self.received - before >= FULL:
+            self._await_news(FRESH_MS)
         frames = list(self._waiting)
         self._waiting.clear()
         return frames
 
     def wait(self, timeout_ms: int) -> bytes:
         """Returns the next frame; empty after ``timeout_ms``, >= 1."""
-        if self._waiting:
-            return self._waiting.popleft()
-        return self._next(timeout_ms)
+        if not self._waiting:
+            self._await_news(timeout_ms)
+        return self._waiting.popleft() if self._waiting else b""
 
     def write(self, report: bytes) -> None:
         """Sends a frame after a byte 0, which is not sent; it replaces an unsent one.
@@ -242,17 +242,13 @@ class SerialLink:
                 self._port.close()
             self._log.close()
 
-    def _next(self, timeout_ms: int) -> bytes:
-        """Waits for a frame newer than those that wait, and returns the first."""
+    def _await_news(self, timeout_ms: int) -> None:
+        """Waits until a frame joins those that wait, or the time is over."""
         end, count = self._ports.now() + 1e-3 * timeout_ms, len(self._waiting)
         while True:
             self._receive()
-            if len(self._waiting) > count:
-                frame = self._waiting[count]
-                del self._waiting[count]
-                return frame
-            if self._ports.now() >= end:
-                return b""
+            if len(self._waiting) > count or self._ports.now() >= end:
+                return
             self._ports.sleep(PAUSE)
 
     def _receive(self) -> None:
