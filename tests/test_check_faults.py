@@ -424,3 +424,44 @@ def test_missing_folder_is_told(tmp_path: Path, option: str, ending: str, capsys
     assert main(["check", "peg_in_hole", f"--{option}", str(target)]) == USAGE_ERROR
     said = capsys.readouterr()
     assert ("its folder does not exist" in said.err, said.out) == (True, "")
+
+
+HINGE = """<body name="tool"><joint name="turn" axis="0 1 0" range="{}"/>
+  <geom size="0.01" pos="0.05 0 0" mass="0.1"/><site name="grip" pos="0.05 0 0"/></body>"""
+
+
+@pytest.mark.parametrize(
+    ("unit", "limits", "words"),
+    [
+        ("degree", "-0.78 0.78", "turns from -0.78 to 0.78 degrees; are these radians?"),
+        ("degree", "-45 45", None),
+        ("degree", "-2 2", None),
+        (
+            "radian",
+            "-45 45",
+            "turns from -45 to 45 radians, which is 7.16 turns; are these degrees?",
+        ),
+        ("radian", "-0.78 0.78", None),
+        ("radian", "-0.01 0.01", None),
+        ("radian", "-12.6 12.6", None),
+    ],
+)
+def test_an_angle_in_the_wrong_unit_is_told(
+    tmp_path: Path, unit: str, limits: str, words: str | None
+) -> None:
+    compiler = f'<compiler angle="{unit}"/>'
+    text = mjcf(compiler, GOOD_OPTION, GOOD_CONTACT, body=HINGE.format(limits))
+    told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "angle unit"]
+    assert [fault.sentence for fault in told] == ([f"joint 'turn' {words}"] if words else [])
+
+
+@pytest.mark.parametrize(("gain", "is_told"), [(0.0, True), (1.0, True), (100.0, False)])
+def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_told: bool) -> None:
+    servo = f'<actuator><position joint="turn" kp="{gain}"/></actuator>' if gain else ""
+    body = HINGE.format("-90 90").replace('mass="0.1"', 'mass="0.8"')
+    text = mjcf(HEAVY, GOOD_CONTACT, servo, body=body)
+    told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "heavy tool"]
+    assert bool(told) == is_told
+    if told:  # the moment about the hinge: m g r = (K r² + K_r + k) sag / r
+        sag = 0.8 * 9.81 * 0.05**2 / (2400 * 0.05**2 + 2.4 + gain)
+        assert length(sag) in told[0].sentence

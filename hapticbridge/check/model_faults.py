@@ -186,6 +186,14 @@ LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
 """Length in m and mass in kg above which no hand holds a tool, so that wrong units are
 suspected."""
 
+NARROWEST_RANGE = np.radians(np.pi)
+"""Range of a hinge in rad up to which radians read as degrees are suspected: ±π/2 written so. A
+hinge that truly turns less is rarely given limits."""
+
+WIDEST_TURN = 8 * np.pi
+"""Limit of a hinge in rad beyond which degrees read as radians are suspected: four turns to a side,
+more than any hand makes."""
+
 DEEPEST_DENT = 0.02
 """Depth of a mesh's dent below its convex hull, relative to the mesh's largest extent, without
 unit. Rounding of vertices and facets stays far below it."""
@@ -202,6 +210,7 @@ _SMALLEST_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
 def geometry_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields faults of sizes and shapes."""
     yield from _units(case)
+    yield from _angles(case)
     yield from _dented_meshes(case)
     yield from _far_grip(case)
     yield from _workspace(case)
@@ -234,6 +243,33 @@ def _units(case: SceneUnderCheck) -> Iterator[Fault]:
         "kg",
         change,
     )
+
+
+def _angles(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Finds ranges of hinges whose unit is not that of the compiler."""
+    model, is_degree = case.model, bool(case.source.spec.compiler.degree)
+    for joint in range(model.njnt):
+        is_hinge = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+        if not is_hinge or not model.jnt_limited[joint]:
+            continue
+        low, high = (float(limit) for limit in model.jnt_range[joint])
+        place = case.places.joint(joint)
+        if is_degree and high - low <= NARROWEST_RANGE:
+            written = f"{number(np.degrees(low))} to {number(np.degrees(high))}"
+            yield Fault(
+                "angle unit",
+                place,
+                f"{place.element} turns from {written} degrees; are these radians?",
+                '<compiler angle="radian"/> in <mujoco>',
+            )
+        elif not is_degree and max(abs(low), abs(high)) > WIDEST_TURN:
+            yield Fault(
+                "angle unit",
+                place,
+                f"{place.element} turns from {number(low)} to {number(high)} radians, which is "
+                f"{number(max(abs(low), abs(high)) / (2 * np.pi))} turns; are these degrees?",
+                'a range in radians, or <compiler angle="degree"/> in <mujoco>',
+            )
 
 
 def _dented_meshes(case: SceneUnderCheck) -> Iterator[Fault]:
@@ -296,6 +332,8 @@ def _far_grip(case: SceneUnderCheck) -> Iterator[Fault]:
     site = model.site(scene.grip).id
     tool_bodies, body = _tool_bodies(case), int(model.site_bodyid[site])
     mass = model.body_mass[tool_bodies]
+    if not mass.sum() > 0:  # it has no centre, and another fault says so
+        return
     centre = mass @ scene.data.xipos[tool_bodies] / mass.sum()
     grip = scene.data.site_xpos[site]
     distance = float(np.linalg.norm(grip - centre))
@@ -303,7 +341,8 @@ def _far_grip(case: SceneUnderCheck) -> Iterator[Fault]:
     if distance <= FARTHEST_GRIP * extent:
         return
     rotation = scene.data.xmat[body].reshape(3, 3)
-    local = " ".join(f"{v:.4g}" for v in rotation.T @ (centre - scene.data.xpos[body]))
+    offset = np.round(rotation.T @ (centre - scene.data.xpos[body]), 6) + 0.0  # no -0
+    local = " ".join(f"{v:.4g}" for v in offset)
     place = case.places.site(site)
     yield Fault(
         "far grip",
@@ -476,7 +515,7 @@ def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
 
 
 def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
-    """Computes the tool's sag below the handle: (JᵀKJ + K_joints) δq = its weight."""
+    """Computes the tool's sag below the handle: (JᵀKJ + K_joints + K_servos) δq = its weight."""
     model, scene = case.model, case.scene
     scene.reset()
     data, site = scene.data, model.site(scene.grip).id
@@ -494,6 +533,11 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     for joint in range(model.njnt):
         if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
             springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
+    for actuator in range(model.nactuator):  # a position servo holds its joint like a spring
+        if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+            joint = int(model.actuator_trnid[actuator, 0])
+            gain = max(-float(model.actuator_biasprm[actuator, 1]), 0.0)
+            springs[model.jnt_dofadr[joint]] += gain * float(model.actuator_gear[actuator, 0]) ** 2
     tool_jacobian = jacobian[:, dofs]
     stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
     pulls = (data.qfrc_gravcomp - bias)[dofs]
