@@ -126,6 +126,13 @@ def test_serial_ports_and_boards_of_any_vendor_get_a_rule_each(
         assert rules.count(rule) == 1
 
 
+def test_every_product_of_a_vendor_with_a_library_has_a_permission(bus: Path) -> None:
+    rules = [line for line in udev_rules().splitlines() if "1451" in line and line[0] != "#"]
+    assert rules == [
+        'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", ATTR{idVendor}=="1451", TAG+="uaccess"'
+    ]
+
+
 @pytest.mark.parametrize(
     ("plugged", "words"),
     [

@@ -44,6 +44,9 @@ def blind_spots() -> list[str]:
     return spots + broken_drivers()
 
 
+_USB_DEVICE = 'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device"'
+
+
 def udev_rules() -> str:
     """Returns the udev rules that let a local user open these devices.
 
@@ -59,9 +62,12 @@ def udev_rules() -> str:
         "#   sudo udevadm control --reload && sudo udevadm trigger",
     ]
     for driver in all_drivers():
-        if driver.transport in ("service", "library", "view") and not driver.ids:
+        if driver.transport in ("service", "library", "view") and not (driver.ids or driver.vendor):
             continue  # no node to open: a program has it
         lines += ["", f"# {driver.name}: {driver.about}"]
+        if driver.vendor is not None:
+            lines.append(f'{_USB_DEVICE}, ATTR{{idVendor}}=="{driver.vendor:04x}", TAG+="uaccess"')
+            continue
         ids = driver.ids
         if driver.usage is not None or driver.recognises is not None or not ids:
             listed = {(one.vendor, one.product) for one in ids}
@@ -81,8 +87,7 @@ def udev_rules() -> str:
                 )
             else:
                 match = (
-                    'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", '
-                    f'ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
+                    f'{_USB_DEVICE}, ATTR{{idVendor}}=="{vendor}", ATTR{{idProduct}}=="{product}"'
                 )
             lines += [f"# {usb_id.model}", f'{match}, TAG+="uaccess"']
     return "\n".join(lines) + "\n"

@@ -75,6 +75,8 @@ class Driver:
             nothing to build.
         recognises: Recognises a device class by its HID report descriptor; None for drivers with a
             list of products.
+        vendor: USB vendor whose products a library opens, known by id or not; the udev rule then
+            names no product. None for drivers with a list of products.
     """
 
     name: str
@@ -95,6 +97,7 @@ class Driver:
     document: Path | None = None
     products: str = ""
     recognises: Callable[[bytes], bool] | None = None
+    vendor: int | None = None
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model with these ids, or None if it is not of the driver."""

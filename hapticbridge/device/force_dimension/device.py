@@ -306,6 +306,7 @@ DRIVER = Driver(
     name="forcedimension",
     about="Force Dimension omega, delta, sigma and lambda through the maker's library (DHD)",
     ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
+    vendor=0x1451,
     transport="library",
     axes="x, y, z; with rx, ry, rz where the wrist has motors",
     force="the library's limit, else 12 N (omega, sigma, lambda) or 20 N (delta)",
@@ -318,5 +319,5 @@ DRIVER = Driver(
     medium=medium,
     products="a device of Force Dimension's library",
 )
-"""Driver of Force Dimension's devices. Not all of their USB ids are known, so the library finds
-them."""
+"""Driver of Force Dimension's devices. Not all of their USB products are known, so the library
+finds them, and the udev rule is for the vendor as a whole."""
