@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import re
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
+from chromium import browser
 from cli_cases import Called
 from view_cases import pressed_floor
 
@@ -20,6 +26,7 @@ from hapticbridge.view.window import Address
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
+import msgspec
 from page_client import PATIENCE, hand, said
 
 from hapticbridge.view.replay import Replay, Theatre
@@ -111,3 +118,70 @@ def test_without_the_extra_a_sentence_says_how_to_get_it(
         code, _, err = call(*command)
         assert code == 2
         assert install_command("view") in err
+
+
+def embedded(page: str) -> dict[str, Any]:
+    """Returns what a saved page holds: its duration and the messages that move the scene."""
+    found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
+    assert found is not None
+    packed = base64.b64decode(found[1])
+    size = int.from_bytes(packed[:8], "little")
+    plain = zstandard.ZstdDecompressor().decompress(packed[8:], max_output_size=size)
+    length = int.from_bytes(plain[:8], "little")
+    held: dict[str, Any] = msgspec.msgpack.decode(plain[8 : 8 + length])
+    return held
+
+
+def test_a_saved_page_holds_the_whole_run(replay: Replay, call: Called, tmp_path: Path) -> None:
+    page = tmp_path / "run.html"
+    code, out, _ = call("view", replay.recording.path, "--save", page)
+    assert code == 0
+    assert f"wrote {page}" in out
+    held = embedded(page.read_text(encoding="utf-8"))
+    assert held["durationSeconds"] == pytest.approx(len(replay.sights) * replay.step)
+    # the tool's body is at the recorded place at the time that the page has reached
+    ball = Stage(replay.recording).model.body("ball").id
+    moves = [
+        (time, message["position"])
+        for time, message in held["messages"]
+        if (message["type"], message.get("name")) == ("SetPositionMessage", f"/body{ball}")
+    ]
+    assert len(moves) > 10
+    for time, position in moves:
+        np.testing.assert_allclose(position, replay.at(time).places[ball], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("run.png", "must end in .html"),
+        ("mine.html", "exists; choose another file or add --overwrite"),
+        ("no/such.html", "its folder does not exist"),
+    ],
+)
+def test_a_page_that_cannot_be_saved_is_refused_before_the_run_is_simulated(
+    replay: Replay,
+    call: Called,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    sentence: str,
+) -> None:
+    (tmp_path / "mine.html").write_text("mine", encoding="utf-8")
+    monkeypatch.setattr("hapticbridge.view.replay.Replay", pytest.fail)
+    code, _, err = call("view", replay.recording.path, "--save", tmp_path / name)
+    assert code == 2
+    assert sentence in " ".join(err.split())
+    assert (tmp_path / "mine.html").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_browser_plays_a_saved_page_without_a_request(replay: Replay, tmp_path: Path) -> None:
+    page = tmp_path / "run.html"
+    with served(replay, Address(0)) as (theatre, _):
+        page.write_text(theatre.page(), encoding="utf-8")
+    with browser(tmp_path) as tab:
+        shown = tab()
+        shown.open(page.as_uri())
+        shown.wait_for("document.querySelector('canvas') !== null")
+        asked = [each for each in shown.requests if not each.startswith(("data:", "blob:"))]
+        assert asked == [page.as_uri()]

@@ -12,6 +12,7 @@ import tyro
 
 from hapticbridge.cli.terminal import err, notify, out, plain, progress
 from hapticbridge.errors import RecordingError
+from hapticbridge.files import atomic_write
 from hapticbridge.film import Shot, draw
 from hapticbridge.recording import read_recording
 from hapticbridge.view import Address
@@ -23,10 +24,12 @@ class View:
     """Show a recorded run in a browser.
 
     The page has the scene, the coupling, curves and a slider for the time. It is there until
-    Ctrl-C. Needs the extra 'view'.
+    Ctrl-C. Needs the extra 'view'. With --save it is written to one file that plays the run in any
+    browser, to send to others.
 
-    Example:
+    Examples:
         hapticbridge view run.mcap
+        hapticbridge view run.mcap --save run.html
     """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
@@ -34,6 +37,10 @@ class View:
     port: int = 8080
     """Port on this machine, where only the printed address gets in; 0: any that is free. From
     another machine: ssh -L 8080:localhost:8080 MACHINE, then open the printed address there."""
+    save: Path | None = None
+    """Write the scene in motion to this page (.html) and end; it needs no server and no network."""
+    overwrite: bool = False
+    """Replace the page of --save if the file exists."""
 
     in_process: bool = False
     """Simulate in this process, for a recording of a known origin: without the child process whose
@@ -42,17 +49,33 @@ class View:
     def execute(self) -> int:
         """Serves the page; returns the exit code."""
         check_view()
-        address = Address(self.port)
+        if self.save is not None:
+            self._check_page(self.save)
+        address = Address(0 if self.save is not None else self.port)
         from hapticbridge.view.replay import Replay, Theatre  # noqa: PLC0415 - of an extra
 
         with progress("simulating again") as show:
             replay = Replay(self.file, show, in_process=self.in_process)
         theatre = Theatre(replay, address)
+        if self.save is not None:
+            with err.status("writing …"), atomic_write(self.save) as draft:
+                draft.write_text(theatre.page(), encoding="utf-8")
+            theatre.close()
+            out.print(f"wrote {plain(str(self.save))}")
+            return 0
         notify(f"view: {theatre.url}")
         with contextlib.suppress(KeyboardInterrupt):
             theatre.play(threading.Event())
         theatre.close()
         return 0
+
+    def _check_page(self, path: Path) -> None:
+        if path.suffix.lower() != ".html":
+            raise RecordingError(f"--save is '{path}'; the page must end in .html")
+        if path.exists() and not self.overwrite:
+            raise RecordingError(f"'{path}' exists; choose another file or add --overwrite")
+        if not path.absolute().parent.is_dir():
+            raise RecordingError(f"'{path}' cannot be written: its folder does not exist")
 
 
 @dataclass(frozen=True, slots=True)

@@ -162,6 +162,19 @@ class Theatre:
         self._page.show(sight)
         self._page.status.content = f"**{sight.time:.3f} s**, {self._page.forces(sight)}"
 
+    def page(self) -> str:
+        """Returns a page that plays the run by itself: one document without a server.
+
+        It has the scene, the coupling and the arrows; curves and texts need the server.
+        """
+        self.show(0.0)
+        film = self._server.get_scene_serializer()
+        for sight in self._replay.sights[1:]:
+            film.insert_sleep(self._replay.step)
+            self.show(sight.time)
+        film.insert_sleep(self._replay.step)
+        return str(film.as_html())
+
     def play(self, is_over: threading.Event) -> None:
         """Moves the slider with the time while playback is on, until the server is closed."""
         before = time.monotonic()
