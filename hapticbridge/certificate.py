@@ -43,7 +43,7 @@ def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
         fresh: Number of ticks with a new sample.
         due: Number of deadlines.
     """
-    owed = due * period / device_period(info, period)
+    owed = due * (period / device_period(info, period))
     return min(fresh / owed, 1.0) if owed else 1.0
 
 

@@ -250,7 +250,7 @@ class RunCoupling:
             law = method.law_coupling(requested, timestep)
         adds, remark = method.added_share, ""
         if is_always_implicit and method.scheme == Scheme.MIDPOINT:
-            adds, remark = IMPLICIT_SHARE, f"{method.name} is always implicit here"
+            adds, remark = IMPLICIT_SHARE, "implicit in each tick, because the tool is never free"
         if adds is None:
             return cls(requested, law, None)
         effective = replace(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal
@@ -23,8 +25,9 @@ from hapticbridge.kernel.codes import Scheme, coupling_ids
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
-from hapticbridge.rendering import Method, RunCoupling
+from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
 from hapticbridge.timekeeping import RunTimes, Timekeeping
+from hapticbridge.units import format_energy, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
 
@@ -154,6 +157,12 @@ class RunOutcome:
     is_realtime: bool
 
 
+WELD = "the weld in its stiffest directions at the start"
+"""Words for what the stiffness and damping of a run without a coupling law are those of."""
+
+_NAME_WIDTH = 20
+"""Characters of a row's name in the text of a summary, with the space after it."""
+
 _PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
 
 
@@ -196,6 +205,7 @@ class Summary:
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
+        has_hand: True if the device gives its force to a hand; a prescribed motion does not.
     """
 
     ticks: int
@@ -222,6 +232,67 @@ class Summary:
     stopped_by: str
     recording: Path | None
     reach: float | None
+    has_hand: bool
+
+    def __str__(self) -> str:
+        """Describes the run: energies, verdict, coupling, device condition and the next command."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        for name, text in self._rows():
+            yield f"{name:<{_NAME_WIDTH}}{text}"
+        tick, port = self.fault or (0, "")
+        used = f", {self.slack_share:.0%} of the slack used" if self.slack_share else ""
+        since = f", from tick {tick} on" if port else ""
+        judged = "" if port else "environment "  # the device has a line of its own
+        yield f"{judged}{self.verdict} ({port or self.environment}){since}{used}"
+        if self.method != default_method().name:
+            yield f"method {self.method}: {self.about}"
+        sentences = self.coupling.sentences()
+        if self.coupling.law is not None:
+            yield sentences[0]
+        else:
+            of = f": {WELD}" if self.coupling.effective else ""
+            yield from (f"{sentence}{of}" for sentence in sentences)
+        yield from self._device_lines()
+        if hint := self.timekeeping.hint:
+            yield hint
+        if self.recording is not None:
+            yield f"next: hapticbridge audit {shlex.quote(str(self.recording))}"
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        """Yields name and text of what was counted and measured."""
+        yield "ran", f"{self.duration:.3f} s, {self.ticks} ticks ({self.stopped_by})"
+        skipped = f" ({self.skipped} deadlines skipped)" if self.skipped else ""
+        yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
+        if remark := self.timekeeping.remark:
+            yield "time kept", remark
+        hand = self.peak_force, self.peak_torque
+        tool = self.peak_tool_force, self.peak_tool_torque
+        reached = " and ".join(f"{name} limit" for name in self.limits_reached)
+        reached = f" ({reached} reached)" if reached else ""
+        yield "peak", format_wrenches(hand if self.has_hand else None, tool) + reached
+        if self.reach is not None:
+            yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
+        for name, joules in self.energies.items():
+            if joules:  # exactly 0 without motors or springs
+                yield name.replace("_", " "), format_energy(joules)
+
+    def _device_lines(self) -> Iterator[str]:
+        """Yields if the device bears the coupling at the time that the run kept."""
+        kept = self.timekeeping
+        if not self.has_hand:
+            yield "the device feels no force: there is nothing to certify"
+            return
+        if self.is_certified is False and kept.fault:
+            yield f"device not certified: {kept.fault}"
+            return
+        yield kept.device_words(self.is_certified)
+        if not self.is_certified:
+            yield from self.conditions
+        if self.is_certified is False and method_named(self.method).has_law:
+            judge = "the audit" if self.recording else "with --record FILE the audit"
+            yield f"{judge} counts if the hand got energy; the run has only --energy-limit for it"
 
     @property
     def verdict(self) -> str:
@@ -291,4 +362,5 @@ class Summary:
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
+            has_hand=not info.is_prescribed,
         )

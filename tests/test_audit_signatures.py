@@ -414,7 +414,7 @@ def test_a_signed_file_is_passive_under_its_key(bench: Bench, tmp_path: Path) ->
 def test_without_a_key_the_report_says_what_only_a_key_would_prove(
     bench: Bench, tmp_path: Path
 ) -> None:
-    told = "who recorded the file, and that nothing was changed or cut off"
+    told = "who recorded the file, and that it is complete and unedited"
     signed = audit(bench.run)
     assert signed.signature.startswith(f"signed by SHA256:{''}")
     unsigned = audit(rewritten(read_recording(bench.run), tmp_path / "unsigned.mcap"))

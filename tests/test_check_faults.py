@@ -465,3 +465,15 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
     if told:  # the moment about the hinge: m g r = (K r² + K_r + k) sag / r
         sag = 0.8 * 9.81 * 0.05**2 / (2400 * 0.05**2 + 2.4 + gain)
         assert length(sag) in told[0].sentence
+
+
+@pytest.mark.parametrize(("floor", "is_told"), [("", True), (FLOOR, False)])
+def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told: bool) -> None:
+    ball = '<body name="ball" pos="0.2 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/></body>'
+    text = mjcf(HEAVY, GOOD_CONTACT, body=floor + ball + HINGE.format("-90 90"))
+    told = [fault for fault in faults_in(tmp_path, text) if fault.kind == "falling body"]
+    assert [fault.place.element for fault in told] == (["body 'ball'"] if is_told else [])
+    for fault in told:  # by half of g t² in the s of the hand's motion
+        fallen = float(fault.sentence.split(" by ")[1].split(" m ")[0])
+        seconds = case_of(written(tmp_path, text)).motion.duration
+        assert fallen == pytest.approx(4.905 * seconds**2, rel=0.05)

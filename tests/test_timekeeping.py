@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from hapticbridge import timekeeping
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, is_certified
+from hapticbridge.certificate import default_coupling, fresh_share, is_certified
 from hapticbridge.check.cost import Cost, Growth, TimingStats
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.summary import Summary
@@ -174,6 +175,15 @@ def test_a_missed_deadline_is_said_with_the_share_of_the_time(tmp_path: Path) ->
     summary, _ = felt(tmp_path / "again.mcap", IN_TIME["simulated"])
     assert summary.timekeeping.clause == summary.timekeeping.hint == ""
     assert summary.timekeeping.remark == ""
+
+
+def test_a_run_that_lost_nothing_has_all_of_its_samples() -> None:
+    info = DeviceInfo(name="rail", axes=("x",), force_limit=10.0)
+    for rate in (333, 1000, 1500, 4000):
+        assert all(fresh_share(info, 1 / rate, n, n) == 1.0 for n in range(1, 5000))
+    assert fresh_share(info, 1e-3, 900, 1000) == 0.9
+    own = replace(info, rate=500.0)  # owes every second sample
+    assert fresh_share(own, 1e-3, 500, 1000) == 1.0
 
 
 def test_ticks_that_come_late_in_turn_are_said_and_count(tmp_path: Path) -> None:

@@ -323,6 +323,7 @@ class Observation:
     Attributes:
         meetings: Contacts by the ids of two geoms, the smaller first.
         postures: ``qpos`` at times spread over the motion, shape (n, nq).
+        ticks_between_postures: Number of ticks from one of them to the next.
         rows: Number of constraint rows in each tick, by kind.
         force: Norm of the force on the tool in each tick, in N.
         full_ticks: Number of ticks in which the solver stopped at its iteration limit.
@@ -333,6 +334,7 @@ class Observation:
 
     meetings: dict[tuple[int, int], Meeting]
     postures: NDArray[np.float64]
+    ticks_between_postures: int
     rows: dict[str, NDArray[np.int64]]
     force: NDArray[np.float64]
     full_ticks: int
@@ -390,6 +392,7 @@ def observe(
     return Observation(
         meetings=meetings,
         postures=np.array(postures),
+        ticks_between_postures=every,
         rows={kind: types[:done, list(those)].sum(axis=1) for kind, those in ROW_KINDS.items()},
         force=force[:done],
         full_ticks=full,

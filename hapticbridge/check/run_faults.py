@@ -129,8 +129,35 @@ def run_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"MuJoCo warned {count} times in the motion: {words}",
             "follow the warning's advice",
         )
+    yield from _falling_bodies(case, seen)
     if seen.environment != "strict":
         yield _energy_created(case, seen)
+
+
+FALLING = 0.5
+"""Share of the way of a free fall above which a body that nothing holds is told; no unit. A body on
+a slope without friction slides less than this down to slopes of 45 degrees."""
+
+
+def _falling_bodies(case: SceneUnderCheck, seen: Observation) -> Iterator[Fault]:
+    """Yields a fault for a free body that fell through the whole motion, ½ g t²."""
+    model, gravity = case.model, case.model.opt.gravity
+    if len(seen.postures) < 2 or not np.any(gravity):
+        return
+    seconds = seen.ticks_between_postures * (len(seen.postures) - 1) * case.period
+    far = 0.5 * float(np.linalg.norm(gravity)) * seconds**2
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).tolist():
+        address = int(model.jnt_qposadr[joint])
+        moved = seen.postures[-1, address : address + 3] - seen.postures[0, address : address + 3]
+        fallen = float(moved @ gravity / np.linalg.norm(gravity))
+        if fallen > FALLING * far:
+            place = case.places.body(int(model.jnt_bodyid[joint]))
+            yield Fault(
+                "falling body",
+                place,
+                f"nothing holds {place.element}: it fell by {number(fallen)} m in the motion",
+                'a floor below it, no joint, or gravcomp="1"',
+            )
 
 
 def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:

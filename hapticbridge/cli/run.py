@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
@@ -14,13 +13,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 from rich.markup import escape
-from rich.table import Table
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import device_conditions, run_conditions
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
-from hapticbridge.cli.terminal import compiling, err, notify, out, print_json
+from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -44,11 +42,11 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
-from hapticbridge.rendering import RunCoupling, default_method, method_named
+from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.summary import Summary, coarse_spring, is_always_implicit
-from hapticbridge.units import format_energy, format_si, format_wrenches
+from hapticbridge.summary import WELD, coarse_spring, is_always_implicit
+from hapticbridge.units import format_si
 
 if TYPE_CHECKING:
     from hapticbridge.view import Window
@@ -158,7 +156,7 @@ def announce_measured(bridge: Bridge) -> None:
     if parameters.effective is not None:
         measured = RunCoupling(setup.coupling, None, parameters.effective)
         for sentence in measured.sentences():
-            err.print(f"  {sentence}: {_WELD}")
+            err.print(f"  {sentence}: {WELD}")
     conditions = run_conditions(setup.info, parameters, setup.method)
     met = {condition.sentence() for condition in conditions if condition.holds}
     for sentence in bridge.conditions():
@@ -180,78 +178,6 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
             f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
             "the handle; --no-tool-weight carries it"
         )
-
-
-_WELD = "the weld in its stiffest directions at the start"
-
-
-def print_summary(summary: Summary, *, has_hand: bool = True) -> None:
-    """Prints what a run was, whether the device bears it, and what to do next.
-
-    Args:
-        summary: Of the run.
-        has_hand: True if a hand holds the device.
-    """
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_row("ran", f"{summary.duration:.3f} s, {summary.ticks} ticks ({summary.stopped_by})")
-    skipped = f" ({summary.skipped} deadlines skipped)" if summary.skipped else ""
-    table.add_row("overruns", f"{summary.overruns}{skipped}, records dropped {summary.dropped}")
-    if remark := summary.timekeeping.remark:
-        table.add_row("time kept", remark)
-    hand, tool = (
-        (summary.peak_force, summary.peak_torque),
-        (summary.peak_tool_force, summary.peak_tool_torque),
-    )
-    reached = " and ".join(f"{name} limit" for name in summary.limits_reached)
-    reached = f" ({reached} reached)" if reached else ""
-    table.add_row("peak", format_wrenches(hand if has_hand else None, tool) + reached)
-    if summary.reach is not None:
-        table.add_row("reach", f"{format_si(summary.reach, 'm')}; beyond, no handle and no force")
-    for name, joules in summary.energies.items():
-        if joules:  # exactly 0 without motors or springs
-            table.add_row(name.replace("_", " "), format_energy(joules))
-    out.print(table)
-    tick, port = summary.fault or (0, "")
-    used = f", {summary.slack_share:.0%} of the slack used" if summary.slack_share else ""
-    since = f", from tick {tick} on" if port else ""
-    judged = "" if port else "environment "  # the device has a line of its own
-    words = f"{judged}[bold]{summary.verdict}[/bold] ({port or summary.environment})"
-    out.print(f"{words}{since}{used}")
-    if summary.method != default_method().name:
-        out.print(f"method {escape(summary.method)}: {escape(summary.about)}")
-    _print_coupling(summary.coupling)
-    _print_certificate(summary, has_hand=has_hand)
-    if hint := summary.timekeeping.hint:
-        out.print(hint)
-    if summary.recording is not None:
-        out.print(f"next: hapticbridge audit {escape(shlex.quote(str(summary.recording)))}")
-
-
-def _print_certificate(summary: Summary, *, has_hand: bool) -> None:
-    """Prints if the device bears the coupling at the time that the run kept."""
-    kept = summary.timekeeping
-    if not has_hand:
-        out.print("the device feels no force: there is nothing to certify")
-        return
-    if summary.is_certified is False and kept.fault:
-        out.print(escape(f"device not certified: {kept.fault}"))
-        return
-    out.print(kept.device_words(summary.is_certified))
-    if not summary.is_certified:
-        for sentence in summary.conditions:
-            out.print(escape(sentence))
-    if summary.is_certified is False and method_named(summary.method).has_law:
-        judge = "the audit" if summary.recording else "with --record FILE the audit"
-        out.print(f"{judge} counts if the hand got energy; the run has only --energy-limit for it")
-
-
-def _print_coupling(coupling: RunCoupling) -> None:
-    sentences = coupling.sentences()
-    if coupling.law is not None:
-        out.print(sentences[0])
-        return
-    for sentence in sentences:
-        out.print(f"{sentence}: {_WELD}" if coupling.effective else sentence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -493,7 +419,8 @@ class Run:
             values = asdict(summary) | {"verdict": summary.verdict}
             print_json(values | {"recording": str(self.record or "") or None})
         else:
-            print_summary(summary, has_hand=not device.info.is_prescribed)
+            for line in str(summary).splitlines():
+                out.print(plain(line))
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 

@@ -255,10 +255,7 @@ def trusted_keys(path: str | Path) -> dict[str, str]:
     return keys
 
 
-UNPROVEN = (
-    "who recorded the file, and that nothing was changed or cut off that its other parts do not "
-    "contradict"
-)
+UNPROVEN = "who recorded the file, and that it is complete and unedited"
 """Facts that only a key proves; part of every report without one."""
 
 
