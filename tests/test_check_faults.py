@@ -467,6 +467,38 @@ def test_what_a_servo_carries_the_hand_does_not(tmp_path: Path, gain: float, is_
         assert length(sag) in told[0].sentence
 
 
+TWO_KINDS = """<geom name="wall" type="box" size="0.01 0.1 0.1" pos="0.06 0 0" {wall}/>
+<body name="tool"><freejoint/><site name="grip"/>
+  <geom name="shell" type="box" size="0.02 0.02 0.02" mass="0.05" {shell}/>
+  <geom name="tip" size="0.01" pos="0.025 0 0" {tip}/></body>"""
+
+
+def test_what_is_advised_for_a_geom_does_not_contradict_itself(tmp_path: Path) -> None:
+    settings = {"floor": "", "wall": 'solref="-1e5 -10"', "shell": "", "tip": 'solref="0.05 1"'}
+    for folder in ("before", "after"):
+        (tmp_path / folder).mkdir()
+        floor = FLOOR.replace("/>", ' pos="0 0 -0.03" {floor}/>')
+        body = (floor + TWO_KINDS).format(**settings)
+        faults = faults_in(tmp_path / folder, mjcf(GOOD_OPTION, body=body), contact="scene")
+        told = [fault for fault in faults if "solref=" in fault.change]
+        if folder == "before":
+            assert {"soft contact", "not passive"} <= {fault.kind for fault in told}
+            (advised,) = {fault.change.split('"')[1] for fault in told}
+            better = f'solref="{advised}" solimp="0.9 0.95 0.001"'
+            settings = dict.fromkeys(settings, better)
+    assert told == [], "what is advised mends the scene"
+
+
+def test_mass_is_taken_from_what_is_only_seen_and_not_from_what_collides(tmp_path: Path) -> None:
+    body = TWO_KINDS.format(wall="", shell='contype="0" conaffinity="0"', tip="")
+    faults = faults_in(tmp_path, mjcf(GOOD_OPTION, body=body.replace('mass="0.05" ', "")))
+    told = {fault.kind: fault for fault in faults if "water" in fault.sentence}
+    seen, solid = told["visual geom with mass"], told["density of water"]
+    assert (seen.place.element, seen.change) == ("geom 'shell'", 'mass="0"')
+    assert solid.place.element == "geom 'tip'"
+    assert solid.change.startswith('mass="…"')
+
+
 @pytest.mark.parametrize(("floor", "is_told"), [("", True), (FLOOR, False)])
 def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told: bool) -> None:
     ball = '<body name="ball" pos="0.2 0 0.1"><freejoint/><geom size="0.02" mass="0.1"/></body>'

@@ -24,6 +24,7 @@ from hapticbridge.scene.contacts import (
     contact_numbers,
     meeting_pairs,
     settings_among,
+    suggested_solref,
     tool_geoms,
 )
 
@@ -56,10 +57,17 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     push, is_cone_reported = push_of(case), False
     case.scene.reset()
     rooms = _rooms(case, [pair for pairs in where.values() for pair in pairs])
+    active = {
+        geom
+        for setting, pairs in where.items()
+        if contact_numbers(setting.solref, setting.solimp, float(option.timestep)).grade == "active"
+        for pair in pairs
+        for geom in pair
+    }
     for setting, pairs in where.items():
         place, also = _place(case, pairs[0], is_soft=False)
         names = pair_names(case, pairs)
-        if fault := _soft(case, setting, pairs, push, rooms):
+        if fault := _soft(case, setting, pairs, push, rooms, active):
             yield fault
         for concern in contact_concerns(
             setting.solref,
@@ -155,7 +163,9 @@ def _soft(
     pairs: list[tuple[int, int]],
     push: float,
     rooms: dict[tuple[int, int], float],
+    active: set[int],
 ) -> Fault | None:
+    """Returns a contact that is too soft; what to write suits ``active`` geoms' other contacts."""
     step = float(case.model.opt.timestep)
     depths = {
         pair: depth_under(
@@ -182,7 +192,10 @@ def _soft(
     )
     if pair in rooms:
         sentence += f", into a clearance of {length(rooms[pair])}"
-    change = f'solref="{REFERENCE_STEPS * step:g} 1" solimp="0.9 0.95 0.001"'
+    solref = f'solref="{REFERENCE_STEPS * step:g} 1"'
+    if active & set(pair):
+        solref = suggested_solref(step)
+    change = f'{solref} solimp="0.9 0.95 0.001"'
     kind = "default contact" if is_default else "soft contact"
     place, also = _place(case, pair, is_soft=True)
     if is_default and len(pairs) > 1:

@@ -438,24 +438,33 @@ def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
         if is_free_to_move and _sets_no_mass(case, geom, written):
             silent.setdefault(body, []).append(geom)
     for body, those in silent.items():
-        visual = [
-            geom for geom in those if not model.geom_contype[geom] | model.geom_conaffinity[geom]
-        ]
-        first = (visual or those)[0]
-        place, name = case.places.geom(first), case.places.body(body).element
+        collides = (model.geom_contype[those] | model.geom_conaffinity[those]) != 0
+        visual, solid = (np.array(those)[each].tolist() for each in (~collides, collides))
         mass = float(model.body_mass[body])
-        made = "has neither mass nor density and so is made of water"
-        mend = f'mass="{number(mass)}", or what it really weighs'
-        if len(those) > 1:
-            made = "have neither mass nor density and so are made of water"
+        if visual:
+            yield _made_of_water(case, body, visual, "visual geom with mass", 'mass="0"')
+        if len(those) == 1 and solid:
+            mend = f'mass="{number(mass)}", or what it really weighs'
+            yield _made_of_water(case, body, solid, "density of water", mend)
+        elif solid:
             mend = f'mass="…" in each, what it really weighs; now {weight(mass)} together'
-        yield Fault(
-            "visual geom with mass" if visual else "density of water",
-            place,
-            f"{place.element}{others(len(those) - 1)} {made} ({WATER:g} kg/m³); {name} "
-            f"weighs {weight(mass)} with it",
-            'mass="0"' if visual else mend,
-        )
+            yield _made_of_water(case, body, solid, "density of water", mend)
+
+
+def _made_of_water(
+    case: SceneUnderCheck, body: int, geoms: list[int], kind: str, change: str
+) -> Fault:
+    place, name = case.places.geom(geoms[0]), case.places.body(body).element
+    made = "has neither mass nor density and so is made of water"
+    if len(geoms) > 1:
+        made = "have neither mass nor density and so are made of water"
+    return Fault(
+        kind,
+        place,
+        f"{place.element}{others(len(geoms) - 1)} {made} ({WATER:g} kg/m³); {name} "
+        f"weighs {weight(float(case.model.body_mass[body]))} with it",
+        change,
+    )
 
 
 def _sets_no_mass(case: SceneUnderCheck, geom: int, written: Any) -> bool:
