@@ -65,6 +65,41 @@ def test_options_of_a_run_reach_the_recording(call: Called, tmp_path: Path) -> N
     assert json.loads(meta["axes"]) == [0, -1, 0, 1, 0, 0, 0, 0, 1]
 
 
+FELT_WRONG = """<mujoco>
+  <compiler angle="degree"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="turn" axis="0 1 0" {turn}/>
+      <geom type="capsule" fromto="0 0 0 {reach} 0 0" size="{width}" mass="0.2"/>
+      <site name="grip" pos="{reach} 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("turn", "reach", "words"),
+    [
+        ('damping="0.01"', 0.15, []),
+        ('damping="0.01"', 150.0, ["are these millimetres"]),
+        ('range="-0.78 0.78" damping="0.01"', 0.15, ["are these radians?"]),
+        ('frictionloss="0.5"', 0.15, ["creeps by"]),
+        ('frictionloss="0.5" range="-0.7 0.7"', 150.0, ["millimetres", "radians"]),  # not a third
+    ],
+)
+def test_a_run_repeats_the_worst_faults_of_its_scene(
+    call: Called, tmp_path: Path, turn: str, reach: float, words: list[str]
+) -> None:
+    scene = tmp_path / "arm.xml"
+    scene.write_text(FELT_WRONG.format(turn=turn, reach=reach, width=reach / 15))
+    _, _, err = call("run", str(scene), "--fast", "--duration", "0.01")
+    told = [line for line in err.splitlines() if "'hapticbridge check' says what to" in line]
+    assert len(told) == len(words)
+    assert all(word in line for word, line in zip(words, told, strict=True))
+    assert all("arm.xml:" in line for line in told)
+
+
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
     path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, SceneUnderCheck
 from hapticbridge.check.fault import Fault, length, number, others, weight
@@ -20,8 +20,9 @@ from hapticbridge.check.physics import (
     joint_inertia,
     mesh_of,
 )
-from hapticbridge.check.source_map import Place
+from hapticbridge.check.source_map import Place, Places
 from hapticbridge.kernel.rigid_contact import LAST_RIGID
+from hapticbridge.scene import Scene, SceneSource
 from hapticbridge.scene.contacts import (
     REFERENCE_STEPS,
     ROUNDING,
@@ -29,6 +30,51 @@ from hapticbridge.scene.contacts import (
     contact_numbers,
     impedance_at,
 )
+
+# Faults that are felt at once, and seen without a motion
+
+
+class CompiledScene(Protocol):
+    """Part of a ``SceneUnderCheck`` that a rule without a motion needs."""
+
+    @property
+    def source(self) -> SceneSource:
+        """The scene as its files describe it."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it runs."""
+
+    @property
+    def places(self) -> Places:
+        """Lines of the files."""
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class _LoadedScene:
+    source: SceneSource
+    scene: Scene
+    places: Places
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.scene.model
+
+
+def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
+    """Yields faults that make a run feel wrong from its first second: units, angles, creep.
+
+    They need no motion, so that a run can tell them at its start. The scene is reset.
+    """
+    loaded = _LoadedScene(source, scene, Places(source, scene.model))
+    for rule in (_units, _angles, _frictions):
+        scene.reset()
+        yield from rule(loaded)
+
 
 # Faults of joint limits, equality constraints and dry friction
 
@@ -126,7 +172,7 @@ def _equalities(case: SceneUnderCheck) -> Iterator[Fault]:
             )
 
 
-def _frictions(case: SceneUnderCheck) -> Iterator[Fault]:
+def _frictions(case: CompiledScene) -> Iterator[Fault]:
     model = case.model
     reported = set()
     for dof in np.flatnonzero(model.dof_frictionloss > 0).tolist():
@@ -172,7 +218,7 @@ def _depth_words(
     return f"amounts to {amount} (solref {_numbers(solref)}): {deep}"
 
 
-def _reference(case: SceneUnderCheck) -> str:
+def _reference(case: CompiledScene) -> str:
     return f"{REFERENCE_STEPS * float(case.model.opt.timestep):g} 1"
 
 
@@ -216,7 +262,7 @@ def geometry_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     yield from _workspace(case)
 
 
-def _units(case: SceneUnderCheck) -> Iterator[Fault]:
+def _units(case: CompiledScene) -> Iterator[Fault]:
     model = case.model
     tool_bodies = _tool_bodies(case)
     mass, extent = float(model.body_mass[tool_bodies].sum()), float(_tool_extent(case).max())
@@ -245,7 +291,7 @@ def _units(case: SceneUnderCheck) -> Iterator[Fault]:
     )
 
 
-def _angles(case: SceneUnderCheck) -> Iterator[Fault]:
+def _angles(case: CompiledScene) -> Iterator[Fault]:
     """Finds ranges of hinges whose unit is not that of the compiler."""
     model, is_degree = case.model, bool(case.source.spec.compiler.degree)
     for joint in range(model.njnt):
@@ -310,9 +356,11 @@ def dent_of(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> tuple[fl
         Depth in m of the triangle centre that lies deepest inside the hull, and volume of the hull
         minus that of the mesh in m³. The volume is 0 for a surface that is not closed.
     """
+    from scipy import spatial  # noqa: PLC0415 - for meshes alone; it is slow to import
+
     try:
-        hull = ConvexHull(vertices)
-    except (QhullError, ValueError):  # a flat mesh; MuJoCo gives it no volume either
+        hull = spatial.ConvexHull(vertices)
+    except (spatial.QhullError, ValueError):  # a flat mesh; MuJoCo gives it no volume either
         return 0.0, 0.0
     triangles = vertices[faces]
     dent = 0.0
@@ -369,13 +417,13 @@ def _workspace(case: SceneUnderCheck) -> Iterator[Fault]:
     )
 
 
-def _tool_bodies(case: SceneUnderCheck) -> NDArray[np.bool_]:
+def _tool_bodies(case: CompiledScene) -> NDArray[np.bool_]:
     model = case.model
     tree = model.body_treeid[model.site(case.scene.grip).bodyid[0]]
     return np.asarray(model.body_treeid == tree, dtype=bool)
 
 
-def _tool_extent(case: SceneUnderCheck) -> NDArray[np.float64]:
+def _tool_extent(case: CompiledScene) -> NDArray[np.float64]:
     """Returns the edges in m of the axis-aligned box around the tool's geoms at the start."""
     model, scene = case.model, case.scene
     scene.reset()

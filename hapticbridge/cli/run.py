@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from signal import Signals
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
@@ -16,6 +17,7 @@ from rich.markup import escape
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import device_conditions, run_conditions
+from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
@@ -162,6 +164,17 @@ def announce_measured(bridge: Bridge) -> None:
     for sentence in bridge.conditions():
         head = "  " if sentence in met else "[yellow]warning:[/yellow] "
         err.print(head + escape(sentence))
+
+
+MOST_FAULTS = 2
+"""Number of a scene's faults that a run repeats."""
+
+
+def _warn_of_faults(source: SceneSource, scene: Scene) -> None:
+    """Prints the worst of what ``hapticbridge check`` finds without a motion."""
+    for fault in islice(worst_faults(source, scene), MOST_FAULTS):
+        told = f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
+        err.print(f"[yellow]warning:[/yellow] {plain(told)}")
 
 
 HEAVY = 0.25
@@ -346,6 +359,8 @@ class Run:
                 with compiling(self.scene):
                     source = read_scene(self.scene, **settings_from(self.settings))
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
+                if not self.as_json:
+                    _warn_of_faults(source, scene)
                 chosen = (
                     self
                     if self.substeps is not None
