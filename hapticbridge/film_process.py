@@ -152,6 +152,7 @@ class Stage:
         if on_compiled is not None:
             on_compiled()
         self.model = self._run.model
+        _light(self.model)
         self.data = mujoco.MjData(self.model)
         self._rest = self.recording.blocks()
         self._block = next(self._rest)
@@ -257,6 +258,24 @@ class Stage:
             _add(scene, arrow, _HAND, between=(handle, tip), size=0.5 * size)
 
 
+HEADLIGHT_AMBIENT, HEADLIGHT_DIFFUSE = 0.4, 0.6
+"""Light from the camera on a scene without lights, 0 to 1 in each colour. MuJoCo's own, 0.1 and
+0.4, is meant to be added to lights, and leaves such a scene dark."""
+
+
+def _light(model: mujoco.MjModel) -> None:
+    """Lights a scene that has no light of its own and no setting of the headlight."""
+    headlight = model.vis.headlight
+    is_usual = np.allclose(headlight.ambient, 0.1) and np.allclose(headlight.diffuse, 0.4)
+    if not model.nlight and is_usual:
+        headlight.ambient[:] = HEADLIGHT_AMBIENT
+        headlight.diffuse[:] = HEADLIGHT_DIFFUSE
+
+
+GLOW = 0.6
+"""Share of its own colour that handle, coupling, force and contacts have in the dark, 0 to 1."""
+
+
 def _add(
     scene: mujoco.MjvScene,
     kind: mujoco.mjtGeom,
@@ -281,6 +300,7 @@ def _add(
         start, end = (np.asarray(point, dtype=np.float64) for point in between)
         mujoco.mjv_connector(geom, kind, size, start, end)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    geom.emission = GLOW
     scene.ngeom += 1
 
 

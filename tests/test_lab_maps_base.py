@@ -11,16 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.maps import MAPS
 from hapticbridge.lab.maps.base import (
+    COLOURS,
+    FILLED,
     VERDICTS,
     Point,
     Sentences,
     StabilityMap,
+    draw_verdicts,
     run_map,
     verdict_numbers,
 )
@@ -150,6 +154,21 @@ def test_an_unstable_loop_is_unstable_whatever_its_environment() -> None:
     names = np.array(["strict", "active", "within slack", "strict"], dtype=object)
     numbers = verdict_numbers([True, True, True, False], names)
     assert [VERDICTS[i] for i in numbers] == ["strict", "active", "within slack", "unstable"]
+
+
+@pytest.mark.parametrize("side", [FILLED - 1, FILLED])
+def test_a_coarse_grid_is_drawn_as_points_that_claim_nothing_between(side: int) -> None:
+    axes = new_figure(4, 4).subplots()
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(side), np.arange(side)))
+    verdict = (x > 2).astype(np.int64)
+    draw_verdicts(axes, x.astype(float), y.astype(float), verdict)
+    (drawn,) = axes.collections
+    is_coarse = side < FILLED
+    assert (type(drawn).__name__ == "PathCollection") == is_coarse
+    if is_coarse:
+        assert len(np.asarray(drawn.get_offsets())) == side**2
+        seen = {to_hex(colour) for colour in np.asarray(drawn.get_facecolor())}
+        assert seen == {COLOURS[0].lower(), COLOURS[1].lower()}
 
 
 def test_command_lists_the_maps_for_an_unknown_name(capsys: pytest.CaptureFixture[str]) -> None:

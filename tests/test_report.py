@@ -21,6 +21,7 @@ from report_runs import Made
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.parameters import DAMPER
 from hapticbridge.record import TickFlag
@@ -28,7 +29,7 @@ from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import Cause, likely_cause, what_would_do
-from hapticbridge.report.evidence import Evidence, decimated
+from hapticbridge.report.evidence import Evidence, decimated, draw_recording
 from hapticbridge.report.facts import MAX_EVENTS, MAX_INPUTS, event_rows, guard_facts
 from hapticbridge.report.page import is_warned, notes
 from hapticbridge.report.plots import BINS, activities, draw_motion, draw_timing
@@ -107,6 +108,24 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     for told in (*where, most, f"<strong>{cause.kind}</strong>. ", cause.remedy[1:]):
         assert told in first
     assert "The moment" in text
+
+
+def test_the_energies_that_are_drawn_balance(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"  # gravity, and springs in the joints of a ratchet
+    with Bridge("ratchet", clock=SimulatedClock(), recording=path) as bridge:
+        bridge.run(duration=1.0)
+    energies = draw_recording(read_recording(path)).axes[-1]
+    grids, sums = np.linspace(0.0, 0.999, 400), {"-": 0.0, "--": 0.0}
+    for line in energies.get_lines():
+        if line.get_label() != "given to the device":
+            drawn = np.interp(grids, *np.asarray(line.get_data(), dtype=float))
+            sums[str(line.get_linestyle())] += drawn
+    stored, worked = sums["--"], sums["-"]  # the curves are decimated: equal but for peaks
+    largest = np.abs(stored).max()
+    assert largest > 1.0  # mJ
+    apart = stored - worked  # the first tick's change is not drawn
+    assert np.median(np.abs(apart - np.median(apart))) < 0.002 * largest
+    assert abs(np.median(apart)) < 0.02 * largest
 
 
 def test_no_peak_of_a_curve_is_lost_wherever_it_stands() -> None:

@@ -52,8 +52,13 @@ _ENERGIES = (
     ("coupling_work", "work of the coupling", "#0072b2", "-"),
     ("environment_energy", "created (+) or dissipated (−)", "#009e73", "-"),
     ("device_energy", "given to the device", "#e69f00", "-"),
+    ("actuator_work", "work of the scene's motors", "#cc79a7", "-"),
+    ("external_work", "work of inputs and resets", "#56b4e9", "-"),
     ("kinetic", "kinetic", "#555555", "--"),
+    ("potential", "potential, from the start", "#a08000", "--"),
 )
+"""Energies that are drawn. The dashed ones are stored: together they grow by the sum of the works
+and of what was created."""
 _DRAWN = (
     "wrench_on_tool",
     "wrench_on_device",
@@ -61,6 +66,10 @@ _DRAWN = (
     "handle_position",
     *(name for name, *_ in _ENERGIES),
 )
+
+
+HANDLE = {"lw": 5.0, "alpha": 0.3, "solid_capstyle": "butt"}
+"""Line of the handle: broad and pale, so that it is seen on both sides of the tool's."""
 
 
 def decimated(
@@ -114,7 +123,7 @@ def draw_recording(recording: Recording) -> Figure:
     time = due_times(ticks, parameters.period)
     figure = new_figure(8, 8)
     force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
-    position_axes.plot([], [], color="grey", ls=":", lw=1, label="handle")
+    position_axes.plot([], [], color="grey", **HANDLE, label="handle")
     hand = force_on_hand(ticks, parameters.axes)
     is_held = not is_motion_prescribed(meta)
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
@@ -126,10 +135,11 @@ def draw_recording(recording: Recording) -> Figure:
         tool = 1e3 * (ticks["tool_position"][:, i] - start)
         handle = 1e3 * (ticks["handle_position"][:, i] - start)
         position_axes.plot(*decimated(time, tool), color=colour, label=f"tool {axis}")
-        position_axes.plot(*decimated(time, handle), color=colour, ls=":", lw=1)
+        position_axes.plot(*decimated(time, handle), color=colour, **HANDLE)
     for name, label, colour, style in _ENERGIES:
-        drawn = decimated(time, 1e3 * ticks[name])
-        energy_axes.plot(*drawn, color=colour, ls=style, label=label)
+        joules = ticks[name] - (ticks[name][0] if name == "potential" else 0.0)
+        if joules.any():
+            energy_axes.plot(*decimated(time, 1e3 * joules), color=colour, ls=style, label=label)
     force_axes.set_ylabel("force on hand and tool (N)" if is_held else "force on the tool (N)")
     position_axes.set_ylabel("displacement (mm)")
     energy_axes.set_ylabel("energy (mJ)")

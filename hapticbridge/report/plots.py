@@ -11,7 +11,7 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.plotting import new_figure
 from hapticbridge.record import TickFlag, force_on_hand, has_flag
-from hapticbridge.report.evidence import AXES, COLOURS, Evidence, decimated, finish
+from hapticbridge.report.evidence import AXES, COLOURS, HANDLE, Evidence, decimated, finish
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,7 +146,7 @@ def draw_motion(evidence: Evidence) -> Figure:
     *hand, force, torque, way, turn = figure.subplots(4 + is_held, 1, sharex=True)
     on_hand = force_on_hand(ticks, evidence.parameters.axes)
     start = ticks["tool_position"][0]
-    way.plot([], [], color="grey", ls=":", lw=1, label="handle")
+    way.plot([], [], color="grey", **HANDLE, label="handle")
     for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
         for axes in hand:
             curve(axes, time, on_hand[:, i], color=colour, label=axis)
@@ -155,7 +155,7 @@ def draw_motion(evidence: Evidence) -> Figure:
         tool = 1e3 * (ticks["tool_position"][:, i] - start[i])
         curve(way, time, tool, color=colour, label=f"tool {axis}")
         handle = 1e3 * (ticks["handle_position"][:, i] - start[i])
-        curve(way, time, handle, color=colour, ls=":", lw=1)
+        curve(way, time, handle, color=colour, **HANDLE)
     turned = (("tool", "#222222", "-"), ("handle", "grey", ":"))
     first = np.broadcast_to(ticks["tool_quaternion"][0], (len(ticks), 4))
     for name, colour, style in turned:
@@ -244,14 +244,21 @@ def draw_timing(evidence: Evidence) -> Figure:
     return figure
 
 
+LEAST_LATENESS = 1.0
+"""Lateness in µs below which ticks are drawn at the left edge: a clock is read no finer."""
+
+
 def _draw_lateness(axes: Axes, evidence: Evidence) -> None:
-    lateness = 1e6 * evidence.lateness
+    lateness = np.maximum(1e6 * evidence.lateness, LEAST_LATENESS)
     period = 1e6 * evidence.parameters.period
-    axes.hist(lateness, bins=80, color="#1a5fb4", log=True, label="ticks")
+    bins = np.geomspace(LEAST_LATENESS, max(lateness.max(), 10 * LEAST_LATENESS), 81)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.hist(lateness, bins=list(bins), color="#1a5fb4", log=True, label="ticks")
     # after a stall of seconds the line of one period would not be visible
     if lateness.max() > 0.2 * period:
         axes.axvline(period, color="#b3261e", ls="--", label="one period: a deadline is missed")
-    axes.set_xlabel("lateness: start of a tick after its deadline (µs)")
+    axes.set_xlabel("lateness: start of a tick after its deadline (µs; at the left edge 1 or less)")
     axes.set_ylabel("ticks")
     finish(axes)
 

@@ -305,10 +305,10 @@ class Order:
 
     @property
     def words(self) -> str:
-        """Text of the order for a picture."""
+        """Text of the order for a picture; empty if the steps do not settle it."""
         if self.is_level:
             return "level"
-        return f"order {self.power:.1f}" if self.is_settled else "order ?"
+        return f"order {self.power:.1f}" if self.is_settled else ""
 
 
 def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:

@@ -258,8 +258,10 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
     if best is not None:
         axes.plot(
             best.cost.median, drawn_error(best), "*", ms=13, mfc="none", mec="black", mew=1.3,
-            label="recommended for 1 kHz", zorder=5,
+            label=f"recommended for 1 kHz: {who(best.setting)}", zorder=5,
         )  # fmt: skip
+        for label in _passed_over(best, chart.front(panel), points):
+            axes.plot([], [], " ", label=label)
     axes.axhline(JND, color="black", ls="--", lw=0.9)
     axes.annotate(
         "one just noticeable difference", (0.995, JND), xycoords=("axes fraction", "data"),
@@ -290,9 +292,24 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
+def _passed_over(
+    best: Measurement, front: Sequence[Measurement], points: Sequence[Measurement]
+) -> list[str]:
+    """Returns why a method on the front is not recommended, one legend each."""
+    reasons: dict[str, str] = {}
+    for each in front:
+        found = _objections(each, points) if _is_fast(each) else []
+        if found and who(each.setting) != who(best.setting):
+            reasons.setdefault(who(each.setting), found[-1])
+    return [
+        textwrap.fill(f"not {name}: {reason}", 34, subsequent_indent="  ")
+        for name, reason in reasons.items()
+    ]
+
+
 def _named(name: str, points: Sequence[Measurement], order: Order | None) -> str:
     """Returns a method's legend: its order, and its limit if that differs."""
-    remarks = [] if order is None else [order.words]
+    remarks = [order.words] if order is not None and order.words else []
     if not all(each.is_comparable for each in points):
         remarks.append(f"limit {points[0].limit_apart:.2g} off")
     return f"{name} ({', '.join(remarks)})" if remarks else name
@@ -303,8 +320,6 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
     facts = []
     if any(order.is_level for order in orders):
         facts.append("level: smaller steps gain nothing")
-    if not all(order.is_settled for order in orders):
-        facts.append("order ?: not settled at these steps")
     if not all(each.is_comparable for each in points):
         facts.append(
             "pale: nearer to its own limit than\n"

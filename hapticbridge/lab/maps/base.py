@@ -482,6 +482,10 @@ def panels(figure: Figure, count: int) -> list[Axes]:
     return list(all_panels[:count])
 
 
+FILLED = 6
+"""Number of columns and of rows from which on a grid of runs is drawn as areas."""
+
+
 def draw_verdicts(
     axes: Axes,
     x: NDArray[np.float64],
@@ -501,7 +505,9 @@ def draw_verdicts(
         log_x: True if x is even in its logarithm.
         log_y: True if y is even in its logarithm.
 
-    Without a run the axes state that no point could be computed.
+    A grid of fewer than ``FILLED`` columns or rows is drawn as its points, because a filled area
+    between them would claim what nothing measured. Without a run the axes state that no point could
+    be computed.
     """
     if log_x:
         axes.set_xscale("log")
@@ -511,6 +517,10 @@ def draw_verdicts(
         say_missing(axes)
         return
     columns, rows = np.unique(x), np.unique(y)
+    if min(columns.size, rows.size) < FILLED:
+        colours = [COLOURS[each] for each in verdict]
+        axes.scatter(x, y, c=colours, marker="s", s=70, edgecolors="black", clip_on=False, zorder=4)
+        return
     cells = np.full((rows.size, columns.size), np.nan)
     cells[np.searchsorted(rows, y), np.searchsorted(columns, x)] = verdict
     axes.pcolormesh(
