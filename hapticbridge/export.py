@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
+from hapticbridge.export_viewers import FoxgloveSink, RerunSink
 from hapticbridge.files import import_extra
 from hapticbridge.record import FLAG_LEGEND, TableColumns, Timeline, due_times
 from hapticbridge.recording import RecordingFile, open_recording
@@ -185,6 +186,8 @@ FORMATS: dict[str, tuple[type[Sink], tuple[str, ...]]] = {
     "parquet": (ParquetSink, (".parquet", ".pq")),
     "csv": (CsvSink, (".csv",)),
     "hdf5": (Hdf5Sink, (".h5", ".hdf5")),
+    "rerun": (RerunSink, (".rrd",)),
+    "foxglove": (FoxgloveSink, (".json",)),
 }
 """Writer and file extensions of each format, the usual extension first."""
 

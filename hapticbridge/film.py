@@ -19,6 +19,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any, cast
 
+import numpy as np
+
 from hapticbridge.arguments import Arguments
 from hapticbridge.confinement import SHARE, ForeignSceneError, death
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -40,11 +42,13 @@ process's memory."""
 MAX_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
 
-_BOOTSTRAP = """
-import sys
+_RENDERER = """
 from mujoco.rendering.classic.gl_context import GLContext
 GLContext(16, 16).free()
+"""
+_BOOTSTRAP = """
 print('{"ready": true}', flush=True)
+import sys
 sys.path.insert(0, sys.argv[1])
 from hapticbridge.film_process import run
 run()
@@ -55,6 +59,14 @@ _NONE_WORKS = (
     "neither EGL nor OSMesa works here, so nothing can be drawn off-screen; on Debian: apt install "
     "libegl1 libgl1-mesa-dri, or libosmesa6"
 )
+
+STATES = ".npz"
+"""Ending of a file of states: ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv),
+``ctrl`` (n, nu), ``names`` of positions, ``controls`` of ``ctrl``, and with a camera ``pictures``
+and ``ends``: all PNG in a row of bytes, and where each ends."""
+
+FREE_CAMERA = "free"
+"""Name by which states are seen from the free camera, as the scene's file sets it."""
 
 Progress = Callable[[int, int], None]
 
@@ -166,6 +178,32 @@ def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
     raise HapticBridgeError(_NONE_WORKS)
 
 
+def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dict[str, Any]:
+    """Returns states of a run simulated again, ``shot.fps`` per second, in a confined process.
+
+    Args:
+        recording: The file.
+        shot: Frames per second, and the camera and size of pictures; no pictures without a camera.
+        progress: Called with the finished and all frames.
+
+    Returns:
+        Arrays by name, as ``STATES`` has them.
+
+    Raises:
+        HapticBridgeError: As ``draw``.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / f"states{STATES}"
+        job = {"recording": str(recording), "name": str(file), "out": str(file)}
+        job |= asdict(shot) | {"in_process": False}
+        if shot.camera is None:
+            _draw_with(None, job, progress)
+        else:
+            _draw_with_any(job, progress)
+        with np.load(file, allow_pickle=False) as found:
+            return dict(found)
+
+
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
     """Returns a picture of a recording as PNG.
 
@@ -198,12 +236,16 @@ def _check_target(target: Path, shot: Shot) -> None:
         raise HapticBridgeError(f"a film needs the extra 'view': {install_command('view')}")
 
 
-def _draw_with(renderer: str, job: dict[str, Any], progress: Progress | None) -> bool:
-    """Draws in a separate process; returns False if its renderer does not work."""
+def _draw_with(renderer: str | None, job: dict[str, Any], progress: Progress | None) -> bool:
+    """Does a job in a separate process; returns False if its renderer does not work.
+
+    ``renderer`` is None for a job that draws nothing.
+    """
     package = str(Path(__file__).resolve().parents[1])
     # -P: a file in the user's working folder must not replace a module
-    command = [sys.executable, "-P", "-c", _BOOTSTRAP, package]
-    environment = {**os.environ, "MUJOCO_GL": renderer}
+    begin = "" if renderer is None else _RENDERER
+    command = [sys.executable, "-P", "-c", begin + _BOOTSTRAP, package]
+    environment = {**os.environ, "MUJOCO_GL": renderer or "disable"}
     # settings of another renderer, if this process tried one
     environment.pop("PYOPENGL_PLATFORM", None)
     process = subprocess.Popen(

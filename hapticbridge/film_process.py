@@ -8,6 +8,7 @@ the limits of ``confinement`` before MuJoCo sees the scene.
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 import tempfile
@@ -26,6 +27,8 @@ from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film import FREE_CAMERA, STATES
+from hapticbridge.kernel.codes import coupling_ids
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recorded_scene import bounds_for
@@ -309,16 +312,24 @@ class Camera:
 
     Args:
         stage: The run.
-        width: Width of a frame in pixels.
-        height: Height of a frame in pixels.
+        size: Width and height of a frame in pixels.
         name: A camera of the scene; None for the free one.
+        has_forces: True draws handle, coupling, forces and contacts, and bodies that show them.
 
     Raises:
         RecordingError: The scene has no camera of that name.
     """
 
-    def __init__(self, stage: Stage, width: int, height: int, name: str | None = None) -> None:
-        self._stage = stage
+    def __init__(
+        self,
+        stage: Stage,
+        size: tuple[int, int],
+        name: str | None = None,
+        *,
+        has_forces: bool = True,
+    ) -> None:
+        self._stage, self._has_forces = stage, has_forces
+        width, height = size
         model = stage.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._camera = FREE if name is None else _camera_id(model, name)
@@ -327,16 +338,18 @@ class Camera:
         shadows.shadowsize = min(shadows.shadowsize, SHADOW)
         # grip and handle are points in the model, without a shape to see
         self._shown.sitegroup[:] = 0
-        model.vis.map.alpha = TOOL_ALPHA
-        self._shown.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = True
+        if has_forces:
+            model.vis.map.alpha = TOOL_ALPHA
+            self._shown.flags[mujoco.mjtVisFlag.mjVIS_TRANSPARENT] = True
         self.renderer = mujoco.Renderer(model, height, width)
 
     def frame(self, tick: int) -> Frame:
         """Returns the picture of a tick, (height, width, 3)."""
         self._stage.show(tick)
         self.renderer.update_scene(self._stage.data, self._camera, self._shown)
-        self._stage.add_contacts(self.renderer.scene)
-        self._stage.add_coupling(self.renderer.scene)
+        if self._has_forces:
+            self._stage.add_contacts(self.renderer.scene)
+            self._stage.add_coupling(self.renderer.scene)
         return np.array(self.renderer.render(), dtype=np.uint8)
 
 
@@ -431,9 +444,8 @@ def _confine(job: dict[str, Any], recording: RecordingFile) -> float:
     parameters = parameters_of(recording.meta)
     bounds = bounds_for(recording, parameters)
     pixels = job["width"] * job["height"]
-    is_film = job["out"].endswith(".mp4")
     frames = 1.0
-    if is_film:
+    if not job["out"].endswith(".png"):
         length = Timeline(recording.blocks(), parameters.period).duration
         span = (length if job["stop"] is None else job["stop"]) - job["start"]
         frames = max(1.0, min(span, length) * job["fps"] / job["speed"])
@@ -454,8 +466,15 @@ def _draw(job: dict[str, Any]) -> None:
         _answer(seconds=seconds)
         on_compiled = partial(allow_time, seconds)
     stage = Stage(recording, on_compiled)
-    camera = Camera(stage, job["width"], job["height"], job["camera"])
-    out = job["out"]
+    out, size = job["out"], (job["width"], job["height"])
+    if out.endswith(STATES):
+        camera = None
+        if job["camera"] is not None:
+            name = None if job["camera"] == FREE_CAMERA else job["camera"]
+            camera = Camera(stage, size, name, has_forces=False)
+        _write_states(out, stage, list(film_ticks(stage, job["fps"])), camera)
+        return
+    camera = Camera(stage, size, job["camera"])
     if out.endswith(".png"):
         tick = stage.recording.count - 1 if job["at"] is None else stage.tick_at(job["at"])
         picture = Image.fromarray(camera.frame(tick))
@@ -472,7 +491,52 @@ def _draw(job: dict[str, Any]) -> None:
             yield camera.frame(tick)
             _answer(frame=number, frames=len(ticks))
 
-    write_film(out, frames(), (job["width"], job["height"]), job["fps"])
+    write_film(out, frames(), size, job["fps"])
+
+
+def _write_states(out: str, stage: Stage, ticks: list[int], camera: Camera | None) -> None:
+    """Writes the states of some ticks, and their pictures, for ``hapticbridge.dataset``."""
+    rows, states, pictures = [], [], bytearray()
+    ends, model, ours = [], stage.model, coupling_ids(stage.model)
+    own = [k for k in range(model.nactuator) if k not in ours]
+    for number, tick in enumerate(ticks, start=1):
+        stage.show(tick)
+        data = stage.data
+        rows.append(stage.row.copy())
+        states.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[own].copy()))
+        if camera is not None:
+            buffer = io.BytesIO()
+            Image.fromarray(camera.frame(tick)).save(buffer, "PNG")
+            pictures += buffer.getvalue()
+            ends.append(len(pictures))
+        _answer(frame=number, frames=len(ticks))
+    qpos, qvel, ctrl = (np.array(each) for each in zip(*states, strict=True))
+    names = [
+        f"{model.joint(joint).name or joint}{f'_{k}' if size > 1 else ''}"
+        for joint in range(model.njnt)
+        for size in [_POSITIONS[int(model.jnt_type[joint])]]
+        for k in range(size)
+    ]
+    np.savez(
+        out,
+        rows=np.concatenate(rows),
+        qpos=qpos,
+        qvel=qvel,
+        ctrl=ctrl,
+        names=np.array(names),
+        controls=np.array([model.actuator(k).name or str(k) for k in own], str),
+        pictures=np.frombuffer(pictures, np.uint8),
+        ends=np.array(ends, np.int64),
+    )
+
+
+_POSITIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): 7,
+    int(mujoco.mjtJoint.mjJNT_BALL): 4,
+    int(mujoco.mjtJoint.mjJNT_SLIDE): 1,
+    int(mujoco.mjtJoint.mjJNT_HINGE): 1,
+}
+"""Numbers in ``qpos`` by joint type."""
 
 
 def run() -> None:

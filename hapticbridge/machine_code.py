@@ -102,7 +102,9 @@ def _machine() -> tuple[Any, Any]:
     target = llvm.Target.from_triple(llvm.get_process_triple()).create_target_machine(
         cpu=cpu, features=features, opt=3, reloc="pic", codemodel="default"
     )
-    return target, llvm.create_lljit_compiler(target, suppress_errors=True)
+    # one stretch of memory for all sections: apart by more than 2 GB, as in a process that reserves
+    # much address space, they could not refer to each other, and the other linker aborts
+    return target, llvm.create_lljit_compiler(target, use_jit_link=True, suppress_errors=True)
 
 
 @cache

@@ -103,8 +103,8 @@ def test_library_reads_events_metadata_and_attachments_in_time_order(whole: Path
 def test_schema_lists_every_field_with_its_type() -> None:
     lines = layout.tick_schema().decode().splitlines()
     assert lines[0] == "int64 tick"
-    assert "float64[3] device_position" in lines
-    assert "float64[6] wrench_on_device" in lines
+    assert "float64[3] device_position # m" in lines
+    assert "float64[6] wrench_on_device # N, N m" in lines
     assert "float64 share" in lines
     assert len(lines) == len(TICK_DTYPE.names or ())
 
@@ -344,8 +344,9 @@ def rewritten(path: Path, output: Path, change: Callable[[str, Any], Any]) -> No
             writer.add_attachment(0, 0, *change("attachment", given))
         ids = {"/foreign": writer.register_channel("/foreign", "json", 0)}
         for channel in summary.channels.values():
-            schema = summary.schemas[channel.schema_id]
-            known = writer.register_schema(schema.name, schema.encoding, schema.data)
+            known = 0
+            if schema := summary.schemas.get(channel.schema_id):
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
             ids[channel.topic] = writer.register_channel(
                 channel.topic, channel.message_encoding, known
             )
@@ -403,7 +404,7 @@ def test_digest_tells_any_change_although_all_checksums_are_right(
 ) -> None:
     rewritten(whole, tmp_path / "run.mcap", first_call(kind, edit))
     recording = read_recording(tmp_path / "run.mcap")
-    assert recording.problems == ()
+    assert all("does not follow" in problem for problem in recording.problems)
     assert recording.digest == read_recording(whole).digest
     assert recording.digest != recording.computed_digest
 
@@ -446,9 +447,10 @@ def test_cut_anywhere_reads_to_the_last_whole_chunk(whole: Path, tmp_path: Path)
         assert recording.meta["method"] == "implicit"
         assert recording.attachments["model.mjb"] == FILES[1].data
         assert same(recording.ticks, rows[: recording.ticks.size])
-        # what the whole chunks hold, but for their events, schemas and the records' heads
+        # what the whole chunks hold, but for their events, schemas and the records' heads, and a
+        # tenth for the messages of ROS
         held = sum(size for end, size in ends if end <= offset) // (TICK_DTYPE.itemsize + 35)
-        assert held - 20 <= recording.ticks.size <= held
+        assert 0.88 * held - 20 <= recording.ticks.size <= held
     path.write_bytes(data)
     assert not read_recording(path).is_cut
 

@@ -25,6 +25,7 @@ TOPICS = {
         "missed-deadlines",
         "shaking-scene",
         "many-recordings",
+        "other-programs",
     ),
     "Explanation": (
         "passivity",

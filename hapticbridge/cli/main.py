@@ -37,7 +37,7 @@ COMMANDS = {
     "view": "Show a recorded run in a browser.",
     "render": "Draw a recorded run: a picture, or a film of it.",
     "compare": "Find the first tick and field where two runs differ.",
-    "export": "Write a recording as Parquet, CSV or HDF5.",
+    "export": "Write a recording as a table, for a viewer or to learn from.",
     "repair": "Make a whole file of a recording that a crash cut.",
     "devices": "List the haptic devices plugged in and supported.",
     "identify": "Measure a device's mass, damping, friction, resolution and delay.",

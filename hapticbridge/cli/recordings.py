@@ -9,45 +9,73 @@ from typing import Annotated, Literal
 
 import tyro
 
-from hapticbridge.cli.terminal import err, out, plain, print_json
+from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.compare import Comparison, Difference, compare
-from hapticbridge.export import export, time_of
+from hapticbridge.dataset import DATASETS, write_dataset
+from hapticbridge.errors import RecordingError
+from hapticbridge.export import EVERYTHING, export, time_of
+from hapticbridge.film import Shot
 from hapticbridge.units import format_si
 
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """Write a recording as Parquet, CSV or HDF5.
+    """Write a recording as a table, for a viewer or to learn from.
 
-    The table has a row per tick. Parquet keeps units in the columns' metadata, CSV in a file .json
-    beside it, HDF5 in attributes; metadata and events go along. --from and --to cut a piece out of
-    the run; the times of its marks are printed. Exit code 1 if the recording is damaged: what can
-    be read is written.
+    'parquet', 'csv' and 'hdf5' have a row per tick, with units, metadata and events. 'rerun' is a
+    file for the viewer of that name, 'foxglove' a layout for Foxglove, which opens the recording
+    itself. 'lerobot' and 'robomimic' write a folder with an episode for each recording, simulated
+    again. --from and --to cut a piece out of a run; the times of its marks are printed. Exit code
+    1 if the recording is damaged: of what can be read, tables are written all the same.
 
     Example:
         hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
     """
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
-    """The recording."""
-    form: Annotated[Literal["parquet", "csv", "hdf5"], tyro.conf.arg(name="format")]
-    """The format; parquet needs the extra 'tables', hdf5 the extra 'hdf5'."""
+    files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")]
+    """The recording; several for 'lerobot' and 'robomimic'."""
+    form: Annotated[
+        Literal["parquet", "csv", "hdf5", "rerun", "foxglove", "lerobot", "robomimic"],
+        tyro.conf.arg(name="format"),
+    ]
+    """The format. 'parquet' and 'lerobot' need the extra 'tables', 'hdf5' and 'robomimic' the extra
+    'hdf5', 'rerun' the extra 'rerun'."""
     start: Annotated[float, tyro.conf.arg(name="from", metavar="S")] = -math.inf
     """First time to write, in s of the run; by default its start."""
     end: Annotated[float, tyro.conf.arg(name="to", metavar="S")] = math.inf
     """Time in s of the run before which the last tick lies; by default its end."""
     out: Path | None = None
-    """File to write; by default the recording's name with .parquet, .csv or .h5."""
+    """File to write; by default the recording's name with the format's ending. A folder that does
+    not exist for 'lerobot' and 'robomimic', by default the format's name."""
     overwrite: bool = False
     """Replace the file if it exists."""
+    fps: int | None = None
+    """Frames per second of a data set, by default 30."""
+    camera: str | None = None
+    """Camera of the scene whose pictures a data set holds, or 'free'; by default none."""
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
+    """Width and height of the pictures in pixels, both even; by default 320 240."""
+    task: str | None = None
+    """Text of a data set on its task; by default the scene's name."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print what was written as JSON."""
 
     def execute(self) -> int:
         """Exports; returns the exit code."""
-        with err.status(f"exporting {plain(str(self.file))} …"):
+        if self.form in DATASETS:
+            return self._write_dataset()
+        of_datasets = {"fps": self.fps, "camera": self.camera, "size": self.size, "task": self.task}
+        for name, value in of_datasets.items():
+            if value is not None:
+                raise RecordingError(f"--{name} goes with --format {' or '.join(DATASETS)}")
+        if len(self.files) != 1:
+            raise RecordingError(
+                f"--format {self.form} writes one recording, not {len(self.files)}; several go "
+                f"with {' or '.join(DATASETS)}"
+            )
+        with err.status(f"exporting {plain(str(self.files[0]))} …"):
             span = self.start, self.end
-            done = export(self.file, self.form, self.out, span=span, overwrite=self.overwrite)
+            done = export(self.files[0], self.form, self.out, span=span, overwrite=self.overwrite)
         found = done.recording
         marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
         if self.as_json:
@@ -66,6 +94,30 @@ class Export:
             damage = plain("; ".join(done.damage))
             err.print(f"[yellow]warning:[/yellow] the recording is damaged: {damage}")
         return 1 if done.damage else 0
+
+    def _write_dataset(self) -> int:
+        """Writes a data set; returns the exit code."""
+        if (self.start, self.end) != EVERYTHING or self.overwrite:
+            raise RecordingError(
+                "--from, --to and --overwrite go with tables; a data set has whole recordings, in "
+                "a new folder"
+            )
+        width, height = self.size or (320, 240)
+        shot = Shot(
+            fps=30 if self.fps is None else self.fps, camera=self.camera, width=width, height=height
+        )
+        with progress("simulating again") as show:
+            done = write_dataset(
+                self.files, self.form, self.out or self.form, shot, task=self.task, progress=show
+            )
+        if self.as_json:
+            print_json({"folder": str(done.folder), "episodes": done.episodes})
+        else:
+            frames = f"{sum(done.episodes)} frames at {shot.fps} Hz"
+            count = len(done.episodes)
+            episodes = "1 episode" if count == 1 else f"{count} episodes"
+            out.print(f"wrote {plain(str(done.folder))}: {episodes}, {frames}")
+        return 0
 
 
 @dataclass(frozen=True, slots=True)

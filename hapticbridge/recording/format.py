@@ -9,6 +9,7 @@ and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds n
 earlier versions may lack ``LATER_FIELDS``.
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
 ``time_ns`` (since the start of the run).
+- Topics with types of ROS 2 for other programs, which follow from the above (``ros_messages``).
 - The metadata record ``hapticbridge.digest`` comes last (see ``seal``).
 
 The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
@@ -24,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticbridge.record import LATER_FIELDS, TICK_DTYPE
+from hapticbridge.record import LATER_FIELDS, TICK_DTYPE, columns_of
 
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"
@@ -32,16 +33,23 @@ TICK_ENCODING = "cdr"
 EVENT_ENCODING = "json"
 TICK_SCHEMA_NAME = "hapticbridge/msg/Tick"
 TICK_SCHEMA_ENCODING = "ros2msg"
-EVENT_SCHEMA_NAME = "hapticbridge.Event"
-EVENT_SCHEMA_ENCODING = "jsonschema"
-EVENT_SCHEMA = (
-    b'{"type": "object", "properties": {"event": {"type": "string"}, '
-    b'"time_ns": {"type": "integer"}}, "required": ["event", "time_ns"]}'
-)
+NO_SCHEMA = 0
+"""Schema number of a topic without one, as MCAP has it: JSON describes itself, and readers of ROS 2
+refuse a file with a schema that is not ROS's."""
+
+PROFILE = "ros2"
+"""Profile of the file, by which readers of ROS 2 know it."""
 
 METADATA_NAME = "hapticbridge"
 DIGEST_NAME = "hapticbridge.digest"
 EPOCH_KEY = "epoch_ns"
+
+
+def epoch_of(meta: Mapping[str, str]) -> int:
+    """Returns the Unix time of a run's start in ns; 0 if the metadata lack or spoil it."""
+    text = meta.get(EPOCH_KEY, "")
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
+
 
 CHUNK_SIZE = 128 * 1024
 """Uncompressed size in bytes at which a chunk is finished: 0.3 s of ticks at 1 kHz. It is the
@@ -74,23 +82,34 @@ def payload_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
-    """Returns the ROS 2 message definition of a record, one field per line."""
+    """Returns the ROS 2 message definition of a record: a field per line, its unit as a comment."""
+    units: dict[str, list[str]] = {}
+    for column in columns_of(record):
+        units.setdefault(column.field, []).append(column.unit)
     lines = []
     for name in record.names or ():
         field = record[name]
         suffix = f"[{field.shape[0]}]" if field.shape else ""
-        lines.append(f"{_ROS_TYPES[field.base.str]}{suffix} {name}\n")
+        unit = ", ".join(dict.fromkeys(units[name]))
+        comment = f" # {unit}" if unit != "1" else ""
+        lines.append(f"{_ROS_TYPES[field.base.str]}{suffix} {name}{comment}\n")
     return "".join(lines).encode()
 
 
 def record_dtype(schema: bytes) -> np.dtype[np.void] | None:
     """Returns the record that a schema of this or an earlier version describes, or None."""
-    lines = schema.decode(errors="replace").splitlines()
-    described = {line.rpartition(" ")[2] for line in lines}
-    lacking = [name for name in LATER_FIELDS if name not in described]
+    described = _without_comments(schema)
+    present = {line.rpartition(" ")[2] for line in described}
+    lacking = [name for name in LATER_FIELDS if name not in present]
     names = [name for name in TICK_DTYPE.names or () if name not in lacking]
     record = np.dtype([(name, TICK_DTYPE[name]) for name in names])
-    return record if tick_schema(record) == schema else None
+    return record if _without_comments(tick_schema(record)) == described else None
+
+
+def _without_comments(schema: bytes) -> list[str]:
+    """Returns the lines of a schema; those of earlier versions have no units."""
+    lines = schema.decode(errors="replace").splitlines()
+    return [line.partition("#")[0].rstrip() for line in lines]
 
 
 def event_payload(event: Mapping[str, object], time_ns: int) -> bytes:

@@ -14,10 +14,11 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from hapticbridge.errors import RecordingError
+from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra, read_json
 from hapticbridge.record import FLAG_LEGEND, SECONDS, TICK_DTYPE, TableColumns
 from hapticbridge.recording import format as layout
+from hapticbridge.recording import ros_messages
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.seal import DIGEST, Digest, seal_fault
@@ -53,7 +54,8 @@ class Contents:
         meta: The metadata; None before they are read.
         seal: Entries of the seal; None before it is read.
         refusal: Reason why the records cannot be read; None if they can.
-        keeps_events: True to parse events.
+        keeps_events: True to parse events, and to compare the messages for ROS 2.
+        has_messages: True if there are such messages; earlier versions wrote none.
     """
 
     problems: list[str]
@@ -65,6 +67,10 @@ class Contents:
     seal: dict[str, str] | None = None
     refusal: str | None = None
     keeps_events: bool = True
+    has_messages: bool = False
+    _written: ros_messages.Checksums = field(default_factory=ros_messages.Checksums)
+    _derived: ros_messages.Checksums = field(default_factory=ros_messages.Checksums)
+    _messages: ros_messages.Messages | None = None
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _topics: dict[int, str] = field(default_factory=dict)
     _names: set[str] = field(default_factory=set)
@@ -121,8 +127,13 @@ class Contents:
                     topic = topics.get(channel, "")
                     if topic == layout.TICK_TOPIC:
                         stop = self._add_ticks(data, position, channel)
-                    elif topic == layout.EVENT_TOPIC and self.keeps_events:
-                        self._add_event(data[position + _MESSAGE_HEAD : stop])
+                    elif topic and self.keeps_events:
+                        payload = data[position + _MESSAGE_HEAD : stop]
+                        if topic == layout.EVENT_TOPIC:
+                            self._add_event(payload)
+                        else:
+                            time = int.from_bytes(data[body + 6 : body + 14], "little")
+                            self._written.add(topic, time, payload)
                 elif opcode == Opcode.SCHEMA:
                     self._add_schema(Fields(data, body, stop))
                 elif opcode == Opcode.CHANNEL:
@@ -145,6 +156,8 @@ class Contents:
         topic, encoding = fields.text(), fields.text()
         if topic == layout.EVENT_TOPIC and encoding == layout.EVENT_ENCODING:
             self._topics[channel] = topic
+        if topic in ros_messages.TOPICS and encoding == layout.TICK_ENCODING:
+            self._topics[channel], self.has_messages = topic, True
         if topic == layout.TICK_TOPIC and channel not in self._topics:
             name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
             if (name, schema_encoding) != (layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING):
@@ -177,6 +190,8 @@ class Contents:
             )
             run = count if matches.all() else int(matches.argmin())
             self.take(rows["payload"]["record"][:run])
+            if messages := self._expected():
+                self._derived.add_all(messages.of_ticks(rows["payload"]["record"][:run]))
             position += run * size
             if run < count or count == 0:
                 break
@@ -193,6 +208,26 @@ class Contents:
         if not isinstance(event, dict):
             raise DamageError("an event is not a JSON object")
         self.events.append((payload, event))
+        if messages := self._expected():
+            time = event.get("time_ns")
+            time = time if isinstance(time, int) else 0
+            line = messages.of_event(payload, time, event.get("event"))
+            self._derived.add(ros_messages.LOG, *line)
+
+    def _expected(self) -> ros_messages.Messages | None:
+        """Returns what derives the messages for ROS 2; None for a file without them."""
+        if not self.has_messages or not self.keeps_events or self.meta is None:
+            return None
+        if self._messages is None:
+            axes = ros_messages.axes_of(self.meta)
+            self._messages = ros_messages.Messages(layout.epoch_of(self.meta), axes)
+        return self._messages
+
+    def message_fault(self) -> str:
+        """Returns a sentence if the messages for ROS 2 do not follow from the ticks; else empty."""
+        if differing := self._expected() and self._written.differing(self._derived):
+            return f"what {choices(differing)} say does not follow from the ticks and events"
+        return ""
 
 
 CUT = "the file is cut: its end is missing"
@@ -417,6 +452,9 @@ def _read_through(
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")
     meta = contents.meta or {}
+    is_whole = not container.is_cut and not contents.problems
+    if is_whole and (fault := contents.message_fault()):
+        contents.problems.append(fault)
     digest.describe(meta, contents.attachments)
     for payload, _ in contents.events:
         digest.add_event(payload)

@@ -65,12 +65,11 @@ def rewrite(
     Raises:
         RecordingError: The file cannot be written, or exists and the access is ``exclusive``.
     """
-    epoch = recording.meta.get(layout.EPOCH_KEY, "")
     writer = RecordingWriter(
         output,
         recording.meta,
         attachments,
-        int(epoch) if epoch.isascii() and epoch.isdigit() and len(epoch) < 20 else 0,
+        layout.epoch_of(recording.meta),
         exclusive=exclusive,
         record=recording.record,
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import format as layout
-from hapticbridge.recording import seal
+from hapticbridge.recording import ros_messages, seal
 from hapticbridge.recording.format import Attachment
 
 # Chunk index on disk
@@ -265,6 +265,7 @@ class RecordingWriter:
         meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
         check_contents(meta, attachments)
         self._digest = seal.Digest(meta, attachments)
+        self._messages = ros_messages.Messages(self._epoch, ros_messages.axes_of(meta))
         self._sequence = 0
         self._is_closed = False
         try:
@@ -290,7 +291,7 @@ class RecordingWriter:
             enable_data_crcs=True,
         )
         self._index.take_over(self._mcap)
-        self._mcap.start(library="hapticbridge")
+        self._mcap.start(profile=layout.PROFILE, library="hapticbridge")
         self._mcap.add_metadata(layout.METADATA_NAME, dict(meta))
         for item in attachments:
             self._mcap.add_attachment(
@@ -299,15 +300,20 @@ class RecordingWriter:
         tick_schema = self._mcap.register_schema(
             layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema(self._record)
         )
-        event_schema = self._mcap.register_schema(
-            layout.EVENT_SCHEMA_NAME, layout.EVENT_SCHEMA_ENCODING, layout.EVENT_SCHEMA
-        )
         self._ticks = self._mcap.register_channel(
             layout.TICK_TOPIC, layout.TICK_ENCODING, tick_schema
         )
         self._events = self._mcap.register_channel(
-            layout.EVENT_TOPIC, layout.EVENT_ENCODING, event_schema
+            layout.EVENT_TOPIC, layout.EVENT_ENCODING, layout.NO_SCHEMA
         )
+        schemas = {
+            name: self._mcap.register_schema(name, layout.TICK_SCHEMA_ENCODING, text)
+            for name, text in dict(ros_messages.TOPICS.values()).items()
+        }
+        self._channels = {
+            topic: self._mcap.register_channel(topic, layout.TICK_ENCODING, schemas[name])
+            for topic, (name, _) in ros_messages.TOPICS.items()
+        }
 
     @property
     def is_full(self) -> bool:
@@ -336,6 +342,9 @@ class RecordingWriter:
                     time,
                     (self._sequence + index) & 0xFFFFFFFF,
                 )
+            for topic, messages in self._messages.of_ticks(rows).items():
+                for time, payload in messages.tolist():
+                    self._mcap.add_message(self._channels[topic], time, payload, time)
         except OSError as error:
             raise self._failed(error) from error
         self._sequence += len(times)
@@ -353,6 +362,8 @@ class RecordingWriter:
         self._digest.add_event(payload)
         try:
             self._mcap.add_message(self._events, time, payload, time)
+            time, line = self._messages.of_event(payload, int(time_ns), event.get("event"))
+            self._mcap.add_message(self._channels[ros_messages.LOG], time, line, time)
         except OSError as error:
             raise self._failed(error) from error
 

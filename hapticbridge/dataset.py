@@ -1,0 +1,454 @@
+"""Recordings as a data set for learning from demonstrations: LeRobot's and robomimic's formats.
+
+Every recording is an episode. It is simulated again, which gives the scene's positions and, if a
+camera is named, its pictures. A frame holds
+
+| name                   | content                                                              |
+|------------------------|----------------------------------------------------------------------|
+| ``observation.state``  | pose of the tool's grip: position in m, quaternion (w, x, y, z)      |
+| ``observation.wrench`` | force and torque on the hand, in N and N m, along the scene's axes   |
+| ``observation.qpos``   | positions of all joints, as MuJoCo has them                          |
+| ``observation.ctrl``   | controls of the scene's own actuators, if there are any              |
+| ``action``             | pose of the handle one frame later, and the wrench on the tool then  |
+
+References:
+    LeRobotDataset v3.0; robomimic's documentation of its data sets.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import RecordingError, choices
+from hapticbridge.files import import_extra
+from hapticbridge.film import Shot, states
+from hapticbridge.record import force_on_hand
+from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.ros_messages import axes_of
+
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+
+STATE, ON_HAND, QPOS, CTRL, ACTION = (
+    *("observation.state", "observation.wrench", "observation.qpos", "observation.ctrl"),
+    "action",
+)
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A recording as frames.
+
+    Attributes:
+        name: File name of the recording.
+        scene: Name of its scene.
+        values: Numbers by name, (n, k) float32 each.
+        names: Names of the k numbers, by name.
+        states: ``qpos`` and ``qvel`` in a row, (n, nq + nv).
+        pictures: PNG of each frame; none without a camera.
+    """
+
+    name: str
+    scene: str
+    values: Mapping[str, NDArray[np.float32]]
+    names: Mapping[str, tuple[str, ...]]
+    states: NDArray[np.float64]
+    pictures: tuple[bytes, ...] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+
+def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None = None) -> Episode:
+    """Simulates a recording again, and returns its frames.
+
+    Args:
+        recording: The recording, opened.
+        shot: Frames per second, and the camera and size of pictures; none without a camera.
+        progress: Called with the finished and all frames, and the recording's name.
+
+    Raises:
+        RecordingError: It cannot be simulated again, or has fewer than two frames.
+        HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
+    """
+    name = recording.path.name
+    tell = None if progress is None else lambda done, total: progress(done, total, name)
+    found = states(recording.path, shot, tell)
+    rows, count = found["rows"], len(found["rows"]) - 1
+    if count < 1:
+        raise RecordingError(f"'{recording.path}' is shorter than two frames at {shot.fps} Hz")
+    axes = axes_of(recording.meta)
+    torque = found["rows"]["wrench_on_device"][:, 3:] @ axes.T
+    values = {
+        STATE: np.concatenate([rows["tool_position"], rows["tool_quaternion"]], axis=1)[:-1],
+        ON_HAND: np.concatenate([force_on_hand(rows, axes), torque], axis=1)[:-1],
+        QPOS: found["qpos"][:-1],
+        CTRL: found["ctrl"][:-1],
+        ACTION: np.concatenate(
+            [rows["handle_position"], rows["handle_quaternion"], rows["wrench_on_tool"]], axis=1
+        )[1:],
+    }
+    names = {
+        STATE: POSE,
+        ON_HAND: WRENCH,
+        QPOS: tuple(found["names"].tolist()),
+        CTRL: tuple(found["controls"].tolist()),
+        ACTION: (*POSE, *WRENCH),
+    }
+    if not found["ctrl"].shape[1]:
+        del values[CTRL], names[CTRL]
+    ends = [0, *found["ends"].tolist()]
+    data = found["pictures"].tobytes()
+    pictures = [data[start:end] for start, end in pairwise(ends)]
+    return Episode(
+        name=name,
+        scene=recording.meta.get("scene", ""),
+        values={key: value.astype(np.float32) for key, value in values.items()},
+        names=names,
+        states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
+        pictures=tuple(pictures[:count]),
+    )
+
+
+class Writer(Protocol):
+    """A data set being written into a folder."""
+
+    def __init__(self, folder: Path, shot: Shot, task: str) -> None: ...
+
+    def add(self, episode: Episode) -> None:
+        """Appends an episode."""
+
+    def close(self) -> None:
+        """Finishes the data set."""
+
+
+# LeRobot
+
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_FILES_PER_CHUNK = 1000
+_LOOKED_AT = 100
+"""Largest number of pictures of an episode that its statistics take in."""
+
+Stats = dict[str, dict[str, Any]]
+
+
+class LeRobotWriter:
+    """Writer of a LeRobotDataset v3.0: a Parquet file per episode, pictures as PNG in it.
+
+    Raises:
+        RecordingError: pyarrow or pandas is not installed.
+    """
+
+    def __init__(self, folder: Path, shot: Shot, task: str) -> None:
+        self._arrow = import_extra("pyarrow", "a LeRobot data set", "tables", RecordingError)
+        self._parquet = import_extra(
+            "pyarrow.parquet", "a LeRobot data set", "tables", RecordingError
+        )
+        self._pandas = import_extra("pandas", "a LeRobot data set", "tables", RecordingError)
+        self._folder, self._shot, self._task = folder, shot, task
+        self._episodes: list[dict[str, Any]] = []
+        self._features: dict[str, Any] = {}
+        self._frames = 0
+        self._numbers: dict[str, list[NDArray[Any]]] = {}
+
+    def add(self, episode: Episode) -> None:
+        """Implements ``Writer.add``."""
+        arrow, count, number = self._arrow, len(episode), len(self._episodes)
+        index = np.arange(count)
+        numbers: dict[str, NDArray[Any]] = dict(episode.values)
+        numbers["timestamp"] = (index / self._shot.fps).astype(np.float32)
+        counters = index, index * 0 + number, self._frames + index, index * 0
+        numbers |= dict(zip(_COUNTERS, counters, strict=True))
+        columns: dict[str, Any] = {}
+        for name, values in numbers.items():
+            columns[name] = arrow.array(values.ravel())
+            if values.ndim > 1:
+                size = values.shape[1]
+                columns[name] = arrow.FixedSizeListArray.from_arrays(columns[name], size)
+            self._numbers.setdefault(name, []).append(values)
+        looked = np.zeros((0, 3))
+        if episode.pictures:
+            key = f"observation.images.{self._shot.camera}"
+            pictures = [
+                {"bytes": data, "path": f"frame-{frame:06d}.png"}
+                for frame, data in enumerate(episode.pictures)
+            ]
+            kind = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
+            columns[key] = arrow.array(pictures, kind)
+            looked = _pixels(episode.pictures)
+            self._numbers.setdefault(key, []).append(looked)
+        self._features = self._features or self._describe(episode)
+        chunk, file = divmod(number, _FILES_PER_CHUNK)
+        self._write(_DATA.format(chunk_index=chunk, file_index=file), columns)
+        stats = {name: _statistics(values, count) for name, values in numbers.items()}
+        if episode.pictures:
+            stats[key] = _of_pictures(_statistics(looked, count))
+        self._episodes.append(
+            {
+                "episode_index": number,
+                "tasks": [self._task],
+                "length": count,
+                "data/chunk_index": chunk,
+                "data/file_index": file,
+                "dataset_from_index": self._frames,
+                "dataset_to_index": self._frames + count,
+                **{
+                    f"stats/{name}/{kind}": value
+                    for name, found in stats.items()
+                    for kind, value in found.items()
+                },
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+        self._frames += count
+
+    def close(self) -> None:
+        """Implements ``Writer.close``."""
+        episodes = {name: [each[name] for each in self._episodes] for name in self._episodes[0]}
+        self._write(
+            _EPISODES.format(chunk_index=0, file_index=0),
+            {name: self._arrow.array(values) for name, values in episodes.items()},
+        )
+        self._pandas.DataFrame({"task_index": [0]}, index=[self._task]).to_parquet(
+            self._folder / "meta" / "tasks.parquet"
+        )
+        stats: Stats = {}
+        for name, parts in self._numbers.items():
+            stats[name] = _statistics(np.concatenate(parts), self._frames)
+            if name.startswith("observation.images."):
+                stats[name] = _of_pictures(stats[name])
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": "hapticbridge",
+            "total_episodes": len(self._episodes),
+            "total_frames": self._frames,
+            "total_tasks": 1,
+            "chunks_size": _FILES_PER_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": self._shot.fps,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": _DATA,
+            "video_path": None,
+            "features": self._features,
+        }
+        for name, facts in (("info", info), ("stats", stats)):
+            text = json.dumps(facts, indent=4)
+            (self._folder / "meta" / f"{name}.json").write_text(text, encoding="utf-8")
+
+    def _describe(self, episode: Episode) -> dict[str, Any]:
+        features: dict[str, Any] = {
+            name: {"dtype": "float32", "shape": [len(names)], "names": list(names)}
+            for name, names in episode.names.items()
+        }
+        if episode.pictures:
+            shape = [self._shot.height, self._shot.width, 3]
+            features[f"observation.images.{self._shot.camera}"] = {
+                "dtype": "image",
+                "shape": shape,
+                "names": ["height", "width", "channels"],
+            }
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        for name in _COUNTERS:
+            features[name] = {"dtype": "int64", "shape": [1], "names": None}
+        return features
+
+    def _write(self, name: str, columns: Mapping[str, Any]) -> None:
+        path = self._folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._parquet.write_table(self._arrow.table(dict(columns)), path)
+
+
+def _statistics(values: NDArray[Any], count: int) -> dict[str, Any]:
+    """Returns LeRobot's statistics of numbers, (n,) or (n, k), over the first axis."""
+    values = values.astype(np.float64).reshape(len(values), -1)
+    found = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0)}
+    found["std"] = values.std(0)
+    found |= {name: np.quantile(values, share, axis=0) for name, share in _QUANTILES.items()}
+    return {name: value.tolist() for name, value in found.items()} | {"count": [count]}
+
+
+def _pixels(pictures: Sequence[bytes]) -> NDArray[np.float64]:
+    """Returns pixels of some pictures, (n, 3) from 0 to 1."""
+    from PIL import Image  # noqa: PLC0415 - for pictures alone
+
+    some = pictures[:: -(-len(pictures) // _LOOKED_AT)]
+    pixels = [np.asarray(Image.open(io.BytesIO(data))).reshape(-1, 3)[::16] for data in some]
+    return np.concatenate(pixels) / 255.0
+
+
+def _of_pictures(stats: dict[str, Any]) -> dict[str, Any]:
+    """Returns statistics of three colours in the shape of pictures, (3, 1, 1)."""
+    return {
+        name: value if name == "count" else [[[each]] for each in value]
+        for name, value in stats.items()
+    }
+
+
+# robomimic
+
+ROBOMIMIC_FILE = "demos.hdf5"
+_OBSERVATIONS = {STATE: "tool_pose", ON_HAND: "hand_wrench", QPOS: "qpos", CTRL: "ctrl"}
+
+
+class RobomimicWriter:
+    """Writer of a robomimic data set: ``demos.hdf5`` with a group ``data/demo_K`` per episode.
+
+    Raises:
+        RecordingError: h5py is not installed.
+    """
+
+    def __init__(self, folder: Path, shot: Shot, task: str) -> None:
+        h5py = import_extra("h5py", "a robomimic data set", "hdf5", RecordingError)
+        self._file, self._shot = h5py.File(folder / ROBOMIMIC_FILE, "w"), shot
+        self._data = self._file.create_group("data")
+        self._data.attrs["task"] = task
+        self._count = self._total = 0
+
+    def add(self, episode: Episode) -> None:
+        """Implements ``Writer.add``."""
+        count = len(episode)
+        demo = self._data.create_group(f"demo_{self._count}")
+        demo.attrs["num_samples"], demo.attrs["recording"] = count, episode.name
+        demo["actions"], demo["states"] = episode.values[ACTION], episode.states
+        done = np.zeros(count)
+        done[-1] = 1.0
+        demo["rewards"], demo["dones"] = np.zeros(count), done.astype(np.int64)
+        observed: dict[str, NDArray[Any]] = {
+            short: episode.values[name]
+            for name, short in _OBSERVATIONS.items()
+            if name in episode.values
+        }
+        if episode.pictures:
+            observed[f"{self._shot.camera}_image"] = _frames(episode.pictures)
+        for name, values in observed.items():
+            demo[f"obs/{name}"] = values
+            demo[f"next_obs/{name}"] = np.concatenate([values[1:], values[-1:]])
+        if not self._count:
+            about = {"env_name": episode.scene, "type": 2, "env_kwargs": {"fps": self._shot.fps}}
+            self._data.attrs["env_args"] = json.dumps(about)
+        self._count, self._total = self._count + 1, self._total + count
+
+    def close(self) -> None:
+        """Implements ``Writer.close``."""
+        self._data.attrs["total"] = self._total
+        self._file["mask/train"] = [f"demo_{number}".encode() for number in range(self._count)]
+        self._file.close()
+
+
+def _frames(pictures: Sequence[bytes]) -> NDArray[np.uint8]:
+    """Returns pictures as numbers, (n, height, width, 3)."""
+    from PIL import Image  # noqa: PLC0415 - for pictures alone
+
+    return np.stack([np.asarray(Image.open(io.BytesIO(data))) for data in pictures])
+
+
+DATASETS: dict[str, type[Writer]] = {"lerobot": LeRobotWriter, "robomimic": RobomimicWriter}
+"""Writer of each format."""
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenDataset:
+    """Result of ``write_dataset``.
+
+    Attributes:
+        folder: The data set.
+        episodes: Number of frames of each episode.
+    """
+
+    folder: Path
+    episodes: tuple[int, ...]
+
+
+def write_dataset(
+    paths: Sequence[str | Path],
+    form: str,
+    folder: str | Path,
+    shot: Shot | None = None,
+    *,
+    task: str | None = None,
+    progress: Progress | None = None,
+) -> WrittenDataset:
+    """Writes recordings of one scene as a data set, an episode each.
+
+    If writing fails, no partial data set remains.
+
+    Args:
+        paths: The recordings.
+        form: One of ``DATASETS``.
+        folder: Folder to write; it must not exist.
+        shot: Frames per second, and the camera and size of pictures; 30 and none by default.
+        task: What was done, in words; None takes the scene's name.
+        progress: Called with the finished and all frames, and the recording's name.
+
+    Raises:
+        RecordingError: There is no recording, one is damaged, cut, of another scene than the
+            first or cannot be simulated again, the format is unknown, or the folder exists or
+            cannot be written.
+        HapticBridgeError: Nothing can be drawn here, or the scene has no such camera.
+    """
+    if form not in DATASETS:
+        raise RecordingError(f"format {form!r:.60} is unknown; the formats are {choices(DATASETS)}")
+    if not paths:
+        raise RecordingError("a data set needs a recording at least")
+    shot, folder = shot or Shot(), Path(folder)
+    if folder.exists():
+        raise RecordingError(f"'{folder}' exists; choose another folder")
+    recordings = [_sound(open_recording(path)) for path in paths]
+    draft, counts = folder.with_name(f".{folder.name}.draft"), []
+    try:
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir()
+        writer = DATASETS[form](draft, shot, task or recordings[0].meta.get("scene", ""))
+        for episode in _episodes(recordings, shot, progress):
+            writer.add(episode)
+            counts.append(len(episode))
+        writer.close()
+        draft.rename(folder)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        if not folder.absolute().parent.is_dir():
+            reason = f"the folder {folder.parent} does not exist"
+        raise RecordingError(f"cannot write '{folder}': {reason}") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+    return WrittenDataset(folder, tuple(counts))
+
+
+def _sound(recording: RecordingFile) -> RecordingFile:
+    """Returns a recording if it is whole and undamaged; what is learned from must be true."""
+    faults = [*recording.problems, recording.cut_sentence, recording.seal_fault]
+    if found := "; ".join(filter(None, faults)):
+        raise RecordingError(f"'{recording.path}' cannot be learned from: {found}")
+    return recording
+
+
+def _episodes(
+    recordings: Sequence[RecordingFile], shot: Shot, progress: Progress | None
+) -> Iterator[Episode]:
+    first: Episode | None = None
+    for recording in recordings:
+        episode = episode_of(recording, shot, progress)
+        first = first or episode
+        if episode.names != first.names:
+            raise RecordingError(
+                f"'{recording.path}' has other joints or actuators than '{first.name}'; the "
+                "episodes of a data set are of one scene"
+            )
+        yield episode

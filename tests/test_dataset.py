@@ -1,0 +1,185 @@
+"""Recordings as a data set to learn from: LeRobot's and robomimic's formats."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import mujoco
+import numpy as np
+import pytest
+from cli_cases import Called, one_sentence
+from PIL import Image
+
+import hapticbridge as hb
+from hapticbridge.dataset import write_dataset
+from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.film import Shot
+from hapticbridge.recording import read_recording
+
+pq: Any = importlib.import_module("pyarrow.parquet")
+
+LENGTHS = (1.0, 0.6)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder, found = tmp_path_factory.mktemp("runs"), []
+    for number, seconds in enumerate(LENGTHS):
+        found.append(folder / f"{number}.mcap")
+        with hb.Bridge("ratchet", clock=hb.SimulatedClock(), recording=found[-1]) as bridge:
+            bridge.run(duration=seconds)
+    return found
+
+
+def lerobot(folder: Path, episode: int) -> dict[str, Any]:
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    file = info["data_path"].format(chunk_index=0, file_index=episode)
+    table = pq.read_table(folder / file)
+    return {name: table[name].to_pylist() for name in table.column_names}
+
+
+def test_a_frame_is_what_the_run_was_at_its_time(runs: list[Path], tmp_path: Path) -> None:
+    done = write_dataset(runs, "lerobot", tmp_path / "set", Shot(fps=20))
+    assert done.episodes == (19, 11)  # the last frame is the last action alone
+    scene = hb.load_scene("ratchet")
+    data, site = mujoco.MjData(scene.model), scene.model.site("grip").id
+    pose = np.zeros(4)
+    for number, path in enumerate(runs):
+        ticks, table = read_recording(path).ticks, lerobot(done.folder, number)
+        for frame in range(done.episodes[number]):
+            now, later = (ticks[round((frame + k) * 50) - (frame + k > 0)] for k in (0, 1))
+            state = table["observation.state"][frame]
+            np.testing.assert_allclose(state[:3], now["tool_position"], rtol=1e-6, atol=1e-7)
+            np.testing.assert_allclose(
+                table["action"][frame][:7],
+                [*later["handle_position"], *later["handle_quaternion"]],
+                rtol=1e-6,
+                atol=1e-7,
+            )
+            np.testing.assert_allclose(
+                table["action"][frame][7:], later["wrench_on_tool"], rtol=1e-6, atol=1e-7
+            )
+            np.testing.assert_allclose(
+                table["observation.wrench"][frame], now["wrench_on_device"], rtol=1e-6, atol=1e-7
+            )
+            # the joints' positions put the grip where the record says
+            data.qpos[:] = table["observation.qpos"][frame]
+            mujoco.mj_kinematics(scene.model, data)
+            np.testing.assert_allclose(data.site_xpos[site], state[:3], atol=1e-6)
+            mujoco.mju_mat2Quat(pose, data.site_xmat[site])
+            assert abs(pose @ np.array(state[3:])) == pytest.approx(1.0, abs=1e-6)
+        assert table["timestamp"] == pytest.approx(np.arange(len(table["timestamp"])) / 20)
+    assert "observation.ctrl" not in table, "the coupling's own actuators are none of the scene's"
+
+
+def test_pictures_show_the_scene_without_arrows(runs: list[Path], tmp_path: Path) -> None:
+    shot = Shot(fps=10, camera="free", width=64, height=48)
+    folder = write_dataset(runs[:1], "lerobot", tmp_path / "set", shot).folder
+    pictures = lerobot(folder, 0)["observation.images.free"]
+    assert len(pictures) == 9
+    for each in pictures:
+        picture = np.asarray(Image.open(io.BytesIO(each["bytes"])))
+        assert picture.shape == (48, 64, 3)
+        assert picture.std() > 5.0
+    write_dataset(runs[:1], "robomimic", tmp_path / "other", shot)
+    with h5py.File(tmp_path / "other" / "demos.hdf5") as file:
+        np.testing.assert_array_equal(file["data/demo_0/obs/free_image"][-1], picture)
+
+
+def test_lerobot_finds_what_its_description_says(runs: list[Path], tmp_path: Path) -> None:
+    folder = write_dataset(runs, "lerobot", tmp_path / "set", task="turn it").folder
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    stats = json.loads((folder / "meta" / "stats.json").read_text())
+    tables = [lerobot(folder, number) for number in range(2)]
+    assert (info["total_episodes"], info["codebase_version"]) == (2, "v3.0")
+    assert info["total_frames"] == sum(len(table["index"]) for table in tables)
+    joined = {name: tables[0][name] + tables[1][name] for name in tables[0]}
+    assert joined["index"] == list(range(info["total_frames"]))
+    assert set(info["features"]) == set(joined) == set(stats)
+    for name, feature in info["features"].items():
+        values = np.array(joined[name], dtype=np.float64).reshape(info["total_frames"], -1)
+        assert [values.shape[1]] == feature["shape"]
+        assert feature["names"] is None or len(feature["names"]) == values.shape[1]
+        assert stats[name]["mean"] == pytest.approx(values.mean(0), abs=1e-9)
+        assert stats[name]["std"] == pytest.approx(values.std(0), abs=1e-9)
+    episodes = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [each["dataset_from_index"] for each in episodes] == [0, len(tables[0]["index"])]
+    assert episodes[1]["tasks"] == ["turn it"]
+    assert episodes[1]["stats/action/max"] == pytest.approx(np.max(tables[1]["action"], axis=0))
+
+
+def test_lerobot_loads_it(runs: list[Path], tmp_path: Path) -> None:
+    package = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    folder = write_dataset(runs, "lerobot", tmp_path / "set").folder
+    loaded = package.LeRobotDataset("local/ratchet", root=folder)
+    assert (loaded.num_episodes, loaded[0]["task"]) == (2, "ratchet")
+
+
+def test_robomimic_has_its_groups(runs: list[Path], tmp_path: Path) -> None:
+    folder = write_dataset(runs, "robomimic", tmp_path / "set").folder
+    with h5py.File(folder / "demos.hdf5") as file:
+        demos = [file["data"][name.decode()] for name in file["mask/train"]]
+        assert file["data"].attrs["total"] == sum(demo.attrs["num_samples"] for demo in demos)
+        assert json.loads(file["data"].attrs["env_args"])["env_name"] == "ratchet"
+        for demo in demos:
+            count = demo.attrs["num_samples"]
+            for name in ("actions", "states", "rewards", "dones", "obs/qpos", "next_obs/qpos"):
+                assert len(demo[name]) == count
+            np.testing.assert_array_equal(demo["next_obs/qpos"][:-1], demo["obs/qpos"][1:])
+            assert demo["dones"][-1] == 1
+            assert demo["dones"][:-1].sum() == 0
+
+
+def test_what_cannot_be_learned_from_is_refused_and_leaves_nothing(
+    runs: list[Path], tmp_path: Path
+) -> None:
+    cut, other = tmp_path / "cut.mcap", tmp_path / "other.mcap"
+    cut.write_bytes(runs[0].read_bytes()[:-30])
+    with hb.Bridge("point_mass", clock=hb.SimulatedClock(), recording=other) as bridge:
+        bridge.run(duration=0.3)
+    target = tmp_path / "set"
+    cases: list[tuple[list[Path], str, Shot, str]] = [
+        ([], "lerobot", Shot(), "a recording at least"),
+        ([cut], "lerobot", Shot(), "its end is missing"),
+        ([runs[0], other], "lerobot", Shot(), "are of one scene"),
+        ([other], "robomimic", Shot(fps=1), "shorter than two frames"),
+        (runs, "lerobot", Shot(camera="nowhere"), "no camera 'nowhere'"),
+        (runs, "csv", Shot(), "the formats are 'lerobot', 'robomimic'"),
+    ]
+    for paths, form, shot, words in cases:
+        with pytest.raises(HapticBridgeError, match=words):
+            write_dataset(paths, form, target, shot)
+    with pytest.raises(RecordingError, match="does not exist"):
+        write_dataset(runs, "lerobot", tmp_path / "no" / "set")
+    target.mkdir()
+    with pytest.raises(RecordingError, match="exists"):
+        write_dataset(runs, "lerobot", target)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["cut.mcap", "other.mcap", "set"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--format", "csv", "--fps", "3"], "--fps goes with"),
+        (["--format", "lerobot", "--from", "1"], "whole recordings"),
+        (["--format", "lerobot", "--fps", "0"], "fps"),
+        (["--format", "lerobot", "--size", "3", "3"], "width"),
+    ],
+)
+def test_options_that_do_not_go_together_are_a_sentence(
+    call: Called, runs: list[Path], words: list[str], said: str
+) -> None:
+    code, out, err = call("export", str(runs[0]), *words)
+    assert (code, out) == (2, "")
+    assert said in one_sentence(err)
+
+
+def test_several_recordings_are_no_table(call: Called, runs: list[Path]) -> None:
+    code, _, err = call("export", *map(str, runs), "--format", "csv")
+    assert code == 2
+    assert "writes one recording, not 2" in one_sentence(err)
