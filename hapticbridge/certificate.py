@@ -257,11 +257,14 @@ class DampingCondition:
     """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
 
     Attributes:
-        axis: ``translation`` or ``rotation``.
+        axis: ``translation`` or ``rotation``; if it is not felt, the names of the axes.
         needed: Right-hand side in N s/m (rotation: N m s/rad).
         available: The device's damping b; None if unknown.
         remedy: Change that helps if the condition fails.
         delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
+        is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
+            there without work of its own, so no damping bounds what it gets back along the axes
+            with a motor (Barbagli & Salisbury 2003).
     """
 
     axis: str
@@ -269,6 +272,7 @@ class DampingCondition:
     available: float | None
     remedy: str = "lower stiffness or damping, or raise the rate"
     delay: int | None = 0
+    is_felt: bool = True
 
     @property
     def holds(self) -> bool | None:
@@ -277,6 +281,11 @@ class DampingCondition:
 
     def sentence(self) -> str:
         """Describes the condition, with the remedy if it fails."""
+        if not self.is_felt:
+            return (
+                f"{self.axis}: sensed without a motor, so the hand may get back along the other "
+                "axes what it put in there without effort; only --energy-limit bounds it"
+            )
         unit = "N s/m" if self.axis == "translation" else "N m s/rad"
         if self.available is None:
             return (
@@ -303,6 +312,8 @@ def device_conditions(
     method: Method | None = None,
 ) -> tuple[DampingCondition, ...]:
     """Returns the condition for each kind of axis of a device with known translational damping.
+
+    One more, of unknown outcome, is for axes that it senses without a motor.
 
     For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
     not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
@@ -341,6 +352,8 @@ def device_conditions(
             conditions.append(
                 DampingCondition("rotation", needed, info.rotational_damping, remedy, delay)
             )
+        if info.sensed:
+            conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))
     return tuple(conditions)
 
 

@@ -420,6 +420,8 @@ def guard_parameters_for(
         own if own >= required else UNCERTIFIED_CREDIT * own
         for own, required in zip((linear, angular), needed, strict=True)
     ]
+    # a hand that moves about an axis without motor is not paid, so its damping counts for nothing
+    credit = [0.0 if sensed else own for own, sensed in zip(credit, info.senses, strict=True)]
     is_borne = linear >= needed[0] and angular >= needed[1]
     own = period if info.rate is None else max(1.0 / info.rate, period)
     return replace(

@@ -281,6 +281,8 @@ def _at_times(
     condition: DampingCondition, parameters: RunParameters, share: float, times: RunTimes
 ) -> DampingCondition:
     """Returns a device condition at a run's share of deadlines kept and mean times."""
+    if not condition.is_felt:
+        return condition
     coupling = parameters.effective or parameters.coupling
     stiffness = parameters.scale * parameters.force_scale * coupling.stiffness
     if condition.axis == "rotation":

@@ -12,6 +12,7 @@ from emulated.handle import Handle
 from emulated.haply_service import HaplyService
 from emulated.haply_service import VirtualLink as HaplyLink
 from emulated.haply_service import VirtualTime as HaplyTime
+from emulated.hd_stub import HdStub
 from emulated.hid_seam import DrivingClock, HidSeam, Timed
 from emulated.pid_layouts import ODD, USUAL, Report
 from emulated.pid_model import PidStick
@@ -164,8 +165,8 @@ def unheld(driver: str, numbers: Mapping[str, float]) -> tuple[Device, Clock]:
     if driver == "haply":
         haply = HaplyBench(moved, resolution=1e-5)
         return haply.opened(force_limit=8.0), DrivingClock(haply.time)
-    if driver == "forcedimension":
-        stub = Stub()
+    if driver in ("forcedimension", "touch"):
+        stub = Stub() if driver == "forcedimension" else HdStub()
         stub.call("mechanics", numbers["mass"], numbers["damping"], numbers["friction"], 1e-5)
         return stub.opened(), DrivingClock(stub)
     if driver == "pid":
@@ -175,7 +176,7 @@ def unheld(driver: str, numbers: Mapping[str, float]) -> tuple[Device, Clock]:
     return device, DrivingClock(seam)
 
 
-DRIVERS = ("simulated", "falcon", "rawhid", "pid", "haply", "forcedimension")
+DRIVERS = ("simulated", "falcon", "rawhid", "pid", "haply", "forcedimension", "touch")
 
 
 def identified(driver: str, seed: int, axis: str, duration: float = 10.0) -> AxisFit:

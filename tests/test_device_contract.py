@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from device_benches import PERIOD, FalconBench, HaplyBench, paddle
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
+from emulated.hd_stub import HdStub
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam, Timed
 from emulated.pid_layouts import ODD
@@ -136,6 +137,14 @@ def force_dimension(kind: int) -> Device:
     return Ticking(build)
 
 
+def touch(_: Path) -> Device:
+    def build() -> tuple[Device, Timed]:
+        stub = HdStub()
+        return stub.opened(), stub
+
+    return Ticking(build)
+
+
 def serial(_: Path) -> Device:
     def build() -> tuple[Device, Timed]:
         seam = SerialSeam(RawHid(SimulatedDevice(), Claims(rate=500.0)))
@@ -174,6 +183,7 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "haply": haply,
     "omega.3": lambda _: force_dimension(OMEGA3),
     "sigma.7": lambda _: force_dimension(SIGMA7),
+    "touch": touch,
     "stick": lambda _: ticking(lambda: PidStick(SimulatedDevice()), open_pid),
     "odd stick": lambda _: ticking(lambda: PidStick(SimulatedDevice(), ODD), open_pid),
 }
@@ -254,7 +264,7 @@ def test_the_contract_names_what_a_device_breaks(fault: str, words: str) -> None
     assert words in broken
 
 
-@pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "stick"])
+@pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "touch", "stick"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_path: Path) -> None:
     device = DEVICES[name](tmp_path)
@@ -301,6 +311,9 @@ def test_any_data_sheet_survives_json(info: DeviceInfo) -> None:
         ({"axes": ("y", "x")}, "axes = ('y', 'x'): must be of x, y, z, rx, ry, rz, each once, in"),
         ({"axes": ("x", "x")}, "axes = ('x', 'x')"),
         ({"axes": ("x", "w")}, "axes = ('x', 'w')"),
+        ({"axes": ("x", "y"), "sensed": ("y",)}, "sensed = ('y',): must be of x, y, z, rx, ry,"),
+        ({"axes": ("x",), "sensed": ("rz", "rx")}, "each once, in this order, and none of axes"),
+        ({"axes": ("x",), "sensed": "rx"}, "sensed = 'rx'"),
         ({"delay": -1e-3}, "delay = -0.001: must be a finite number >= 0 s"),
         ({"mass": 0.0}, "mass = 0.0: must be a finite number > 0 kg"),
         ({"damping": -0.1}, "damping = -0.1: must be a finite number >= 0 N s/m"),

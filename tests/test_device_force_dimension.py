@@ -18,7 +18,8 @@ from hapticbridge.device import open_device
 from hapticbridge.device.driver import FoundDevice
 from hapticbridge.device.force_dimension import device as forcedimension
 from hapticbridge.device.force_dimension.device import ForceDimensionDevice
-from hapticbridge.device.force_dimension.dhd import MODELS, VARIABLE, Dhd, quaternion_of
+from hapticbridge.device.force_dimension.dhd import MODELS, VARIABLE, Dhd
+from hapticbridge.device.rotation import quaternion_of
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log

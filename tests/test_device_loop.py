@@ -13,6 +13,7 @@ import pytest
 from device_benches import NEWTONS, PERIOD, opened_rawhid
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.handle import planar_hand
+from emulated.hd_stub import HdStub
 from emulated.hid_seam import DrivingClock, HidSeam
 from emulated.pid_model import PidStick
 from emulated.rawhid_model import Claims, RawHid
@@ -118,6 +119,17 @@ def force_dimension(kind: int = OMEGA3) -> Rig:
     return Rig(device, DrivingClock(stub), stub, stub, stub.force, later)
 
 
+def touch() -> Rig:
+    places = np.array([[0, 0, 0], [0, 0, 0], [0, 0, -43], [4, 0, -43], [4, 0, -43]])
+    stub = HdStub(Motion([0.0, 0.3, 2.5, 3.0, 4.0], 1e-3 * places))
+    stub.call("mechanics", 0.1, 1.5, 0.05, 1e-5)
+    stub.call("hand", 300.0, 6.0, 0.3)
+    device = stub.opened(numbers={"damping": 1.5})
+    stub.begin = stub.now
+    later = lambda s: stub.advance(stub.now + s)  # noqa: E731
+    return Rig(device, DrivingClock(stub), stub, stub, stub.force, later)
+
+
 RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
     "falcon": (falcon, "for a wall behind a delay of 2 ticks"),
     # its own period and 1 ms each way on the bus
@@ -126,6 +138,8 @@ RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
     "haply": (haply, "behind a delay of 1 ticks"),
     "omega.3": (force_dimension, "behind a delay of 1 ticks"),
     "sigma.7": (lambda: force_dimension(SIGMA7), "behind a delay of 1 ticks"),
+    # up to a servo tick each way
+    "touch": (touch, "behind a delay of 2 ticks"),
     # what the firmware adds in delay nobody says
     "stick": (stick, "without delay, which is unknown"),
     "odd stick": (lambda: stick("odd"), "without delay, which is unknown"),

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.motion import Array, Motion, turn_between
 from hapticbridge.audit.structure import TOLERANCE, Deviation
-from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
+from hapticbridge.audit.wrench_limits import (
+    AuditedBlock,
+    axes_with_motor,
+    limits_on_tool,
+    spring_energy,
+    whole_wrench,
+)
 from hapticbridge.kernel.parameters import RunParameters
 
 SLACK_SHARE = 0.5
@@ -130,10 +136,10 @@ class EnergyBalance:
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖², (n,) in J.
-        excess_device_energy: Energy given to the device beyond its dissipation and the energy
-            released by scene and coupling, (n,) in J. Zero for an unknown damping or several laws
-            per tick. With a coupling law, energy created by the environment is not included; it
-            belongs to the other port.
+        excess_device_energy: Energy given to the device beyond its dissipation, the energy
+            released by scene and coupling, and the unfelt work (``unfelt_work``), (n,) in J. Zero
+            for an unknown damping or several laws per tick. With a coupling law, energy created by
+            the environment is not included; it belongs to the other port.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
@@ -205,6 +211,7 @@ def _device_excess(
     lost = np.minimum(created, 0.0) if parameters.has_law else created
     released = totals["coupling_work"] + in_springs
     excess = totals["delayed_device_energy"] - totals["device_dissipation"]
+    excess = excess - totals["unfelt_work"]
     return np.asarray(excess + parameters.force_scale / parameters.scale * (lost + released))
 
 
@@ -225,6 +232,10 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
     moved, turned = _device_motion(rows, 0, len(ticks))
     late_moved, late_turned = _device_motion(rows, delay, len(ticks))
     work = np.sum(sent[:, :3] * moved, axis=1) + np.sum(sent[:, 3:] * turned, axis=1)
+    whole = whole_wrench(rows[: len(ticks)], parameters)
+    whole[np.isin(ticks["tick"], events.resumed)] = 0.0
+    gains = events.gains(ticks["tick"])
+    unfelt = unfelt_work(parameters, gains, whole, rows["share"][: len(ticks)], (moved, turned))
     late = np.sum(sent[:, :3] * late_moved, axis=1) + np.sum(sent[:, 3:] * late_turned, axis=1)
     dissipation = np.zeros(len(ticks))
     if parameters.device_damping is not None:
@@ -237,7 +248,46 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
         "device_throughput": _summed(np.abs(work), before["device_throughput"]),
         "delayed_device_energy": _summed(late, before["delayed_device_energy"]),
         "device_dissipation": dissipation,
+        "unfelt_work": _summed(unfelt, before["unfelt_work"]),
     }
+
+
+def unfelt_work(
+    parameters: RunParameters,
+    gains: Array,
+    whole: Array,
+    share: Array,
+    motion: tuple[Array, Array],
+) -> Array:
+    """Returns the work that the hand saves along axes that are sensed without a motor.
+
+        W_u = −w_u·δp + q r² (K/2 + B'/T) ‖δp_u‖²
+
+    w_u is the wrench that a motor would have been sent, δp_u the motion along those axes, r the
+    share, q the ratio of the stiffness at the device to that in the scene. The second part is what
+    the damping that the coupling needs would burn. Like the work of a scene's own motors, this work
+    is a port of its own: the hand may get it back along the other axes.
+
+    Args:
+        parameters: Run parameters.
+        gains: K, B', K_r and B'_r, (n, 4).
+        whole: Wrench that six motors would have been sent, (n, 6) in N and N m.
+        share: r, (n,).
+        motion: δp of each tick, (n, 3) in m, and its rotation vectors, (n, 3) in rad.
+
+    Returns:
+        Work of each tick, (n,) in J; zero for axes that do not move.
+    """
+    lacking = 1.0 - axes_with_motor(parameters)
+    ratios = parameters.force_scale * parameters.scale, parameters.force_scale / parameters.scale
+    work = np.zeros(len(whole))
+    for first, ratio, step in zip((0, 3), ratios, motion, strict=True):
+        column = 2 * first // 3
+        unfelt = step * lacking[first : first + 3]
+        burned = 0.5 * gains[:, column] + gains[:, column + 1] / parameters.period
+        work -= np.sum(whole[:, first : first + 3] * unfelt, axis=1)
+        work += ratio * share**2 * burned * np.sum(unfelt**2, axis=1)
+    return work
 
 
 def _device_motion(rows: NDArray[np.void], first: int, count: int) -> tuple[Array, Array]:

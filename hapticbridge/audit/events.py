@@ -234,6 +234,7 @@ SUMS = (
     "slack",
     "delayed_device_energy",
     "device_dissipation",
+    "unfelt_work",
     "tank_ceiling",
 )
 """Names of the cumulative energies."""

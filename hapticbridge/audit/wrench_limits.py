@@ -217,18 +217,27 @@ def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Devia
         yield Deviation(name, gained, TOLERANCE * (1 + stored), unit, "device pose and share")
 
 
-def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviation:
-    """Compares the wrench on the device with the share of the wrench on the tool."""
-    ticks = block.ticks
+def axes_with_motor(parameters: RunParameters) -> Array:
+    """Returns 1.0 for each axis of the device with a motor, else 0.0; (6,)."""
+    return np.array([parameters.guarding.motors >> i & 1 for i in range(6)], dtype=np.float64)
+
+
+def whole_wrench(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
+    """Returns the wrench that a device with six motors would be sent, (n, 6) in N and N m."""
     axes = np.array(parameters.axes).reshape(3, 3)
     on_tool = ticks["wrench_on_tool"].copy()
     for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
         on_tool[:, part] = _shortened(on_tool[:, part], limit)  # on the tool too with a law
     wrench = -parameters.force_scale * ticks["share"][:, None] * on_tool
-    expected = np.concatenate(
+    return np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1
     )
-    expected *= [parameters.guarding.motors >> i & 1 for i in range(6)]
+
+
+def _wrench_deviation(block: AuditedBlock, parameters: RunParameters) -> Deviation:
+    """Compares the wrench on the device with the share of the wrench on the tool."""
+    ticks = block.ticks
+    expected = whole_wrench(ticks, parameters) * axes_with_motor(parameters)
     sent = ticks["wrench_on_device"]
     deviation = Deviation.between(
         "wrench_on_device", sent, expected, "N or N m", "wrench on the tool and share"

@@ -135,7 +135,13 @@ def _without_motor(setup: RunSetup) -> Iterator[str]:
         ("place", AXES[:3], format_si(setup.limits.hold_force, "N")),
         ("orientation", AXES[3:], f"{format_si(setup.limits.hold_torque, 'N m')} (--hold-torque)"),
     ):
-        if lacking := [axis for axis in part if axis not in setup.info.axes]:
+        if sensed := [axis for axis in part if axis in setup.info.sensed]:
+            yield (
+                f"the device senses {', '.join(sensed)} without a motor: the tool follows up to "
+                f"{limit} beyond its weight, and the hand does not feel it"
+            )
+        present = (*setup.info.axes, *setup.info.sensed)
+        if lacking := [axis for axis in part if axis not in present]:
             yield (
                 f"the device has no motor for {', '.join(lacking)}: the tool keeps its {kind} up "
                 f"to {limit} beyond its weight, then slips"

@@ -91,7 +91,7 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
-_LATER = {"serial", "reach", "buttons"}
+_LATER = {"serial", "reach", "buttons", "sensed"}
 """Fields that the first recordings lack."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
@@ -117,8 +117,8 @@ class DeviceInfo:
 
     Attributes:
         name: Name of the device, not empty.
-        axes: Axes out of ``AXES``, in that order, at least one. Missing axes do not move, and no
-            wrench acts on them.
+        axes: Axes out of ``AXES`` with a motor, in that order, at least one. Missing axes do not
+            move, except those of ``sensed``, and no wrench acts on them.
         mass: Inertia at the handle in kg, > 0; None if unknown.
         damping: Physical damping b at the handle in N s/m, >= 0; None if unknown or if the motion
             is prescribed. The condition b >= KT/2 + B' is checked against it.
@@ -141,6 +141,8 @@ class DeviceInfo:
         buttons: Number of buttons; None if unknown.
         reach: Largest possible distance in m from the origin of its frame, > 0; beyond it are only
             the stops. None if unknown.
+        sensed: Further axes that it senses without a motor, such as those of a wrist; by default
+            none. The hand does not feel what its motion about them does.
 
     Raises:
         DeviceError: A value is of the wrong type, not finite, or out of range.
@@ -165,6 +167,7 @@ class DeviceInfo:
     serial: str = ""
     reach: float | None = None
     buttons: int | None = None
+    sensed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -179,6 +182,14 @@ class DeviceInfo:
                 "order"
             )
         object.__setattr__(self, "axes", tuple(self.axes))
+        if not isinstance(self.sensed, tuple | list) or tuple(self.sensed) != tuple(
+            axis for axis in AXES if axis in self.sensed and axis not in self.axes
+        ):
+            raise DeviceError(
+                f"sensed = {shown(self.sensed)}: must be of {', '.join(AXES)}, each once, in this "
+                "order, and none of axes"
+            )
+        object.__setattr__(self, "sensed", tuple(self.sensed))
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {shown(getattr(self, name))}: must be true or false")
@@ -206,17 +217,29 @@ class DeviceInfo:
         return any(axis in self.axes for axis in AXES[3:])
 
     @property
+    def senses(self) -> tuple[bool, bool]:
+        """True if it senses translation, and if it senses rotation, without a motor."""
+        return (
+            any(axis in AXES[:3] for axis in self.sensed),
+            any(axis in AXES[3:] for axis in self.sensed),
+        )
+
+    @property
     def dissipating_damping(self) -> tuple[float | None, float | None]:
         """Damping that dissipates energy, in N s/m and N m s/rad; (None, None) if unknown.
 
         If one kind of axis is unknown, both are, because the energy cannot be assigned to an axis.
-        A device without rotation has no rotational part. A prescribed motion stores and dissipates
-        nothing.
+        A device without rotation has no rotational part, and neither has a kind of axis that is
+        sensed without a motor: its motion would dissipate nothing that the hand gets. A prescribed
+        motion stores and dissipates nothing.
         """
         is_complete = self.rotational_damping is not None or not self.turns
         if self.is_prescribed or not is_complete:
             return None, None
-        return self.damping, self.rotational_damping
+        slides, turns = self.senses
+        if slides:
+            return None, None
+        return self.damping, None if turns else self.rotational_damping
 
     def to_json(self) -> str:
         """Returns the sheet as one JSON object: a key per attribute, null if unknown."""

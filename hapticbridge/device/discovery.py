@@ -45,6 +45,8 @@ def blind_spots() -> list[str]:
 
 
 _USB_DEVICE = 'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device"'
+_TTY = 'SUBSYSTEM=="tty"'
+_NO_MODEM = 'ENV{ID_MM_DEVICE_IGNORE}="1"'  # a modem's manager must not write to it
 
 
 def udev_rules() -> str:
@@ -66,7 +68,10 @@ def udev_rules() -> str:
             continue  # no node to open: a program has it
         lines += ["", f"# {driver.name}: {driver.about}"]
         if driver.vendor is not None:
-            lines.append(f'{_USB_DEVICE}, ATTR{{idVendor}}=="{driver.vendor:04x}", TAG+="uaccess"')
+            match = f'{_USB_DEVICE}, ATTR{{idVendor}}=="{driver.vendor:04x}"'
+            if driver.subsystem == "tty":
+                match = f'{_TTY}, ATTRS{{idVendor}}=="{driver.vendor:04x}", {_NO_MODEM}'
+            lines.append(f'{match}, TAG+="uaccess"')
             continue
         ids = driver.ids
         if driver.usage is not None or driver.recognises is not None or not ids:
@@ -80,10 +85,10 @@ def udev_rules() -> str:
             if driver.transport == "hid":
                 kernels = f"*:{vendor}:{product}.*".upper()
                 match = f'SUBSYSTEM=="hidraw", KERNELS=="{kernels}"'
-            elif driver.transport == "serial":  # and a modem's manager must not write to it
+            elif driver.transport == "serial":
                 match = (
-                    f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", '
-                    f'ATTRS{{idProduct}}=="{product}", ENV{{ID_MM_DEVICE_IGNORE}}="1"'
+                    f'{_TTY}, ATTRS{{idVendor}}=="{vendor}", ATTRS{{idProduct}}=="{product}", '
+                    f"{_NO_MODEM}"
                 )
             else:
                 match = (

@@ -77,6 +77,7 @@ class Driver:
             list of products.
         vendor: USB vendor whose products a library opens, known by id or not; the udev rule then
             names no product. None for drivers with a list of products.
+        subsystem: Kernel subsystem of the node that this library opens, ``usb`` or ``tty``.
     """
 
     name: str
@@ -98,6 +99,7 @@ class Driver:
     products: str = ""
     recognises: Callable[[bytes], bool] | None = None
     vendor: int | None = None
+    subsystem: Literal["usb", "tty"] = "usb"
 
     def model(self, vendor: int, product: int) -> str | None:
         """Returns the model with these ids, or None if it is not of the driver."""

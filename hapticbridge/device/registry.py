@@ -31,6 +31,7 @@ DRIVERS = {
     "pid": "hapticbridge.device.pid.device",
     "haply": "hapticbridge.device.haply.device",
     "forcedimension": "hapticbridge.device.force_dimension.device",
+    "touch": "hapticbridge.device.touch.device",
 }
 """Module of each driver by the driver's name, in the order in which drivers are listed. The module
 holds the ``Driver`` as ``DRIVER``."""
@@ -182,7 +183,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
       options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``serial:/dev/ttyACM0,baud=115200``,
       ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``, ``haply:serial=049D``,
-      ``forcedimension:library=FILE``. ``serial`` selects one of several,
+      ``forcedimension:library=FILE``, ``touch:library=FILE``. ``serial`` selects one of several,
       ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
       profile of the unit or its model, or from ``profile=NAME`` (or a file, or ``none``).
 

@@ -149,23 +149,46 @@ def within_energy_limit(s: State, force: Vector, torque: Vector) -> tuple[Vector
 
 
 @compiled
+def unfelt_work(s: State, moved: Vector, turned: Vector) -> float:
+    """Returns the work in J that the hand saves along axes that are sensed without a motor.
+
+        W_u = −w_u·δp + q (K/2 + B'/T) ‖δp_u‖²
+
+    w_u is the wrench that a motor would have been sent (N, N m), δp_u the motion along those axes
+    (m, rad). The second part is what the damping of such a device would burn, with the damping that
+    the coupling needs; q is the ratio of the stiffness at the device to that in the scene.
+    """
+    k, run, u = s.coupling, s.run, s.loop.unfelt
+    if not k.lacks_motors:
+        return 0.0
+    whole = s.guard.share * s.guard.share * run.force_scale
+    linear = whole * run.scale * (0.5 * k.stiffness + k.damping / run.period)
+    angular = whole / run.scale * (0.5 * k.rotational_stiffness + k.rotational_damping / run.period)
+    work = 0.0
+    for i in range(3):
+        work += (linear * k.lacks_motor[i] * moved[i] - u[i]) * moved[i]
+        work += (angular * k.lacks_motor[3 + i] * turned[i] - u[3 + i]) * turned[i]
+    return float(work)
+
+
+@compiled
 def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> None:
     """Updates the passivity observer with the previous tick's energy flow.
 
-        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + q (ΔS − W), −A_max)
+        A_k = max(A_{k−1} + w_{k−1}·δp_k − b ‖δp_k‖²/t + q (ΔS − W) − W_u, −A_max)
 
     A > 0 means that device and scene together have delivered more energy than they received.
 
     Symbols: A ``observed_energy``; w wrench on the device (N, N m); δp its motion since the
     previous tick (m, rad); b assumed device damping (N s/m, N m s/rad); t time since the last new
     sample (s); q = force_scale / scale; ΔS change of the stored energy (J); W work of the scene's
-    motors and of user forces (J). A_max (J) caps the credit, so that long dissipation cannot hide a
-    short active phase.
+    motors and of user forces (J); W_u ``unfelt_work`` (J). A_max (J) caps the credit, so that long
+    dissipation cannot hide a short active phase.
 
     Also updated, each in J:
         ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``guarded_energy``: result of the function of that name. If a motor in the scene
-        pushes the hand, that energy counts as excess.
+        pushes the hand, that energy counts as excess, and so does unfelt work.
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -200,6 +223,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         a[i] = max(a[i] + linear, -limit)
         a[3 + i] = max(a[3 + i] + angular, -limit)
         delivered += linear + angular
+    gained -= unfelt_work(s, moved, turned)
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
     observer.net_device_energy += delivered
     observer.guarded_energy = guarded_energy(s)

@@ -139,12 +139,14 @@ LOOP_DTYPE = np.dtype(
         ("wrench_on_tool", "<f8", 6),
         ("motion", "<f8", 6),
         ("wrench_on_device", "<f8", 6),
+        ("unfelt", "<f8", 6),
     ]
 )
 """Sub-record ``loop``, written by this module alone: results that one stage of a tick hands to the
 next. ``external_flags`` is ``STALE_SAMPLE`` as the live loop or a recording has it, set
 before the tick; ``has_positions`` is 1 if MuJoCo's position stage has run since the step;
-``motion`` is the tool's, in m and rad; wrenches in N and N m, peaks since the start."""
+``motion`` is the tool's, in m and rad; ``unfelt`` is the wrench that axes without a motor would be
+sent; wrenches in N and N m, peaks since the start."""
 
 
 # Before MuJoCo's step
@@ -476,8 +478,12 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
         force, torque = limited_wrench(s, force, torque)
     force = scaled(-run.force_scale, device_from_scene(run.axes, force))
     torque = scaled(-run.force_scale / run.scale, device_from_scene(run.axes, torque))
-    force, torque = felt(s, force, torque)
     share = s.guard.share
+    if s.coupling.lacks_motors:
+        whole, whole_torque = force, torque
+        force, torque = felt(s, force, torque)
+        store_vector(s.loop.unfelt[0:3], scaled(share, subtract(whole, force)))
+        store_vector(s.loop.unfelt[3:6], scaled(share, subtract(whole_torque, torque)))
     if share != 1.0:
         force, torque = scaled(share, force), scaled(share, torque)
     force, torque = send_within(s, (force, torque), control(s, force, torque))
@@ -578,7 +584,7 @@ def after_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> 
 
 def pause(loop: Part) -> None:
     """Notes a pause, in which zero was commanded and the scene may have been changed."""
-    loop["wrench_on_device"] = 0.0
+    loop["wrench_on_device"] = loop["unfelt"] = 0.0
     loop["has_positions"] = 0
 
 

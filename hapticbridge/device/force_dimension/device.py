@@ -50,8 +50,8 @@ from hapticbridge.device.force_dimension.dhd import (
     Model,
     limits_of,
     located,
-    quaternion_of,
 )
+from hapticbridge.device.rotation import quaternion_of
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost

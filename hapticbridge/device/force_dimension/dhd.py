@@ -18,18 +18,10 @@ from ctypes import POINTER, c_byte, c_char_p, c_double, c_int, c_ubyte, c_uint, 
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
-import numpy as np
-
 from hapticbridge.device.base import TIMING, USUAL_TORQUE_LIMIT, usual_delay
 from hapticbridge.errors import DeviceError
-from hapticbridge.pose import Quaternion, canonical
 
 # Device types of Force Dimension's library
-
-ROTATION_ERROR = 1e-3
-"""Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to
-rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,31 +91,6 @@ def limits_of(
             )
         limits[name] = min(known)
     return limits["force"], limits["torque"]
-
-
-def quaternion_of(frame: Sequence[float], name: str) -> Quaternion:
-    """Returns the unit quaternion (w, x, y, z) of a rotation matrix.
-
-    Args:
-        frame: Nine numbers, row by row.
-        name: Name of the device in messages.
-
-    Raises:
-        DeviceError: The matrix is not a rotation, or a number in it is not finite.
-    """
-    flat = np.array(frame)
-    matrix = flat.reshape(3, 3)
-    is_finite = bool(np.isfinite(matrix).all())
-    if not is_finite or not (
-        np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
-    ):
-        raise DeviceError(
-            f"{name} reports an orientation that is not a rotation; check its cable and restart it"
-        )
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, flat)
-    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
-    return canonical((w, x, y, z))
 
 
 VARIABLE = "HAPTICBRIDGE_DHD"
