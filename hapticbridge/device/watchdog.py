@@ -160,9 +160,10 @@ def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:
 
     It covers a bridge that dies and one that hangs.
 
-    Without it, the device's own watchdog or the limited duration of its effects ends the force.
+    Without it, as on other systems than Linux, the device's own watchdog or the limited duration of
+    its effects ends the force.
     """
-    if not path.startswith(_SHARED_NODES):
+    if sys.platform != "linux" or not path.startswith(_SHARED_NODES):
         return None
     try:
         return ForceOffGuardian(path, *reports)

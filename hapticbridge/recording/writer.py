@@ -135,8 +135,9 @@ class Output:
         flags |= os.O_EXCL if is_new else 0
         flags |= getattr(os, "O_NONBLOCK", 0)  # a pipe without a reader is an error at once
         self._file = os.fdopen(os.open(path, flags, 0o666), "wb", buffering=0)
-        os.set_blocking(self._file.fileno(), True)
         try:
+            if hasattr(os, "O_NONBLOCK"):
+                os.set_blocking(self._file.fileno(), True)
             if sys.platform != "win32":
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._is_regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
