@@ -129,6 +129,15 @@ def haply(_: Path) -> Device:
     return Ticking(build)
 
 
+def verse_grip(_: Path) -> Device:
+    def build() -> tuple[Device, Timed]:
+        bench = HaplyBench()
+        bench.service.orientation = {"w": 0.6, "x": 0.0, "y": 0.8, "z": 0.0}
+        return bench.opened(), bench.time
+
+    return Ticking(build)
+
+
 def force_dimension(kind: int) -> Device:
     def build() -> tuple[Device, Timed]:
         stub = Stub(kind)
@@ -181,6 +190,7 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     ),
     "falcon": falcon,
     "haply": haply,
+    "verse grip": verse_grip,
     "omega.3": lambda _: force_dimension(OMEGA3),
     "sigma.7": lambda _: force_dimension(SIGMA7),
     "touch": touch,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from device_benches import PERIOD, HaplyBench, ticks
+from device_benches import PERIOD, HaplyBench, read, ticks
 from emulated.haply_service import CENTRE, HaplyService, serving
 from hypothesis import given
 from hypothesis import strategies as st
@@ -82,6 +82,53 @@ def test_the_pose_is_the_services_and_nothing_turns() -> None:
     np.testing.assert_allclose(sample["position"][0], told, atol=2e-4)
     np.testing.assert_array_equal(sample["quaternion"][0], (1.0, 0.0, 0.0, 0.0))
     assert sample["buttons"][0] == 0b101
+
+
+def grip(w: float, x: float, y: float, z: float) -> dict[str, float]:
+    return {"w": w, "x": x, "y": y, "z": z}
+
+
+def test_a_versegrip_turns_the_tool_and_has_buttons() -> None:
+    bench = HaplyBench()
+    bench.service.orientation = grip(0.6, 0.0, 0.8004, 0.0)  # rounded
+    device = bench.opened()
+    assert (device.info.axes, device.info.sensed) == (("x", "y", "z"), ("rx", "ry", "rz"))
+    assert "the VerseGrip turns the tool without torque on the hand" in bench.told
+    sample = device.start(PERIOD)
+    size = np.hypot(0.6, 0.8004)
+    np.testing.assert_allclose(sample["quaternion"][0], [0.6 / size, 0, 0.8004 / size, 0])
+    bench.service.orientation = grip(-0.8, 0.0, 0.0, 0.6)  # the same turn as (0.8, 0, 0, -0.6)
+    ticks(device, bench.time, 5, FORCE)
+    _, moved = read(device, bench.time)
+    np.testing.assert_allclose(moved["quaternion"], [0.8, 0, 0, -0.6])
+    for asleep in (None, grip(0.0, 0.0, 0.0, 0.0)):
+        bench.service.orientation = asleep
+        ticks(device, bench.time, 5, FORCE)
+        _, kept = read(device, bench.time)
+        np.testing.assert_allclose(kept["quaternion"], [0.8, 0, 0, -0.6])
+    bench.service.orientation = grip(2.0, 0.0, 0.0, 0.0)
+    with pytest.raises(DeviceError, match="reports no orientation of the VerseGrip"):
+        ticks(device, bench.time, 5, FORCE)
+
+
+def test_a_wired_grip_has_one_button_and_turns_too() -> None:
+    bench = HaplyBench()
+    bench.service.grip, bench.service.orientation = "verse_grip", grip(0.0, 1.0, 0.0, 0.0)
+    bench.service.buttons["a"] = True
+    device = bench.opened()
+    sample = device.start(PERIOD)
+    assert sample["buttons"][0] == 1
+    np.testing.assert_array_equal(sample["quaternion"][0], (0.0, 1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("listed", ["", "wireless_verse_grip"])
+def test_without_a_grip_or_by_choice_nothing_turns(listed: str) -> None:
+    bench = HaplyBench()
+    bench.service.grip, bench.service.orientation = listed, grip(0.6, 0.8, 0.0, 0.0)
+    device = bench.opened(turn=0.0)
+    assert device.info.sensed == ()
+    assert device.start(PERIOD)["quaternion"][0].tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert ("the VerseGrip does not turn the tool" in bench.told) is bool(listed)
 
 
 def test_a_service_slower_than_the_loop_gets_the_newest_force_and_no_queue() -> None:
@@ -208,9 +255,9 @@ told = st.fixed_dictionaries({"inverse3": entries | number})
 
 @given(st.text() | told.map(json.dumps))
 def test_whatever_comes_the_position_is_finite_or_there_is_none(message: str) -> None:
-    for read in (lambda: messages.state(message, "049D"), lambda: messages.inventory(message)):
+    for answer in (lambda: messages.state(message, "049D"), lambda: messages.inventory(message)):
         try:
-            found = read()
+            found = answer()
         except DeviceError as error:
             assert "\n" not in str(error)
             continue

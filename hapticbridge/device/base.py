@@ -107,6 +107,18 @@ def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[
     return {name: _checked(name, options[name]) for name in names if options.get(name) is not None}
 
 
+def stated_switch(options: Mapping[str, object], name: str) -> bool:
+    """Returns an option that is 1 (on) or 0 (off); on if it is not stated.
+
+    Raises:
+        DeviceError: It is neither.
+    """
+    value = options.get(name, 1.0)
+    if value not in (0, 1):
+        raise DeviceError(f"{name} = {shown(value)}: must be 1 (on) or 0 (off)")
+    return bool(value)
+
+
 def _checked(name: str, value: object) -> float:
     return checked_number(name, value, DATA_SHEET_UNITS[name], is_positive=name in _POSITIVE)
 

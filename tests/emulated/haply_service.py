@@ -98,7 +98,8 @@ class HaplyService:
         is_old: Whether it is of before 3.5: no filters, and forces are called ``values``.
         spoil: Messages by their number (from 1) that are answered with something else.
         messages: How many it has got; ``profile``: what the client calls itself.
-        buttons: What the grip's buttons are.
+        buttons: What the grip's buttons are; ``orientation``: its quaternion, None if it has none.
+        grip: Under which key it is listed; empty for no grip.
     """
 
     def __init__(self, devices: dict[str, SimulatedDevice], resolution: float = 0.0) -> None:
@@ -107,6 +108,8 @@ class HaplyService:
         self.spoil: dict[int, str] = {}
         self.messages, self.profile = 0, ""
         self.buttons = {"a": False, "b": False, "c": False}
+        self.orientation: Any = None
+        self.grip = "wireless_verse_grip"
         self.forces: list[list[float]] = []
 
     def advance(self, now: float) -> None:
@@ -144,8 +147,13 @@ class HaplyService:
         if self.messages in self.spoil:
             return self.spoil[self.messages]
         entries = [{"device_id": d.device_id, "state": d.state()} for d in self.devices.values()]
-        grips = [{"device_id": "61576", "state": {"buttons": self.buttons}}]
-        return json.dumps({"inverse3": entries, "wireless_verse_grip": grips})
+        held: dict[str, Any] = {"buttons": self.buttons}
+        if self.grip == "verse_grip":  # the wired one has a single button
+            held = {"button": self.buttons["a"], "hall": 0}
+        if self.orientation is not None:
+            held["orientation"] = self.orientation
+        grips = {self.grip: [{"device_id": "61576", "state": held}]} if self.grip else {}
+        return json.dumps({"inverse3": entries, **grips})
 
 
 class VirtualLink:

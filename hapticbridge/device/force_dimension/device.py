@@ -31,6 +31,7 @@ from hapticbridge.device.base import (
     calling_on_error,
     checked_period,
     stated_numbers,
+    stated_switch,
 )
 from hapticbridge.device.driver import (
     Driver,
@@ -263,13 +264,11 @@ def open_forcedimension(options: Mapping[str, object], notify: Notify) -> ForceD
         DeviceLost: The device is gone.
     """
     numbers = stated_numbers(options, _NUMBERS)
-    gravity = options.get("gravity", 1.0)
-    if gravity not in (0, 1):
-        raise DeviceError(f"gravity = {gravity!r}: must be 1 (compensated) or 0")
+    gravity = stated_switch(options, "gravity")
     dhd = Dhd(located(options.get("library")))
     device = select_device(DRIVER, _listed(dhd), options.get("serial"))
     return ForceDimensionDevice(
-        dhd, int(device.path), gravity=bool(gravity), numbers=numbers, notify=notify
+        dhd, int(device.path), gravity=gravity, numbers=numbers, notify=notify
     )
 
 

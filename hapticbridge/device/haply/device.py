@@ -1,5 +1,9 @@
 """Haply Inverse3 and related devices: three translations with force, through the maker's service.
 
+A VerseGrip that is paired adds its buttons and its orientation. It has no motors, so its three
+rotations are ``sensed``: the tool turns with it, and the hand does not feel the torque. The option
+``turn=0`` leaves them out. A grip that falls silent keeps its last orientation.
+
 The service answers each message with the device's state when the message arrived. So each tick
 sends a force, and its answer is read in the next tick. As with the Falcon, one message carries the
 force and requests the state. The force that responds to a sample acts as many whole ticks later as
@@ -25,12 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.device.base import (
+    AXES,
     TIMING,
     DeviceInfo,
     calling_on_error,
     checked_number,
     checked_period,
     stated_numbers,
+    stated_switch,
     usual_delay,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, ignore_message, select_device
@@ -128,6 +134,7 @@ class HaplyDevice:
         link: Connected link to the service, after the list of devices was read.
         listed: The device.
         force_gate: Gain of the service's force gate, without unit, >= 0.
+        turns: True to report the orientation of a VerseGrip, if one is listed.
         numbers: Numbers of the data sheet, by name.
         notify: Receives a description of the service's force filters.
 
@@ -145,6 +152,7 @@ class HaplyDevice:
         listed: Listed,
         *,
         force_gate: float = 0.0,
+        turns: bool = True,
         numbers: Mapping[str, float] | None = None,
         notify: Notify = ignore_message,
     ) -> None:
@@ -157,13 +165,22 @@ class HaplyDevice:
         with calling_on_error(self.close):
             messages.refuse_scaled(listed)
             notify(messages.describe_filters(listed, force_gate))
-            self._exchange(messages.first_message(listed, force_gate))
+            first = self._exchange(messages.first_message(listed, force_gate))
+            grip = messages.state(first, listed.device_id).orientation
+            self._turns = turns and grip is not None
+            if grip is not None:
+                notify(
+                    "the VerseGrip turns the tool without torque on the hand"
+                    if turns
+                    else "the VerseGrip does not turn the tool"
+                )
             rate, delay = measured_timing(
                 link, messages.force_message(listed, (0.0, 0.0, 0.0)), self._name
             )
             self.info = DeviceInfo(
                 name=listed.kind,
-                axes=("x", "y", "z"),
+                axes=AXES[:3],
+                sensed=AXES[3:] if self._turns else (),
                 rate=rate,
                 delay=delay,
                 serial=listed.device_id,
@@ -283,6 +300,8 @@ class HaplyDevice:
         state = messages.state(message, self._listed.device_id)
         self._sample["position"] = state.position
         self._sample["buttons"] = state.buttons
+        if self._turns and state.orientation is not None:
+            self._sample["quaternion"] = state.orientation
 
 
 # Discovery of Haply's devices in the maker's service
@@ -297,7 +316,7 @@ def open_haply(options: Mapping[str, object], notify: Notify) -> HaplyDevice:
     """Connects to the service and opens one of its devices.
 
     The options are ``service`` (HOST:PORT), ``serial`` (the service's device_id), ``force_gate``,
-    ``log`` (a file for the messages), and numbers of the data sheet.
+    ``turn`` (1 or 0), ``log`` (a file for the messages), and numbers of the data sheet.
 
     Raises:
         DeviceError: The service does not run, lists no such device, or an option is not valid.
@@ -313,10 +332,13 @@ def opened(link: Link, options: Mapping[str, object], notify: Notify) -> HaplyDe
     with calling_on_error(link.close):
         numbers = stated_numbers(options, _NUMBERS)
         force_gate = checked_number("force_gate", options.get("force_gate", 0.0), "")
+        turns = stated_switch(options, "turn")
         devices = _devices(link)
         serial = select_device(DRIVER, [_plugged(d) for d in devices], options.get("serial")).serial
         listed = next(device for device in devices if device.device_id == serial)
-    return HaplyDevice(link, listed, force_gate=force_gate, numbers=numbers, notify=notify)
+    return HaplyDevice(
+        link, listed, force_gate=force_gate, turns=turns, numbers=numbers, notify=notify
+    )
 
 
 def find(place: tuple[str, int] = PLACE) -> list[FoundDevice]:
@@ -380,14 +402,14 @@ DRIVER = Driver(
     about="Haply Inverse3, Inverse3x and Minverse through the maker's Inverse Service",
     ids=(),
     transport="service",
-    axes="x, y, z",
+    axes="x, y, z; a VerseGrip's rx, ry, rz are sensed without a motor",
     force=f"{FORCE_LIMIT:g} N, or more with force_limit",
     rate="1 kHz",
     on_stall="the maker's service ends the force; the time until then is not documented",
     options={
         "service": str,
         "serial": str,
-        **dict.fromkeys(("force_gate", *_NUMBERS), float),
+        **dict.fromkeys(("force_gate", "turn", *_NUMBERS), float),
         "log": str,
     },
     open=open_haply,

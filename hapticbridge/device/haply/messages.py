@@ -21,6 +21,7 @@ from typing import Any
 
 from hapticbridge.device.transport.websocket import decoded
 from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.pose import Quaternion, canonical
 
 SERVICE = "the Inverse Service"
 """Name of the service in messages."""
@@ -29,10 +30,14 @@ FARTHEST = 10.0
 """Largest plausible coordinate in m; no arm is that long."""
 
 GRIPS = ("wireless_verse_grip", "verse_grip")
-"""Keys under which the handle's buttons may be listed; the first handle is used."""
+"""Keys under which VerseGrips are listed, the wireless ones first; the first grip is used."""
 
 BUTTONS = ("a", "b", "c")
-"""Bits 0, 1 and 2 of a sample's buttons."""
+"""Bits 0, 1 and 2 of a sample's buttons. A wired grip has one ``button``, which is bit 0."""
+
+ROUNDING = 0.02
+"""Largest deviation of a quaternion's norm from 1 that counts as rounding, without unit. The
+maker's example has multiples of 2⁻¹⁴; a larger one is another kind of number."""
 
 _ID = re.compile(r"[0-9A-Za-z_-]{1,64}")  # part of a profile's file name
 
@@ -63,10 +68,13 @@ class State:
     Attributes:
         position: Position of the cursor in m.
         buttons: Bit 0 is a, bit 1 b, bit 2 c.
+        orientation: Unit quaternion of the VerseGrip in the frame of the position; None without a
+            grip, or before it has sent one.
     """
 
     position: tuple[float, float, float]
     buttons: int
+    orientation: Quaternion | None = None
 
 
 def inventory(message: str) -> list[Listed]:
@@ -87,7 +95,12 @@ def state(message: str, device_id: str) -> State:
     content = decoded(message, SERVICE)
     for entry in _entries(content, "inverse3"):
         if entry.get("device_id") == device_id:
-            return State(_vector(_part(entry, "state"), "cursor_position"), _buttons(content))
+            grip = _grip(content)
+            return State(
+                _vector(_part(entry, "state"), "cursor_position"),
+                _buttons(grip),
+                _orientation(grip),
+            )
     raise DeviceLost(f"the device '{device_id}' is gone: {SERVICE} does not list it any more")
 
 
@@ -191,10 +204,32 @@ def _vector(where: dict[str, Any], key: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _buttons(content: dict[str, Any]) -> int:
+def _grip(content: dict[str, Any]) -> dict[str, Any]:
+    """Returns the state of the first VerseGrip; empty without one."""
     for name in GRIPS:
         entries = content.get(name)
         if isinstance(entries, list) and entries and isinstance(entries[0], dict):
-            pressed = _part(_part(entries[0], "state"), "buttons")
-            return sum(1 << bit for bit, key in enumerate(BUTTONS) if pressed.get(key) is True)
-    return 0
+            return _part(entries[0], "state")
+    return {}
+
+
+def _buttons(grip: dict[str, Any]) -> int:
+    pressed = _part(grip, "buttons")
+    bits = sum(1 << bit for bit, key in enumerate(BUTTONS) if pressed.get(key) is True)
+    return bits | (grip.get("button") is True)
+
+
+def _orientation(grip: dict[str, Any]) -> Quaternion | None:
+    """Returns a grip's orientation, of unit length; None if it has sent none yet."""
+    if "orientation" not in grip:
+        return None
+    numbers = [_number(grip["orientation"], axis) for axis in "wxyz"]
+    if numbers == [0.0] * 4:
+        return None
+    size = math.hypot(*(math.nan if number is None else number for number in numbers))
+    if not abs(size - 1.0) < ROUNDING:
+        raise DeviceError(
+            f"{SERVICE} reports no orientation of the VerseGrip: {grip['orientation']!r:.60}"
+        )
+    w, x, y, z = (float(number or 0.0) / size for number in numbers)
+    return canonical((w, x, y, z))

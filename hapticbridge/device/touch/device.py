@@ -32,6 +32,7 @@ from hapticbridge.device.base import (
     calling_on_error,
     checked_period,
     stated_numbers,
+    stated_switch,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, UsbId, ignore_message
 from hapticbridge.device.rotation import quaternion_of
@@ -364,13 +365,11 @@ def open_touch(
         DeviceLost: The device is gone.
     """
     numbers = stated_numbers(options, _NUMBERS)
-    turn = options.get("turn", 1.0)
-    if turn not in (0, 1):
-        raise DeviceError(f"turn = {turn!r}: must be 1 (the stylus turns the tool) or 0")
+    turns = stated_switch(options, "turn")
     return TouchDevice(
         Hd(located(options.get("library"))),
         str(options.get("config", "")),
-        turns=bool(turn),
+        turns=turns,
         numbers=numbers,
         notify=notify,
         waiting=waiting,
