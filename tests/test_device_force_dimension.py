@@ -15,11 +15,11 @@ from device_benches import PERIOD, ticks
 from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
 
 from hapticbridge.device import open_device
+from hapticbridge.device.base import checked_rotation
 from hapticbridge.device.driver import FoundDevice
 from hapticbridge.device.force_dimension import device as forcedimension
 from hapticbridge.device.force_dimension.device import ForceDimensionDevice
 from hapticbridge.device.force_dimension.dhd import MODELS, VARIABLE, Dhd
-from hapticbridge.device.rotation import quaternion_of
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log
@@ -200,7 +200,7 @@ def test_a_pose_that_is_none_is_not_reported(kind: int, value: float) -> None:
         device.read(np.zeros(1, SAMPLE_DTYPE))
     # and a mirror is no rotation
     with pytest.raises(DeviceError, match="it reports an orientation that is not a rotation"):
-        quaternion_of([1, 0, 0, 0, 1, 0, 0, 0, -1], "it")
+        checked_rotation([1, 0, 0, 0, 1, 0, 0, 0, -1], "it")
 
 
 def test_what_the_library_does_not_know_comes_from_the_profile_of_its_model() -> None:

@@ -135,7 +135,7 @@ def test_the_servo_thread_needs_neither_the_lock_nor_the_loop() -> None:
         hold_lock = ctypes.PyDLL(None).usleep  # a call of PyDLL keeps it
         hold_lock(200_000)
         after = ctypes.PyDLL(stub.file).stub_frames()
-        force = device._servo.memory["force"][0].copy()
+        force = device.servo.memory["force"][0].copy()
     finally:
         sys.setswitchinterval(interval)
     device.close()
@@ -152,7 +152,7 @@ def test_a_sample_is_of_one_servo_tick_while_the_servo_thread_goes_on() -> None:
     seen = set()
     for _ in range(3000):
         device.write(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))  # it moves
-        sample = device._servo.newest()
+        sample = device.servo.newest()
         assert (sample.position == sample.transform[12:15]).all()
         seen.add(sample.ticks)
     device.close()
@@ -164,7 +164,7 @@ def test_forces_that_are_no_numbers_do_not_reach_the_motors_either_way() -> None
     for value in (math.nan, math.inf):
         with pytest.raises(DeviceError, match="that is not finite was not sent"):
             device.write(np.array([0.0, value, 0.0, 0, 0, 0]))
-    servo: Servo = device._servo
+    servo: Servo = device.servo
     servo.send((math.nan, 0.0, 1.0))  # past the driver's own check
     stub.advance(stub.now + 2e-3)
     assert stub.force().tolist() == [0.0, 0.0, 0.0]

@@ -5,17 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import is_number, shown
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
+from hapticbridge.pose import Quaternion, canonical
 
 
 @contextmanager
@@ -45,6 +47,36 @@ def checked_number(name: str, value: object, unit: str, *, is_positive: bool = F
     if not math.isfinite(number) or number < 0.0 or (is_positive and number == 0.0):
         raise DeviceError(message)
     return number
+
+
+ROTATION_ERROR = 1e-3
+"""Largest deviation of R Rᵀ from the identity, without unit. A larger one is not due to
+rounding."""
+
+
+def checked_rotation(frame: Sequence[float], name: str) -> Quaternion:
+    """Returns the unit quaternion (w, x, y, z) of a rotation matrix.
+
+    Args:
+        frame: Nine numbers, row by row.
+        name: Name of the device in messages.
+
+    Raises:
+        DeviceError: The matrix is not a rotation, or a number in it is not finite.
+    """
+    flat = np.array(frame)
+    matrix = flat.reshape(3, 3)
+    is_finite = bool(np.isfinite(matrix).all())
+    if not is_finite or not (
+        np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_ERROR and np.linalg.det(matrix) > 0
+    ):
+        raise DeviceError(
+            f"{name} reports an orientation that is not a rotation; check its cable and restart it"
+        )
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, flat)
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion)).tolist()
+    return canonical((w, x, y, z))
 
 
 def checked_period(period: float) -> float:

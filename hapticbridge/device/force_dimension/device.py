@@ -30,6 +30,7 @@ from hapticbridge.device.base import (
     DeviceInfo,
     calling_on_error,
     checked_period,
+    checked_rotation,
     stated_numbers,
     stated_switch,
 )
@@ -52,7 +53,6 @@ from hapticbridge.device.force_dimension.dhd import (
     limits_of,
     located,
 )
-from hapticbridge.device.rotation import quaternion_of
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -245,7 +245,7 @@ class ForceDimensionDevice:
         self._sample["position"] = (x, y, z)
         self._sample["buttons"] = self._dhd["dhdGetButtonMask"](self._id) & 0xFFFF
         if self._turns:
-            self._sample["quaternion"] = quaternion_of(self._frame[:], self._name)
+            self._sample["quaternion"] = checked_rotation(self._frame[:], self._name)
 
 
 # Discovery of Force Dimension's devices

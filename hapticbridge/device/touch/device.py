@@ -31,11 +31,11 @@ from hapticbridge.device.base import (
     DeviceInfo,
     calling_on_error,
     checked_period,
+    checked_rotation,
     stated_numbers,
     stated_switch,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, UsbId, ignore_message
-from hapticbridge.device.rotation import quaternion_of
 from hapticbridge.device.touch.hd import (
     BY_ENCODER_RESET,
     BY_INKWELL,
@@ -121,6 +121,10 @@ class TouchDevice:
         notify: Receives a description of the device.
         waiting: Time in which the servo thread runs.
 
+    Attributes:
+        info: Its data sheet.
+        servo: The memory shared with the servo thread.
+
     Raises:
         DeviceError: The device cannot be opened or calibrated, or its largest force is unknown.
     """
@@ -151,8 +155,8 @@ class TouchDevice:
             serial = hd.text(SERIAL_NUMBER)
             known: dict[str, Any] = dict(numbers or {})
             limit, continuous = self._limits(known)
-            self._servo = Servo(hd, self._id, limit)
-            self._start_servo()
+            self.servo = Servo(hd, self._id, limit)
+            self._start_thread()
             self._calibrate()
             rate = self._measured_rate()
             self.info = DeviceInfo(
@@ -185,10 +189,10 @@ class TouchDevice:
         """
         ticks = watchdog_time(checked_period(period)) * (self.info.rate or 0.0)
         hold = max(round(FULL_SHARE * ticks), 1)
-        self._servo.watch(hold, max(round(ticks) - hold, 1))
-        self._servo.send((0.0, 0.0, 0.0))
+        self.servo.watch(hold, max(round(ticks) - hold, 1))
+        self.servo.send((0.0, 0.0, 0.0))
         self._hd.errors()
-        self._servo.forget()
+        self.servo.forget()
         self._hd["hdEnable"](MAX_FORCE_CLAMPING)
         self._hd["hdEnable"](FORCE_OUTPUT)
         self._hd.refuse_errors(f"{self._name}: its force cannot be switched on")
@@ -208,7 +212,7 @@ class TouchDevice:
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
         self._refuse_faults()
-        newest = self._servo.newest()
+        newest = self.servo.newest()
         is_new = newest.ticks != self._seen
         if is_new:
             self._fill(newest)
@@ -225,12 +229,12 @@ class TouchDevice:
         x, y, z = wrench[:3].tolist()
         if not all(map(math.isfinite, (x, y, z))):
             raise DeviceError(f"{self._name}: a force that is not finite was not sent")
-        self._servo.send((x, z, -y))  # to the library's axes
+        self.servo.send((x, z, -y))  # to the library's axes
 
     @property
     def faded(self) -> int:
         """Number of servo ticks in which the watchdog lowered the force."""
-        return self._servo.faded
+        return self.servo.faded
 
     def close(self) -> None:
         """Commands zero force, switches the motors off, and releases the device."""
@@ -239,7 +243,7 @@ class TouchDevice:
             return
         self._is_open = self._is_started = False
         if self._is_running:
-            self._servo.send((0.0, 0.0, 0.0))
+            self.servo.send((0.0, 0.0, 0.0))
             self._time.sleep(LAST_TICKS)
         self._hd["hdDisable"](FORCE_OUTPUT)
         if self._is_running:
@@ -267,10 +271,10 @@ class TouchDevice:
         reach = 1e-3 * math.hypot(*(max(abs(ends[i]), abs(ends[i + 3])) for i in range(3)))
         return reach if 0.0 < reach < FARTHEST else None
 
-    def _start_servo(self) -> None:
+    def _start_thread(self) -> None:
         hd = self._hd
         self._task = hd["hdScheduleAsynchronous"](
-            CALLBACK(self._servo.callback.address), self._servo.address, TOP_PRIORITY
+            CALLBACK(self.servo.callback.address), self.servo.address, TOP_PRIORITY
         )
         hd["hdStartScheduler"]()
         self._is_running = True
@@ -292,7 +296,7 @@ class TouchDevice:
             self._time.sleep(0.1 * CALIBRATION_TIME)
             hd.errors()
             state = int(hd["hdCheckCalibration"]())
-        self._servo.forget()
+        self.servo.forget()
         if state == CALIBRATED:
             return
         if styles & BY_INKWELL:
@@ -306,7 +310,7 @@ class TouchDevice:
     def _measured_rate(self) -> float:
         first, begin = self._next_sample(), self._time.now()
         self._time.sleep(TIMING)
-        last = self._servo.newest()
+        last = self.servo.newest()
         return (last.ticks - first.ticks) / (self._time.now() - begin) or 1.0
 
     def _next_sample(self) -> ServoSample:
@@ -315,8 +319,8 @@ class TouchDevice:
         Raises:
             DeviceLost: None comes within ``SILENCE``.
         """
-        before, end = self._servo.newest().ticks, self._time.now() + SILENCE
-        while (newest := self._servo.newest()).ticks == before:
+        before, end = self.servo.newest().ticks, self._time.now() + SILENCE
+        while (newest := self.servo.newest()).ticks == before:
             if self._time.now() > end:
                 raise DeviceLost(
                     f"{self._name}: OpenHaptics' servo thread does not run; check the cable and "
@@ -326,9 +330,9 @@ class TouchDevice:
         return newest
 
     def _refuse_faults(self) -> None:
-        if code := self._servo.error:
+        if code := self.servo.error:
             raise DeviceLost(f"{self._name} has ended its force: {self._hd.cause(code)}")
-        if not self._servo.is_calibrated:
+        if not self.servo.is_calibrated:
             raise DeviceLost(f"{self._name} has lost its calibration; start again")
 
     def _fill(self, newest: ServoSample) -> None:
@@ -344,7 +348,7 @@ class TouchDevice:
         if self._turns:
             turned = newest.transform.reshape(4, 4).T[:3, :3]  # column by column
             frame = _FROM_LIBRARY @ turned @ _FROM_LIBRARY.T
-            self._sample["quaternion"] = quaternion_of(frame.ravel().tolist(), self._name)
+            self._sample["quaternion"] = checked_rotation(frame.ravel().tolist(), self._name)
 
 
 # Discovery of the maker's devices
