@@ -313,7 +313,8 @@ def device_conditions(
 ) -> tuple[DampingCondition, ...]:
     """Returns the condition for each kind of axis of a device with known translational damping.
 
-    One more, of unknown outcome, is for axes that it senses without a motor.
+    A device that only turns needs no translational damping. One more condition, of unknown outcome,
+    is for axes that it senses without a motor.
 
     For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
     not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
@@ -333,8 +334,9 @@ def device_conditions(
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
     conditions = []
-    if info.damping is not None:
-        delay = delay_ticks(info, period)
+    delay = delay_ticks(info, period)
+    is_known = info.damping is not None or not info.moves
+    if info.moves and info.damping is not None:
         needed = (
             scale
             * force_scale
@@ -342,18 +344,18 @@ def device_conditions(
         )
         remedy = _remedy(method, coupling.damping)
         conditions.append(DampingCondition("translation", needed, info.damping, remedy, delay))
-        if info.turns:
-            needed = (
-                force_scale
-                / scale
-                * required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
-            )
-            remedy = _remedy(method, coupling.rotational_damping)
-            conditions.append(
-                DampingCondition("rotation", needed, info.rotational_damping, remedy, delay)
-            )
-        if info.sensed:
-            conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))
+    if info.turns and is_known:
+        needed = (
+            force_scale
+            / scale
+            * required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
+        )
+        remedy = _remedy(method, coupling.rotational_damping)
+        conditions.append(
+            DampingCondition("rotation", needed, info.rotational_damping, remedy, delay)
+        )
+    if info.sensed and is_known:
+        conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))
     return tuple(conditions)
 
 

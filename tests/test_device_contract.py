@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from device_benches import PERIOD, FalconBench, HaplyBench, paddle
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
+from emulated.evdev_model import WheelModel
 from emulated.hd_stub import HdStub
 from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam, Timed
@@ -44,6 +45,7 @@ from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.rawhid.device import open_rawhid
 from hapticbridge.device.rawhid.serial import open_serial
 from hapticbridge.device.spacemouse import open_spacemouse
+from hapticbridge.device.wheel.device import open_wheel
 from hapticbridge.errors import DeviceError
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.testing.device_contract import CONTRACT
@@ -129,6 +131,14 @@ def haply(_: Path) -> Device:
     return Ticking(build)
 
 
+def wheel(_: Path) -> Device:
+    def build() -> tuple[Device, Timed]:
+        model = WheelModel(SimulatedDevice())
+        return open_wheel({"max_torque": 2.0, "range": 900.0}, ignore_message, model), model
+
+    return Ticking(build)
+
+
 def verse_grip(_: Path) -> Device:
     def build() -> tuple[Device, Timed]:
         bench = HaplyBench()
@@ -194,6 +204,7 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
     "omega.3": lambda _: force_dimension(OMEGA3),
     "sigma.7": lambda _: force_dimension(SIGMA7),
     "touch": touch,
+    "wheel": wheel,
     "stick": lambda _: ticking(lambda: PidStick(SimulatedDevice()), open_pid),
     "odd stick": lambda _: ticking(lambda: PidStick(SimulatedDevice(), ODD), open_pid),
 }
@@ -274,12 +285,14 @@ def test_the_contract_names_what_a_device_breaks(fault: str, words: str) -> None
     assert words in broken
 
 
-@pytest.mark.parametrize("name", ["rawhid", "haply", "omega.3", "sigma.7", "touch", "stick"])
+@pytest.mark.parametrize(
+    "name", ["rawhid", "haply", "omega.3", "sigma.7", "touch", "wheel", "stick"]
+)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_force_that_is_not_finite_is_not_sent(name: str, value: float, tmp_path: Path) -> None:
     device = DEVICES[name](tmp_path)
     device.start(PERIOD)
-    for axis in (0, 1):
+    for axis in [AXES.index(device.info.axes[0]), AXES.index(device.info.axes[-1])]:
         with pytest.raises(DeviceError, match="that is not finite was not sent"):
             device.write(np.where(np.arange(6) == axis, value, 0.0))
 

@@ -11,7 +11,7 @@ import tyro
 from hapticbridge.cli.terminal import out, plain, print_json
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
 from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
-from hapticbridge.device.registry import all_drivers
+from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
 
@@ -125,8 +125,11 @@ def _specification(device: FoundDevice, plugged: list[FoundDevice]) -> str:
     """Returns what to type for a device: its port, or its serial where there are more like it."""
     if device.transport == "serial":
         return f"{device.driver}:{device.path}"
-    is_only = sum(other.driver == device.driver for other in plugged) == 1
-    return device.driver if is_only else f"{device.driver}:serial={device.serial or device.path}"
+    driver = driver_named(device.driver)
+    details = [driver.stated] if driver is not None and driver.stated else []
+    if sum(other.driver == device.driver for other in plugged) > 1:
+        details.append(f"serial={device.serial or device.path}")
+    return ":".join(filter(None, (device.driver, ",".join(details))))
 
 
 def _standstill(driver: Driver) -> Iterator[str]:

@@ -273,9 +273,9 @@ class DeviceInfo:
         """Damping that dissipates energy, in N s/m and N m s/rad; (None, None) if unknown.
 
         If one kind of axis is unknown, both are, because the energy cannot be assigned to an axis.
-        A device without rotation has no rotational part, and neither has a kind of axis that is
-        sensed without a motor: its motion would dissipate nothing that the hand gets. A prescribed
-        motion stores and dissipates nothing.
+        Without translation its part is 0. A device without rotation has no rotational part, and
+        neither has a kind of axis that is sensed without a motor: its motion would dissipate
+        nothing that the hand gets. A prescribed motion stores and dissipates nothing.
         """
         is_complete = self.rotational_damping is not None or not self.turns
         if self.is_prescribed or not is_complete:
@@ -283,7 +283,7 @@ class DeviceInfo:
         slides, turns = self.senses
         if slides:
             return None, None
-        return self.damping, None if turns else self.rotational_damping
+        return self.damping if self.moves else 0.0, None if turns else self.rotational_damping
 
     def to_json(self) -> str:
         """Returns the sheet as one JSON object: a key per attribute, null if unknown."""

@@ -45,6 +45,7 @@ def blind_spots() -> list[str]:
 
 
 _USB_DEVICE = 'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device"'
+_INPUT = 'SUBSYSTEM=="input", KERNEL=="event*"'
 _TTY = 'SUBSYSTEM=="tty"'
 _NO_MODEM = 'ENV{ID_MM_DEVICE_IGNORE}="1"'  # a modem's manager must not write to it
 
@@ -72,6 +73,9 @@ def udev_rules() -> str:
             if driver.subsystem == "tty":
                 match = f'{_TTY}, ATTRS{{idVendor}}=="{driver.vendor:04x}", {_NO_MODEM}'
             lines.append(f'{match}, TAG+="uaccess"')
+            continue
+        if driver.transport == "evdev":  # the kernel counts wheels among the joysticks
+            lines.append(f'{_INPUT}, ENV{{ID_INPUT_JOYSTICK}}=="1", TAG+="uaccess"')
             continue
         ids = driver.ids
         if driver.usage is not None or driver.recognises is not None or not ids:

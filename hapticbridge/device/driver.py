@@ -54,7 +54,8 @@ class Driver:
         about: Description, in a few words.
         ids: Every product of the driver; empty for a device class.
         transport: ``hid`` (hidapi), ``usb`` (pyusb), ``serial`` (pyserial), ``service`` (the
-            maker's background program), ``library`` (the maker's library) or ``view`` (the page).
+            maker's background program), ``library`` (the maker's library), ``evdev`` (Linux's input
+            devices) or ``view`` (the page).
         axes: Axes in words, because they may differ between units.
         force: Available force, in words.
         rate: Rate of reports, in words.
@@ -77,13 +78,15 @@ class Driver:
             list of products.
         vendor: USB vendor whose products a library opens, known by id or not; the udev rule then
             names no product. None for drivers with a list of products.
+        stated: Options that the user has to state, with a word in the place of each value, as the
+            next command to type shows them; empty if there are none.
         subsystem: Kernel subsystem of the node that this library opens, ``usb`` or ``tty``.
     """
 
     name: str
     about: str
     ids: tuple[UsbId, ...]
-    transport: Literal["hid", "usb", "serial", "service", "library", "view"]
+    transport: Literal["hid", "usb", "serial", "service", "library", "evdev", "view"]
     axes: str
     force: str
     rate: str
@@ -99,6 +102,7 @@ class Driver:
     products: str = ""
     recognises: Callable[[bytes], bool] | None = None
     vendor: int | None = None
+    stated: str = ""
     subsystem: Literal["usb", "tty"] = "usb"
 
     def model(self, vendor: int, product: int) -> str | None:

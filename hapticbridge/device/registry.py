@@ -29,6 +29,7 @@ DRIVERS = {
     "rawhid": "hapticbridge.device.rawhid.device",
     "serial": "hapticbridge.device.rawhid.serial",
     "pid": "hapticbridge.device.pid.device",
+    "wheel": "hapticbridge.device.wheel.device",
     "haply": "hapticbridge.device.haply.device",
     "forcedimension": "hapticbridge.device.force_dimension.device",
     "touch": "hapticbridge.device.touch.device",
@@ -182,10 +183,11 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     - a connected device, by the name of its driver (``hapticbridge devices`` lists them), with
       options of that driver: ``spacemouse:speed=0.1,turn=1,dead_band=0.05``,
       ``rawhid:serial=12345,damping=2``, ``serial:/dev/ttyACM0,baud=115200``,
-      ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``, ``haply:serial=049D``,
-      ``forcedimension:library=FILE``, ``touch:library=FILE``. ``serial`` selects one of several,
-      ``log=FILE`` records the transferred bytes. Numbers unknown to the driver come from the
-      profile of the unit or its model, or from ``profile=NAME`` (or a file, or ``none``).
+      ``falcon:firmware=FILE``, ``pid:newtons=4,travel=0.08``, ``wheel:max_torque=2``,
+      ``haply:serial=049D``, ``forcedimension:library=FILE``, ``touch:library=FILE``. ``serial``
+      selects one of several, ``log=FILE`` records the transferred bytes. Numbers unknown to the
+      driver come from the profile of the unit or its model, or from ``profile=NAME`` (or a file,
+      or ``none``).
 
     Args:
         spec: The specification.

@@ -151,8 +151,9 @@ class ForceOffGuardian:
             process.wait(PATIENCE)
 
 
-_SHARED_NODES = "/dev/hidraw", "/dev/tty", "/dev/pts/"
-"""Beginnings of the nodes that two processes can hold: raw HID, serial ports, pseudo-terminals."""
+_SHARED_NODES = "/dev/hidraw", "/dev/input/event", "/dev/tty", "/dev/pts/"
+"""Beginnings of the nodes that two processes can hold: raw HID, input devices, serial ports,
+pseudo-terminals."""
 
 
 def guard_device_node(path: str, *reports: bytes) -> ForceOffGuardian | None:

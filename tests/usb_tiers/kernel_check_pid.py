@@ -10,14 +10,18 @@ import fcntl
 import os
 import struct
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from emulated.emulator_process import EmulatorProcess
 from emulated.guest import NO_PIDFF
 from emulated.pid_model import PidStick
+from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.device.discovery import plugged_devices
+from hapticbridge.device.wheel.device import WheelDevice, find, open_wheel
 from usb_tiers.benches import NEWTONS, STICK, free_stick, wait_for
 from usb_tiers.conftest import Plug
 
@@ -82,6 +86,34 @@ def test_the_kernels_driver_pushes_the_way_it_says(plug_usb: Plug, is_odd: bool)
     evdev.erase(effect)
     wait_for(lambda: not model.get("effects"))
     evdev.close()
+
+
+@pytest.mark.skipif("HAPTICBRIDGE_NO_PIDFF" in os.environ, reason=NO_PIDFF)
+def test_our_driver_of_input_devices_pushes_through_the_kernels(plug_usb: Plug) -> None:
+    """A stick as a wheel: to the right is a positive torque, and a positive angle."""
+    model = plug_usb(free_stick)
+    wait_for(lambda: [device for device in find() if device.problem is None])
+    wheel = open_wheel({"max_torque": 2.0, "range": 180.0})
+    sample = wheel.start(1e-3)
+    wrench = np.zeros(6)
+    for torque in (1.0, -0.5):
+        wrench[5] = torque
+        wait_for(lambda: _pushes(wheel, wrench, model, 0.5 * torque * NEWTONS))  # noqa: B023
+    before = float(sample["quaternion"][0, 3])
+    wait_for(lambda: _turned(wheel, sample) != before)
+    wheel.close()
+    _wait_for_force(model, 0.0, 0.0)
+    wait_for(lambda: not model.get("effects"))
+
+
+def _pushes(wheel: WheelDevice, wrench: NDArray[np.float64], model: Any, force: float) -> bool:
+    wheel.write(wrench)
+    return bool(model.call("force") == pytest.approx((force, 0.0), abs=0.05))
+
+
+def _turned(wheel: WheelDevice, sample: NDArray[np.void]) -> float:
+    wheel.read(sample)
+    return float(sample["quaternion"][0, 3])
 
 
 def _with_force(node: Path) -> Evdev | None:
