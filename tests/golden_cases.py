@@ -31,8 +31,10 @@ import hapticbridge as hb
 from hapticbridge.cli import main, terminal
 from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
-from hapticbridge.device.force_dimension.dhd import VARIABLE
+from hapticbridge.device.force_dimension import dhd
+from hapticbridge.device.touch import hd
 from hapticbridge.device.transport import hid, usb
+from hapticbridge.device.wheel.evdev import Linux
 from hapticbridge.errors import CommandError
 from hapticbridge.recording import Recording
 
@@ -643,7 +645,8 @@ def session_text(name: str, folder: Path) -> str:
     """
     lines = session_file(name).read_text(encoding="utf-8").splitlines()
     commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
-    plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb", VARIABLE: "/no/such.so"}
+    plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    plain |= dict.fromkeys((dhd.VARIABLE, hd.VARIABLE), "/no/such.so")
     shown = []
     models = str(Path(hb.__file__).parents[1])
     for command in commands:
@@ -655,6 +658,7 @@ def session_text(name: str, folder: Path) -> str:
             patch.object(usb, "on_the_bus", list),
             patch.object(usb, "libusb", lambda: None),
             patch.object(hid, "hid_api", lambda: None),
+            patch.object(Linux, "nodes", lambda _: []),
             redirect_stdout(out),
             redirect_stderr(err),
         ):

@@ -24,10 +24,11 @@ from hapticbridge.device.driver import (
     access_problem,
     permission_problem,
 )
-from hapticbridge.device.force_dimension.dhd import VARIABLE
+from hapticbridge.device.force_dimension import dhd
 from hapticbridge.device.haply import device as haply
 from hapticbridge.device.rawhid import serial
 from hapticbridge.device.registry import all_drivers
+from hapticbridge.device.touch import hd
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_bus
 from hapticbridge.device.transport import usb as usb_search
@@ -131,6 +132,17 @@ def test_every_product_of_a_vendor_with_a_library_has_a_permission(bus: Path) ->
     assert rules == [
         'SUBSYSTEM=="usb", ENV{DEVTYPE}=="usb_device", ATTR{idVendor}=="1451", TAG+="uaccess"'
     ]
+    (rule,) = [line for line in udev_rules().splitlines() if "2988" in line]  # its node is a port
+    assert rule == (
+        'SUBSYSTEM=="tty", ATTRS{idVendor}=="2988", ENV{ID_MM_DEVICE_IGNORE}="1", TAG+="uaccess"'
+    )
+
+
+def test_wheels_of_any_vendor_have_a_permission(bus: Path) -> None:
+    assert (
+        'SUBSYSTEM=="input", KERNEL=="event*", ENV{ID_INPUT_JOYSTICK}=="1", TAG+="uaccess"\n'
+        in udev_rules()
+    )
 
 
 @pytest.mark.parametrize(
@@ -254,12 +266,14 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
     [
         ("haply", "the Inverse Service does not run: no answer at localhost:"),
         ("forcedimension", "the library '/no/such.so' cannot be loaded"),
+        ("touch", "the library '/no/such.so' cannot be loaded"),
     ],
 )
 def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
     call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
 ) -> None:
-    monkeypatch.setenv(VARIABLE, "/no/such.so")
+    for variable in (dhd.VARIABLE, hd.VARIABLE):
+        monkeypatch.setenv(variable, "/no/such.so")
     with socket.socket() as unused:
         unused.bind(("localhost", 0))  # nobody listens there
         place = ("localhost", unused.getsockname()[1])
