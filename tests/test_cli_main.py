@@ -90,10 +90,10 @@ from hapticbridge.cli import main
 usual = builtins.__import__
 
 
-def interrupting(name, *rest):
+def interrupting(name, *rest, **named):
     if name == "mujoco":
         os.kill(os.getpid(), int(sys.argv[1]))
-    return usual(name, *rest)
+    return usual(name, *rest, **named)
 
 
 builtins.__import__ = interrupting
