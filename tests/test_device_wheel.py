@@ -22,6 +22,7 @@ from hapticbridge.device.wheel.device import WheelDevice, find, open_wheel
 from hapticbridge.device.wheel.evdev import interval_of, range_of
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.identify import identify
+from hapticbridge.identify.profile import measured_profile
 
 SCALE: dict[str, object] = {"max_torque": 2.0, "range": 900.0}
 TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
@@ -67,9 +68,21 @@ def test_full_level_is_the_stated_torque_and_more_is_cut_to_it() -> None:
     device, model = started(reverse=1.0)
     ticks(device, model, 3, 10.0 * TWIST)
     assert model.torque() == pytest.approx(-2.0)
-    device, model = started(torque_limit=0.4)
-    assert device.info.torque_limit == 0.4
-    assert opened(torque_limit=9.0)[0].info.torque_limit == 2.0
+
+
+def test_what_was_measured_with_one_strength_is_not_used_with_another(tmp_path: Path) -> None:
+    device, model = opened(WheelModel(free(), counts=(0, 1 << 20)), rate=1000.0)
+    result = identify(device, DrivingClock(model), period=PERIOD, axes=("rz",), duration=3.0)
+    device.close()
+    told: Any = {"device": "wheel", "serial": "", "date": "today", "duration": 3.0}
+    file = tmp_path / "wheel.toml"
+    file.write_text(measured_profile(result, **told).to_toml())
+    named: dict[str, object] = {"range": 900.0, "profile": str(file)}
+    assert open_wheel(named, ignore_message, model).info.torque_limit == 2.0
+    with pytest.raises(DeviceError, match=r"measured with 2, and its damping holds for that only"):
+        open_wheel({**named, "max_torque": 3.0}, ignore_message, model)
+    other = {**named, "max_torque": 3.0, "profile": "none"}
+    assert open_wheel(other, ignore_message, model).info.torque_limit == 3.0
 
 
 def test_an_angle_beyond_half_a_turn_is_that_of_the_wheel() -> None:

@@ -47,6 +47,7 @@ from hapticbridge.device.driver import (
     ignore_message,
     select_device,
 )
+from hapticbridge.device.profile import profile_named, profile_of
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
 from hapticbridge.device.wheel.evdev import (
@@ -136,13 +137,13 @@ class WheelDevice:
         self._place = AXES.index(axis)
         self._scale = (-FULL if is_reversed else FULL) / max_torque
         keys = [code for code in node.codes(EV_KEY) if FIRST_BUTTON <= code <= LAST_BUTTON]
+        stated: dict[str, Any] = dict(known or {})
         self._bits = {code: 1 << bit for bit, code in enumerate(sorted(keys)[:MAX_BUTTONS])}
-        stated: dict[str, Any] = {"torque_limit": max_torque, **(known or {})}
-        stated["torque_limit"] = min(stated["torque_limit"], max_torque)
         self.info = DeviceInfo(
             name=self._name,
             axes=(axis,),
             force_limit=USUAL_FORCE_LIMIT,
+            torque_limit=max_torque,
             rate=rate,
             serial=node.serial,
             buttons=len(self._bits),
@@ -271,8 +272,6 @@ def lack_of(node: InputNode) -> str:
 
 # Discovery of force-feedback devices among the input devices
 
-_NUMBERS = (*MEASURED, "torque_limit")
-
 
 def open_wheel(
     options: Mapping[str, object], notify: Notify = ignore_message, kernel: Kernel | None = None
@@ -280,26 +279,21 @@ def open_wheel(
     """Finds and opens a wheel.
 
     The options are ``serial`` (serial number or node), ``max_torque``, ``range`` in degrees,
-    ``axis``, ``rate``, ``reverse``, ``log``, and numbers of the data sheet.
+    ``axis``, ``rate``, ``reverse``, ``log``, ``profile``, and numbers of the data sheet.
 
     Raises:
         DeviceError: No wheel is found, an option is missing or not valid, or the device is no
             wheel.
         DeviceLost: The device is gone.
     """
-    numbers = stated_numbers(options, _NUMBERS)
+    numbers = stated_numbers(options, MEASURED)
     axis = options.get("axis", "rz")
     if axis not in AXES[3:]:
         raise DeviceError(f"axis = {axis!r}: must be one of {choices(AXES[3:])}")
     is_reversed = "reverse" in options and stated_switch(options, "reverse")
     system = Linux() if kernel is None else kernel
     plugged = select_device(DRIVER, find(system), options.get("serial"))
-    if "max_torque" not in options:
-        raise DeviceError(
-            f"{plugged}: no driver reports its strength; state the torque at full level in N m "
-            "with max_torque=, from the maker's data or a luggage scale at the rim"
-        )
-    max_torque = checked_number("max_torque", options["max_torque"], "N m", is_positive=True)
+    max_torque = _strength(options, plugged)
     degrees = options.get("range", range_of(plugged.path))
     if degrees is None:
         raise DeviceError(
@@ -330,6 +324,33 @@ def open_wheel(
     if kernel is None:
         device.leave_last_word()
     return device
+
+
+def _strength(options: Mapping[str, object], plugged: FoundDevice) -> float:
+    """Returns the torque at full level in N m, as stated or as in the unit's profile.
+
+    Raises:
+        DeviceError: It is not stated, not valid, or contradicts the profile, whose damping would
+            then have other units than the torque.
+    """
+    named = options.get("profile")
+    profile = profile_of("wheel", plugged.serial, plugged.name) if named is None else None
+    if named not in (None, "none"):
+        profile = profile_named(str(named))
+    known = None if profile is None else profile.quantities.get("torque_limit")
+    measured = known.value if known is not None and isinstance(known.value, float) else None
+    stated = options.get("max_torque", measured)
+    if stated is None:
+        raise DeviceError(
+            f"{plugged}: no driver reports its strength; state the torque at full level in N m "
+            "with max_torque=, from the maker's data or a luggage scale at the rim"
+        )
+    if measured is not None and stated != measured:
+        raise DeviceError(
+            f"max_torque = {stated!r}: the profile of this wheel was measured with {measured:g}, "
+            "and its damping holds for that only; leave out max_torque=, or add profile=none"
+        )
+    return checked_number("max_torque", stated, "N m", is_positive=True)
 
 
 def find(kernel: Kernel | None = None) -> list[FoundDevice]:
@@ -394,7 +415,8 @@ DRIVER = Driver(
         "serial": str,
         "log": str,
         "axis": str,
-        **dict.fromkeys(("max_torque", "range", "rate", "reverse", *_NUMBERS), float),
+        "profile": str,
+        **dict.fromkeys(("max_torque", "range", "rate", "reverse", *MEASURED), float),
     },
     open=open_wheel,
     find=find,
