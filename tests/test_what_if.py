@@ -209,7 +209,7 @@ def test_what_the_hand_wanted_is_found_where_it_is_known() -> None:
             dict.fromkeys(DeviceInfo.__dataclass_fields__)
             | {"name": "d", "axes": ["x", "y", "z"], "mass": 0.1, "damping": 2.0, "serial": ""}
             | {"force_limit": 10, "torque_limit": 0, "speed_limit": 1}
-            | {"is_prescribed": False, "is_real": False, "delay": 0.0}
+            | {"is_prescribed": False, "is_real": False, "delay": 0.0, "sensed": []}
         )
     )
     hand = Hand()

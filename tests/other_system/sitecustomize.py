@@ -65,12 +65,21 @@ class Seen:
         lacking: tuple[str, ...] = object.__getattribute__(self, "_lacking")
         if name == "platform" and module is sys:
             return SYSTEM
+        if name == "open" and module is os:
+            return opened
         if name.startswith(lacking):
             raise AttributeError(f"'{module.__name__}' of {SYSTEM} has no '{name}'")
         return getattr(module, name)
 
     def __setattr__(self, name: str, value: object) -> None:
         setattr(object.__getattribute__(self, "_module"), name, value)
+
+
+def opened(path: Any, *arguments: Any, **named: Any) -> int:
+    """Opens a file as ``os.open`` does; there is no folder of shared memory."""
+    if os.fspath(path).startswith("/dev/shm"):
+        raise FileNotFoundError(2, "No such file or directory", path)
+    return os.open(path, *arguments, **named)
 
 
 def cross() -> None:
