@@ -281,7 +281,7 @@ class Attack:
         if self.scene_ticks:
             slow = BoundKernel(scene.model, scene.data, parameters.of_scene)
         if not self.pays:
-            kernel.state["shown"]["tank"] = kernel.state["shown"]["cap"] = 1e9
+            kernel.state["shown"]["tank"] = kernel.state["shown"]["passing"] = 1e9
         parts = slow.state, slow.row, np.zeros(1, SAMPLE_DTYPE)
         hand, sample = np.zeros(1, HAND_DTYPE), np.zeros(1, SAMPLE_DTYPE)
         hand["quaternion"][0, 0] = 1.0

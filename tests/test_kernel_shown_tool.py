@@ -23,6 +23,9 @@ from hapticbridge.scene import load_scene
 
 LAW = Coupling(800.0, 0.5, 0.8, 5e-4)
 
+CREDIT = 10.0**2 / (2.0 * LAW.stiffness), 0.5**2 / (2.0 * LAW.rotational_stiffness)
+"""Energies in J of the springs at the levels of ``Loop``, 10 N and 0.5 N m."""
+
 
 def attack(seed: int, ticks: int, *, pays: bool = True) -> float:
     """Returns the most energy in J that a hand got out of a scene of so many ticks a step."""
@@ -166,7 +169,7 @@ def test_the_tool_moves_only_as_far_as_the_hand_has_paid() -> None:
     assert tank.min() < 0.0 < tank.max()  # loans, and energy on the way
     is_new = np.diff(rows["scene_step"]) > 0
     assert is_new.sum() == 149
-    cap = loop.fast.state["shown"]["cap"][0]
+    cap = 2.0 * sum(CREDIT) + loop.fast.state["shown"]["passing"][0]
     moved = np.minimum(tank[:-1] + work, cap)
     assert tank[1:][~is_new] == pytest.approx(moved[~is_new], abs=1e-9)
     assert (tank[1:] >= np.minimum(tank[1:] - work, 0.0) - 1e-9).all()
@@ -174,18 +177,79 @@ def test_the_tool_moves_only_as_far_as_the_hand_has_paid() -> None:
     assert loop.slow.state["energy"]["first_unstrict"][0] == -1
 
 
+def given_handle(loop: Loop) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns position and quaternion of the handle that the scene is given now."""
+    loop.fast.state["shown"]["waits"] = 0
+    take_result(loop.fast.state, loop.slow.state, loop.given)
+    return loop.given["position"][0].copy(), loop.given["quaternion"][0].copy()
+
+
 def test_the_handle_is_drawn_near_while_a_loan_is_out() -> None:
     loop = Loop("point_mass", 10)
     loop.run(stroke(0.05, 2.0, 60))
     fast = loop.fast.state
-    for tank, share in ((0.0, 1.0), (-0.75, 0.5), (-1.0, 0.0), (-2.0, 0.0)):
-        stretch = fast["pose"]["handle_position"][0] - fast["shown"]["newest"][0, :3]
-        energy = 0.5 * LAW.stiffness * float(stretch @ stretch)
-        fast["shown"]["credit"], fast["shown"]["tank"] = energy, tank * energy
-        fast["shown"]["waits"] = 0
-        take_result(fast, loop.slow.state, loop.given)
-        given = loop.given["position"][0] - fast["shown"]["newest"][0, :3]
-        assert given == pytest.approx(share * stretch, abs=1e-9)
+    stretch = fast["pose"]["handle_position"][0] - fast["shown"]["newest"][0, :3]
+    energy = 0.5 * LAW.stiffness * float(stretch @ stretch)
+    for lent, share in ((-energy, 1.0), (-0.25 * energy, 0.5), (0.0, 0.0), (1.0, 0.0)):
+        fast["shown"]["tank"] = -sum(CREDIT) - lent
+        position, _ = given_handle(loop)
+        newest = fast["shown"]["newest"][0, :3]
+        assert position - newest == pytest.approx(share * stretch, abs=1e-9), lent
+
+
+def test_the_scene_is_given_the_whole_handle_up_to_both_levels() -> None:
+    """The springs may hold what they hold at their levels, 62.5 mJ and 156 mJ."""
+    loop = Loop("point_mass", 10)
+    loop.run(np.zeros((20, 3)))
+    pose = loop.fast.state["pose"]
+    angle = 0.99 * 0.5 / LAW.rotational_stiffness
+    turned = [np.cos(0.5 * angle), 0.0, np.sin(0.5 * angle), 0.0]
+    pose["handle_position"][0] = loop.fast.state["shown"]["newest"][0, :3]
+    pose["handle_position"][0, 0] += 0.99 * 10.0 / LAW.stiffness
+    pose["handle_quaternion"][0] = turned
+    position, quaternion = given_handle(loop)
+    assert position == pytest.approx(pose["handle_position"][0], abs=1e-12)
+    assert quaternion == pytest.approx(turned, abs=1e-12)
+
+
+def test_the_credit_follows_a_change_of_the_coupling() -> None:
+    """A softer spring holds more at the level; the scene gets the force that the hand feels."""
+    loop = Loop("point_mass", 10)
+    loop.run(np.zeros((20, 3)))
+    soft = replace(LAW, stiffness=0.25 * LAW.stiffness)
+    method = method_named("lossless")
+    goal = replace(TO_REPLACE, coupling=soft, scene_ticks=10)
+    loop.fast.tune(goal, method.gains(soft, 10 * T), 1)
+    loop.run(np.zeros((20, 3)))
+    pose = loop.fast.state["pose"]
+    pose["handle_position"][0] = loop.fast.state["shown"]["newest"][0, :3]
+    pose["handle_position"][0, 0] += 0.99 * 10.0 / soft.stiffness
+    position, _ = given_handle(loop)
+    assert position == pytest.approx(pose["handle_position"][0], abs=1e-12)
+
+
+def test_the_verdict_forgives_what_the_scene_was_lent_and_no_more() -> None:
+    """Energy that the cap discarded was given by the hand, so as much was not lent."""
+    loop = Loop("point_mass", 20)
+    rows = loop.run(stroke(0.12, 6.0, 1500))
+    energy, shown = loop.fast.state["energy"], loop.fast.state["shown"]
+    given, taken = energy["coupling_work"][0], loop.slow.state["energy"]["coupling_work"][0]
+    assert shown["scene_work"][0] == taken
+    stored = rows["kinetic"] + rows["potential"] - energy["start_energy"][0]
+    created = stored - rows["coupling_work"] - rows["actuator_work"] - rows["external_work"]
+    discarded = given - taken - shown["tank"][0]
+    assert discarded > 1e-3  # the cap was reached
+    forgiven = created - rows["environment_energy"]
+    lent = np.maximum(-rows["scene_tank"], 0.0)
+    assert lent.max() > 0.0
+    # each forgiven joule was taken by the scene and not given by the hand
+    k = int(np.argmax(lent))
+    assert (forgiven <= lent + 1e-12).all()
+    loop_work = rows["coupling_work"]
+    is_new = np.diff(rows["scene_step"], prepend=0) > 0
+    lost = np.where(is_new, 0.0, np.diff(loop_work - rows["scene_tank"], prepend=0.0))
+    exact = np.maximum(-(rows["scene_tank"] + np.cumsum(lost)), 0.0)
+    assert forgiven == pytest.approx(exact, abs=1e-9), k
 
 
 def test_a_slower_scene_needs_a_method_that_solves_its_coupling() -> None:

@@ -105,6 +105,17 @@ def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
     return work
 
 
+def _discarded(block: AuditedBlock, work: Array) -> Array:
+    """Returns the energy in J that the cap of the tank discarded in each tick, (n,).
+
+    D_{k−1} + P_k − D_k. In a tick with a new result the cap does not act.
+    """
+    before = block.state.row
+    last = np.concatenate([before["scene_tank"], block.ticks["scene_tank"][:-1]])
+    is_new = np.diff(block.ticks["scene_step"], prepend=before["scene_step"]) != 0
+    return np.where(is_new, 0.0, last + work - block.ticks["scene_tank"])
+
+
 def _shown_deviations(block: AuditedBlock, balance: EnergyBalance) -> Iterator[Deviation]:
     """Yields where a shown tool moved without being paid for, or the scene stepped too often."""
     ticks, before = block.ticks, block.state
@@ -172,12 +183,16 @@ class EnergyBalance:
             coupling_work = _summed(work, before["coupling_work"])
         stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        discarded: Array = np.zeros(1)
         if parameters.scene_ticks:
-            created = created - np.maximum(-ticks["scene_tank"], 0.0)  # lent to the scene
+            discarded = _summed(_discarded(block, work), before["discarded"])
+            # lent to the scene: what it took and the hand has not given
+            created = created - np.maximum(-(ticks["scene_tank"] + discarded), 0.0)
         linear, angular = _slack_gains(parameters, gains)
         slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
         slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
+        totals["discarded"] = discarded
         totals |= _device_energies(block, events, delay)
         in_springs: Array | float = 0.0  # with a delay the device is elsewhere
         if parameters.has_law and not delay:

@@ -236,6 +236,7 @@ SUMS = (
     "device_dissipation",
     "unfelt_work",
     "tank_ceiling",
+    "discarded",
 )
 """Names of the cumulative energies."""
 

@@ -33,7 +33,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import CONTACT_PYRAMIDAL, EQUALITY, LIMIT_TENDON, Part, State
+from hapticbridge.kernel.codes import (
+    CONTACT_PYRAMIDAL,
+    EQUALITY,
+    LIMIT_TENDON,
+    Part,
+    Scheme,
+    State,
+)
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
@@ -505,7 +512,8 @@ def close_balance(s: State) -> bool:
     energy.slack += 0.5 * s.coupling.slack_rotational_stiffness * dot(turned, turned)
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
-    created -= max(-s.shown.tank, 0.0)  # lent to a slower scene, which gives it back first
+    if s.run.scheme == Scheme.SHOWN:  # lent to the scene, which gives it back first
+        created -= max(s.shown.scene_work - energy.coupling_work, 0.0)
     energy.environment_energy = created
     allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput)
     if s.run.watches_device:

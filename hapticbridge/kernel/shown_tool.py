@@ -25,13 +25,14 @@ sum of squares. The scene took W = Σ f_s·δx, metered in its own loop. The tan
 is what the hand has given and the scene has not yet got. The tool is shown at the pose nearest to
 y*, on the way there, with which D does not become negative (passive set-position modulation, Lee &
 Huang 2010), so the hand gets nothing that the scene did not give. D is capped, so that an hour of
-dissipation does not pay for one push.
+dissipation does not pay for one push. The cap holds from the tick after a result on.
 
 A result may have taken more than the hand has given by now, W > Σ P, because the hand turned back
 meanwhile. D is then negative: a loan to the scene, −D. Until the scene or the hand has paid it, the
 tool is shown only where that costs nothing, P >= 0. So Σ P >= min W over the time until now, and
 the hand cannot get more than the scene has released. The next handle that the scene is given is
-drawn so near to its tool that the spring holds no more than ``credit`` + D.
+drawn so near to its tool that the springs hold no more than the credit + D. The credit is what they
+hold at the force level, F²/2K + F_r²/2K_r, at the present gains.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ foreseen. If the next result is later than that, the tool stays where it is show
 HALVINGS = 24
 """Halvings in the search for the largest motion that the tank pays for; 1e-7 of the motion."""
 
-FASTEST = 1.0
-"""Speed in m/s up to which the tool passes on the coupling's whole force in time."""
+FASTEST, FASTEST_TURN = 1.0, 10.0
+"""Speeds in m/s and rad/s up to which the tool passes on the coupling's whole wrench in time."""
 
 SHOWN_DTYPE = np.dtype(
     [
@@ -88,13 +89,14 @@ SHOWN_DTYPE = np.dtype(
         ("scene_step", "<i8"),
         ("age", "<i8"),
         ("held_back", "<i8"),
+        ("silence", "<i8"),
+        ("longest_silence", "<i8"),
         ("contacts", "<i8"),
         ("planes", "<i8"),
         ("scene_period", "<f8"),
         ("lead", "<f8"),
         ("tank", "<f8"),
-        ("cap", "<f8"),
-        ("credit", "<f8"),
+        ("passing", "<f8"),
         ("work", "<f8"),
         ("scene_work", "<f8"),
         ("before", "<f8", 7),
@@ -109,9 +111,9 @@ SHOWN_DTYPE = np.dtype(
 )
 """Sub-record ``shown``, written by this module alone. ``waits`` is 1 while the scene has a handle,
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
-handed over, ``held_back`` those in which the tank was too low for y*. ``lead`` in s is the age of
-the newest result when it was taken over. ``tank`` D, ``cap``, ``credit``, ``work`` P of the present
-tick and ``scene_work`` W in J. ``before`` and ``newest`` are the tool's poses before and after the
+handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
+newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
+``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are the tool's poses before and after the
 newest step; a plane has a normal away from the surface, the arm from the grip to the contact point,
 the gap at the pose ``before`` in m, and the speed against its normal in m/s."""
 
@@ -119,16 +121,15 @@ the gap at the pose ``before`` in m, and the speed against its normal in m/s."""
 def bind_shown(shown: Part, parameters: RunParameters) -> None:
     """Fills in the sub-record; nothing of it is used by a scene that steps in every tick.
 
-    The cap of the tank is F²/K + 2 F v T_s: what two springs at their level hold, and what passes
-    at v = 1 m/s while a result is under way. The credit is F²/(2K), the energy of one of them.
+    The energy ``passing`` while a result is under way is 2 (F v + F_r ω) T_s, at v = 1 m/s and
+    ω = 10 rad/s.
     """
     if not parameters.scene_ticks:
         return
-    force = parameters.force_limit / parameters.force_scale
-    period = parameters.scene_ticks * parameters.period
-    spring = 0.5 * force * force / parameters.coupling.stiffness
-    shown["is_shown"], shown["scene_period"] = 1, period
-    shown["credit"], shown["cap"] = spring, 2.0 * (spring + force * FASTEST * period)
+    of_scene = parameters.of_scene
+    power = of_scene.force_limit * FASTEST + of_scene.torque_limit * FASTEST_TURN
+    shown["is_shown"], shown["scene_period"] = 1, of_scene.period
+    shown["passing"] = 2.0 * power * of_scene.period
 
 
 def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
@@ -156,6 +157,17 @@ def start_shown(state: NDArray[np.void]) -> None:
         store_quaternion(numbers[3:7], quaternion_of(s.pose.tool_quaternion))
 
 
+@compiled
+def _credit(s: State) -> float:
+    """Returns the energy in J of the coupling's springs at their levels, at the present gains."""
+    k, level = s.coupling, s.level.level
+    credit = 0.5 * level[0] * level[0] / k.stiffness
+    if k.rotational_stiffness > 0.0:
+        angle = min(level[1] / k.rotational_stiffness, np.pi)
+        credit += 0.5 * k.rotational_stiffness * angle * angle
+    return float(credit)
+
+
 # From the loop to the scene and back
 
 
@@ -163,7 +175,7 @@ def start_shown(state: NDArray[np.void]) -> None:
 def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     """Gives the scene's next step the handle of now, as its sample.
 
-    The handle is drawn toward the scene's tool where their spring holds more than the credit and
+    The handle is drawn toward the scene's tool where their springs hold more than the credit and
     the tank allow.
     """
     s = state[0]
@@ -174,7 +186,7 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     twist = rotation_between(orientation, quaternion_of(pose.handle_quaternion))
     energy = spring_energy(k.stiffness, norm(stretch), level[0])
     energy_r = spring_energy(k.rotational_stiffness, norm(twist), level[1])
-    allowed = max(s.shown.credit + s.shown.tank, 0.0)
+    allowed = max(_credit(s) + s.shown.tank, 0.0)
     if energy + energy_r <= allowed:
         store_vector(given.position, vector_of(pose.handle_position))
         store_quaternion(given.quaternion, quaternion_of(pose.handle_quaternion))
@@ -208,6 +220,7 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
     shown.tank -= scene.energy.coupling_work - shown.scene_work
     shown.scene_work = scene.energy.coupling_work
     shown.scene_step += 1
+    shown.silence = 0
     shown.lead = shown.age * s.run.period
     take_scene_energies(s.energy, scene.energy)
     _take_planes(s, scene)
@@ -346,8 +359,12 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
             else:
                 share, work = middle, given
     shown.work = work
-    shown.tank = min(shown.tank + work, shown.cap)
+    shown.tank += work
+    if shown.age > 0:
+        shown.tank = min(shown.tank, 2.0 * _credit(s) + shown.passing)
     shown.age += 1
+    shown.silence += 1
+    shown.longest_silence = max(shown.longest_silence, shown.silence)
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
     note_tool(pose, position, orientation)
     return force, torque, moved, turned
