@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -50,7 +51,7 @@ from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare
 from hapticbridge.run_description import attachments, describe_run, start_state
 from hapticbridge.signals import deferring_stops
-from hapticbridge.slow_scene import SlowScene
+from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
 from hapticbridge.summary import RunOutcome, Summary
 
 SUSPENDED_NS = 50_000_000
@@ -248,7 +249,7 @@ class Session:
         self.end, self._is_timed, self._slept = -1, False, 0
         self.stopped_by = self.signal = ""
         self._grants: tuple[Grant, ...] = ()
-        self._is_begun = False
+        self._is_begun = self._is_held = self._has_warned = False
         self.slow: SlowScene | None = None
         self.inputs: deque[list[Write]] = deque()
         self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
@@ -262,7 +263,7 @@ class Session:
     def _open(self, resources: ExitStack) -> None:
         setup, scene, clock = self.setup, self.setup.scene, self.clock
         scene.claim()
-        resources.callback(scene.release)
+        resources.callback(self._release_scene)
         if not setup.tool_weight and not scene.is_carried:
             scene.carry_tool("--no-tool-weight")
         effective = prepare(scene, setup.coupling, setup.scene_period, setup.substeps, setup.method)
@@ -349,6 +350,17 @@ class Session:
         if self.slow is not None:
             self.slow.close()
 
+    def _release_scene(self) -> None:
+        """Releases the scene, unless a step still works on it."""
+        scene = self.setup.scene
+        if self.slow is None or not self.slow.is_running:
+            scene.release()
+            return
+        warnings.warn(
+            f"a step of scene '{scene.name}' still runs; load the scene again for another run",
+            stacklevel=2,
+        )
+
     def _close_stream(self) -> None:
         """Finishes the recording, or removes it if start-up failed or a signal came before."""
         is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
@@ -423,7 +435,26 @@ class Session:
             else:
                 self.slow.note_picture(publish)
         self.stream.look()
+        if self.slow is not None:
+            self._look_after(self.slow)
         return self.tick + self._chore_ticks
+
+    def _look_after(self, slow: SlowScene) -> None:
+        """Lets the force go while a step of the scene does not end, and warns without force.
+
+        While a reset waits for the step, the force is off.
+        """
+        is_missing = slow.is_missing
+        if is_missing != self._is_held and not self.executor.later:
+            self._is_held ^= self.commands.hold(is_missing, "scene")
+        share = self.kernel.bound.state["guard"]["share"][0]
+        if is_missing and share == 0.0 and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"a step of scene '{self.setup.scene.name}' takes more than {LONGEST_WAIT:g} s: "
+                "the force is off until it ends; 'hapticbridge check' finds what is slow",
+                stacklevel=2,
+            )
 
     def count_losses(self, skipped: int) -> int:
         """Counts skipped deadlines; returns the record's flags for them and for lost records.

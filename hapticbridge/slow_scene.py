@@ -38,7 +38,8 @@ from hapticbridge.kernel.tick import (
 from hapticbridge.record import SAMPLE_DTYPE
 
 LONGEST_WAIT = 2.0
-"""Time in s that the end of a run waits for a step of the scene."""
+"""Time in s that the end of a run waits for a step of the scene, and after which a result that is
+due counts as missing. A shorter one lets the force go in scenes that are merely slow."""
 
 
 class SlowScene:
@@ -63,11 +64,11 @@ class SlowScene:
         data: mujoco.MjData,
         parameters: RunParameters,
     ) -> None:
-        self.bound = BoundKernel(model, data, parameters.of_scene)
+        self.bound = BoundKernel(model, data, parameters.of_scene, loop)
         self.late, self.is_waited_for = 0, True
         self._loop, self._model, self._data = loop, model, data
         self._ticks, self._substeps = parameters.scene_ticks, range(parameters.substeps)
-        self._period = parameters.of_scene.period
+        self._period, self._tick = parameters.of_scene.period, parameters.period
         self._given = np.zeros(1, SAMPLE_DTYPE)
         self._changes: deque[Callable[[], None]] = deque()
         self._publish: Callable[[BoundKernel], None] | None = None
@@ -90,14 +91,32 @@ class SlowScene:
     def settle(self) -> None:
         """Ends the step under way without taking it over, and applies the waiting changes.
 
-        The bridge's loop waits for it, so it is for moments without force, such as a reset.
+        The bridge's loop waits for it unless it ``is_idle``. If the step diverged, the next tick
+        trips, as it would have with its result.
 
         Raises:
             HapticBridgeError: The step takes longer than ``LONGEST_WAIT``.
         """
         if self._waits[0]:
             self._wait_for_result()
+            if not self._is_sound:
+                fail_scene(self._loop.state["shown"])
         self._apply_changes()
+
+    @property
+    def is_idle(self) -> bool:
+        """True if no step is under way that the loop would have to wait for."""
+        return self._thread is None or not self._waits[0] or self._done.is_set()
+
+    @property
+    def is_missing(self) -> bool:
+        """True if a result is overdue by more than ``LONGEST_WAIT``."""
+        return not self.is_idle and self._age[0] * self._tick > self._period + LONGEST_WAIT
+
+    @property
+    def is_running(self) -> bool:
+        """True if the thread is alive; after ``close``, if a step did not end."""
+        return self._thread is not None and self._thread.is_alive()
 
     def _apply_changes(self) -> None:
         while self._changes:
@@ -178,12 +197,17 @@ class SlowScene:
         return True
 
     def close(self) -> None:
-        """Ends the thread after its present step, which is waited for ``LONGEST_WAIT`` s."""
+        """Ends the thread after its present step, which is waited for ``LONGEST_WAIT`` s.
+
+        A longer step goes on and ``is_running``; model and data then stay as they are, because it
+        works on them.
+        """
         self._is_closed = True
         self._wake.release()
         if self._thread is not None:
             self._thread.join(LONGEST_WAIT)
-        self.bound.release()
+        if not self.is_running:
+            self.bound.release()
 
     # Whole ticks in compiled code
 

@@ -325,6 +325,7 @@ class Summary:
             flags=int(state["watch"]["flags"][0]),
             has_tripped=outcome.stopped_by == "trip",
             scene_steps=int(state["shown"]["scene_step"][0]),
+            scene_silence=parameters.period * int(state["shown"]["longest_silence"][0]),
         )
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(

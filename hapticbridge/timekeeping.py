@@ -41,6 +41,10 @@ NOT_KEPT = "the run did not keep its time"
 SLOW_MOTION = 0.95
 """Share of its speed below which a slower scene is felt to be in slow motion, without unit."""
 
+SILENT_PERIODS = 10.0
+"""Periods of a slower scene without a result above which the time is named. A late result is usual;
+after ten, a hand has met a tool that stands still."""
+
 SWUNG = "its force came late, reversed or in steps"
 """Words for what the watch found (``kernel.swing_watch``)."""
 
@@ -61,6 +65,7 @@ class RunTimes:
         flags: Combined flags of the records, or of the watch alone.
         has_tripped: True if the guard stopped the run.
         scene_steps: Results that a scene slower than the loop has given.
+        scene_silence: Longest time in s without a new one.
     """
 
     ticks: int
@@ -73,6 +78,7 @@ class RunTimes:
     flags: int = 0
     has_tripped: bool = False
     scene_steps: int = 0
+    scene_silence: float = 0.0
 
 
 def watch_sentence(flags: int) -> str:
@@ -117,6 +123,7 @@ class Timekeeping:
         has_tripped: True if the guard stopped the run.
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
         scene_speed: Share of them that it gave, 0 to 1.
+        scene_silence: Longest time in s without a new one.
     """
 
     rate: float
@@ -134,6 +141,7 @@ class Timekeeping:
     has_tripped: bool
     scene_rate: float | None
     scene_speed: float
+    scene_silence: float
 
     @classmethod
     def of(
@@ -161,6 +169,7 @@ class Timekeeping:
             has_tripped=times.has_tripped,
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
             scene_speed=_scene_speed(times, parameters.scene_ticks),
+            scene_silence=times.scene_silence,
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
@@ -201,6 +210,8 @@ class Timekeeping:
         if self.scene_rate is not None:
             speed = f"{100.0 * self.scene_speed:.3g} % of its speed"
             late += f", the scene at {self.scene_rate:.4g} Hz and {speed}"
+            if self.scene_silence * self.scene_rate > SILENT_PERIODS:
+                late += f", once without a result for {format_si(self.scene_silence, 's')}"
         return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
 
     @property

@@ -279,7 +279,7 @@ class Attack:
         )
         kernel = slow = BoundKernel(scene.model, scene.data, parameters)
         if self.scene_ticks:
-            slow = BoundKernel(scene.model, scene.data, parameters.of_scene)
+            slow = BoundKernel(scene.model, scene.data, parameters.of_scene, kernel)
         if not self.pays:
             kernel.state["shown"]["tank"] = kernel.state["shown"]["passing"] = 1e9
         parts = slow.state, slow.row, np.zeros(1, SAMPLE_DTYPE)

@@ -76,7 +76,7 @@ class Loop:
         model, data = self.scene.model, self.scene.data
         self.fast = self.slow = BoundKernel(model, data, parameters)
         if ticks:
-            self.slow = BoundKernel(model, data, parameters.of_scene)
+            self.slow = BoundKernel(model, data, parameters.of_scene, self.fast)
         self.given = np.zeros(1, SAMPLE_DTYPE)
 
     def run(self, motion: NDArray[np.float64]) -> NDArray[np.void]:

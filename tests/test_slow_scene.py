@@ -222,6 +222,7 @@ def test_a_result_that_is_not_finite_trips() -> None:
     assert not device.writes[-1].any()
 
 
+@pytest.mark.filterwarnings("ignore:a step of scene .point_mass.")
 def test_a_step_that_stands_still_keeps_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hapticbridge.slow_scene.LONGEST_WAIT", 0.1)
     device, release = ScriptedDevice(still), threading.Event()
@@ -237,6 +238,152 @@ def test_a_step_that_stands_still_keeps_no_device(monkeypatch: pytest.MonkeyPatc
         assert summary.timekeeping.scene_speed == 0.0
     finally:
         release.set()
+
+
+class Held:
+    """A step of MuJoCo that begins and does not end before it is told to."""
+
+    def __init__(self, step: Callable[..., None]) -> None:
+        self._step, self.has_begun, self.may_end = step, threading.Event(), threading.Event()
+
+    def __call__(self, *scene: Any) -> None:
+        self.has_begun.set()
+        self.may_end.wait(60.0)
+        self._step(*scene)
+
+
+def holding(bridge: Bridge) -> Held:
+    """Lets the scene's next step begin and not end."""
+    slow = bridge.session.slow
+    assert slow is not None
+    slow.step = Held(slow.step)
+    return slow.step
+
+
+def test_a_scene_is_left_alone_while_a_step_of_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hapticbridge.slow_scene.LONGEST_WAIT", 0.1)
+    scene, left = load_scene("peg_in_hole"), []
+    bridge = Bridge(scene, ScriptedDevice(still), COUPLING, scene_rate=100.0)
+    with pytest.warns(UserWarning, match="a step of scene 'peg_in_hole' still runs"), bridge:
+        held, slow = holding(bridge), bridge.session.slow
+        assert slow is not None
+        monkeypatch.setattr(slow.bound, "release", lambda: left.append(held.may_end.is_set()))
+        bridge.run(0.1)
+        assert held.has_begun.is_set()
+    assert not left  # nothing was put back into the model below the step
+    with pytest.raises(HapticBridgeError, match="in use by another bridge; load it again"):
+        scene.claim()
+    held.may_end.set()
+
+
+def test_a_step_that_does_not_end_lets_the_force_go_until_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticbridge.slow_scene.LONGEST_WAIT", 0.3)
+    steps: list[Held] = []
+
+    def act(bridge: Bridge, tick: int) -> None:
+        time.sleep(1e-4)
+        if tick == 203:
+            steps.append(holding(bridge))
+        if tick == 1000:
+            steps[0].may_end.set()
+
+    path = tmp_path / "held.mcap"
+    with pytest.warns(UserWarning, match="the force is off until it ends"):
+        summary = recorded(
+            path,
+            "virtual_wall",
+            ScriptedDevice(stroke),
+            COUPLING,
+            clock=SlowClock({}),
+            scene_rate=100.0,
+            duration=1.6,
+            on_tick=act,
+        )
+    report = audited(path)
+    ticks, events = read_recording(path).ticks, read_recording(path).events
+    switched = [(e["tick"], e["force"]) for e in events if e["event"] == "switch"]
+    (off, is_on), (on, is_on_again) = switched
+    assert (is_on, is_on_again) == (False, True)
+    assert 203 + 310 <= off <= 203 + 450
+    assert 1000 <= on <= 1250
+    assert not ticks["wrench_on_device"][off + 100 : on].any()
+    assert np.abs(ticks["wrench_on_device"][on + 100 :]).max() > 1.0
+    for kept in (summary.timekeeping, report.timekeeping):
+        assert "once without a result for" in kept.words
+        assert kept.scene_silence == summary.timekeeping.scene_silence > 0.79
+
+
+def test_a_reset_waits_for_the_step_under_way_and_the_loop_does_not(tmp_path: Path) -> None:
+    steps: list[Held] = []
+
+    def act(bridge: Bridge, tick: int) -> None:
+        time.sleep(1e-4)
+        if tick == 300:
+            steps.append(holding(bridge))
+        if tick == 320:
+            assert steps[0].has_begun.wait(10.0)
+            bridge.command(Reset())
+        if tick == 500:
+            steps[0].may_end.set()
+
+    path, began = tmp_path / "reset.mcap", time.monotonic()
+    options: dict[str, Any] = {"clock": SlowClock({}), "scene_rate": 100.0}
+    recorded(
+        path, "virtual_wall", ScriptedDevice(stroke), COUPLING, duration=1.0, on_tick=act, **options
+    )
+    assert time.monotonic() - began < 2.0 + 30.0
+    (reset,) = [e["tick"] for e in read_recording(path).events if e["event"] == "reset"]
+    assert 500 <= reset < 1000
+    assert audited(path).timekeeping.scene_silence > 0.15
+
+
+def test_a_step_that_diverged_before_a_reset_trips_as_its_result_would() -> None:
+    device = ScriptedDevice(sway)
+    bridge = fast("point_mass", device, coupling=COUPLING, scene_rate=100.0)
+
+    def spoils(_: object, data: Any) -> None:
+        data.qvel[:] = np.nan
+
+    def act(tick: int) -> None:
+        slow = bridge.session.slow
+        assert slow is not None
+        if tick == 95:
+            usual, slow.step = slow.step, spoils
+            slow.change(lambda: setattr(slow, "step", usual))  # after the step under way
+            bridge.session.executor.later.append((tick, "test"))
+
+    with pytest.raises(SafetyTrip, match=r"not finite|unstable|diverge"), bridge:
+        bridge.run(1.0, act)
+    assert bridge.session.tick == 95
+    assert not device.writes[-1].any()
+
+
+@pytest.mark.parametrize("scene", ["peg_in_hole", "hammer"])
+def test_a_tool_at_rest_stays_so_at_the_start_and_after_a_reset(tmp_path: Path, scene: str) -> None:
+    """The scene's handle starts where the loop's does, which is not the world's origin."""
+
+    def act(bridge: Bridge, tick: int) -> None:
+        if tick == 203:
+            bridge.command(Reset())
+
+    path, coupling = tmp_path / "rest.mcap", hb.Coupling(800.0, 9.0, 0.8, 9e-3)
+    recorded(
+        path,
+        scene,
+        ScriptedDevice(still),
+        coupling,
+        scene_rate=100.0,
+        duration=0.6,
+        on_tick=act,
+    )
+    ticks = read_recording(path).ticks
+    assert ticks["scene_step"][-1] > 50
+    still_at = ticks["tool_position"][0]
+    assert np.abs(ticks["tool_position"] - still_at).max() < 1e-4
+    assert ticks["kinetic"].max() < 1e-6
+    audited(path)
 
 
 # Options

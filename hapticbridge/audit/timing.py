@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array
@@ -36,6 +37,8 @@ class TimingTally:
         parameters: Run parameters.
         ticks: Number of records so far.
         scene_steps: Results of a slower scene so far.
+        newest_result: Number of the tick that took over the newest of them.
+        longest_silence: Largest number of ticks without a new one so far.
         fresh: Number of records with a new sample so far.
         due: Number of deadlines so far.
         overruns: Number of records after skipped deadlines so far.
@@ -52,6 +55,8 @@ class TimingTally:
     parameters: RunParameters
     ticks: int = 0
     scene_steps: int = 0
+    newest_result: int = 0
+    longest_silence: int = 0
     fresh: int = 0
     due: int = 0
     overruns: int = 0
@@ -68,7 +73,7 @@ class TimingTally:
         ticks, parameters = block.ticks, self.parameters
         self.ticks += len(ticks)
         if parameters.scene_ticks:
-            self.scene_steps = int(ticks["scene_step"][-1])
+            self._add_results(ticks)
         self.fresh += int(np.count_nonzero(~has_flag(ticks, TickFlag.STALE_SAMPLE)))
         self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
         self.overruns += int(np.count_nonzero(has_flag(ticks, TickFlag.OVERRUN)))
@@ -105,6 +110,14 @@ class TimingTally:
             self.last_square[kind] = square[-1]
         most = force_scale / scale * float(np.max(total))
         self.most_uncovered = max(self.most_uncovered, most)
+
+    def _add_results(self, ticks: NDArray[np.void]) -> None:
+        is_new = np.diff(ticks["scene_step"], prepend=self.scene_steps) > 0
+        results = ticks["tick"][is_new]
+        ends = np.concatenate([[self.newest_result], results, [ticks["tick"][-1] + 1]])
+        self.longest_silence = max(self.longest_silence, int(np.diff(ends).max()))
+        self.newest_result = int(ends[-2])
+        self.scene_steps = int(ticks["scene_step"][-1])
 
 
 def _drained(steps: Array, start: float) -> Array:

@@ -390,6 +390,7 @@ def _time_facts(
         flags=recording.flags,
         has_tripped=any(event.get("event") == "trip" for event in recording.events),
         scene_steps=timing.scene_steps,
+        scene_silence=run.parameters.period * timing.longest_silence,
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)

@@ -97,6 +97,17 @@ class Repeat:
     events: tuple[Mapping[str, Any], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Internal command that keeps the force off while a step of the scene does not end.
+
+    Attributes:
+        is_held: True keeps it off, False gives it back as the switches have it.
+    """
+
+    is_held: bool
+
+
 Command = Couple | Switch | Reset | Mark | Stop
 
 KINDS: dict[str, type[Command]] = {

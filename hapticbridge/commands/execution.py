@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 
 from hapticbridge.commands.allowed import CouplingLimits
-from hapticbridge.commands.command import Command, Couple, Mark, Repeat, Reset, Switch
+from hapticbridge.commands.command import Command, Couple, Hold, Mark, Repeat, Reset, Switch
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CommandError, HapticBridgeError, RecordingError
 from hapticbridge.inputs import applied_writes
@@ -119,6 +119,11 @@ class EventApplier:
                 raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
             self._reset()
 
+    @property
+    def is_idle(self) -> bool:
+        """True if a reset needs not wait for a step of a slower scene."""
+        return self._slow is None or self._slow.is_idle
+
     def _reset(self) -> None:
         if self._slow is not None:
             self._slow.settle()
@@ -179,10 +184,17 @@ class CommandQueue:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self.limits, self.now = limits, now
-        self.waiting: deque[tuple[Command | Repeat, str]] = deque(maxlen=MAX_WAITING)
+        self.waiting: deque[tuple[Command | Repeat | Hold, str]] = deque(maxlen=MAX_WAITING)
         self._is_recorded = is_recorded
         self._offering = threading.Lock()  # never taken by the loop
         self._last = self._last_reset = -float("inf")
+
+    def hold(self, is_held: bool, by: str) -> bool:
+        """Adds a ``Hold`` before all waiting commands; returns False if there is no room."""
+        has_room = len(self.waiting) < MAX_WAITING
+        if has_room:
+            self.waiting.appendleft((Hold(is_held), by))
+        return has_room
 
     def warm_up(self) -> None:
         """Computes the tables of limits in advance, so that the first command is not slow."""
@@ -250,13 +262,13 @@ class CommandExecutor:
         self.requested: Coupling = queue.limits.start
         self.later: deque[tuple[int, str]] = deque()
         self._queue, self._applier, self._fade_ticks, self._note = queue, applier, fade_ticks, note
-        self._has_force, self._is_clutched = True, False
+        self._has_force, self._is_clutched, self._is_held = True, False, False
 
     def act(self, tick: int) -> None:
         """Executes the command that is due before a tick."""
         if self.later:
             due, by = self.later[0]
-            if tick < due:
+            if tick < due or not self._applier.is_idle:
                 return  # commands keep their order
             self.later.popleft()
             self._apply({"event": "reset", "by": by})
@@ -278,6 +290,9 @@ class CommandExecutor:
         elif isinstance(command, Reset):
             self.later.append((tick + self._fade_ticks + 1, by))
             self._switch(by, is_fading=True)
+        elif isinstance(command, Hold):
+            self._is_held = command.is_held
+            self._switch(by)
         elif isinstance(command, Mark):
             self._note("mark", by=by)
         elif isinstance(command, Repeat):
@@ -285,7 +300,7 @@ class CommandExecutor:
                 self._apply({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
 
     def _switch(self, by: str, *, is_fading: bool = False) -> None:
-        force = self._has_force and not is_fading
+        force = self._has_force and not is_fading and not self._is_held
         event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
         # a force that fades for a moment only was not switched off by a command
         self._apply(event | ({"fading": True} if is_fading else {}))

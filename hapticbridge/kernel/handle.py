@@ -114,6 +114,13 @@ def stretch_at(s: State, sample: NDArray[np.void]) -> float:
     return norm(subtract(handle, vector_of(pose.tool_position)))
 
 
+def follow_handle(pose: Part, loop: Part) -> None:
+    """Puts device and handle of a slower scene where the handle of its loop is, as their home."""
+    for end, part in (("position", slice(3)), ("quaternion", slice(3, 7))):
+        value = loop[f"handle_{end}"]
+        pose[f"device_{end}"] = pose[f"handle_{end}"] = pose["handle_home"][part] = value
+
+
 def set_tool(pose: Part, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
     """Sets the tool's pose at the start or after a reset."""
     pose["tool_position"] = position

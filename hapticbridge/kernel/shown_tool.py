@@ -113,9 +113,10 @@ SHOWN_DTYPE = np.dtype(
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
 newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
-``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are the tool's poses before and after the
-newest step; a plane has a normal away from the surface, the arm from the grip to the contact point,
-the gap at the pose ``before`` in m, and the speed against its normal in m/s."""
+``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are
+the tool's poses before and after the newest step; a plane has a normal away from the surface, the
+arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed against
+its normal in m/s."""
 
 
 def bind_shown(shown: Part, parameters: RunParameters) -> None:

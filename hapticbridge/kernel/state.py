@@ -46,7 +46,13 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
-from hapticbridge.kernel.handle import POSE_DTYPE, bind_poses, move_handle_home, set_tool
+from hapticbridge.kernel.handle import (
+    POSE_DTYPE,
+    bind_poses,
+    follow_handle,
+    move_handle_home,
+    set_tool,
+)
 from hapticbridge.kernel.law import (
     COUPLING_DTYPE,
     Gains,
@@ -157,13 +163,23 @@ STATE_DTYPE = np.dtype(
 class BoundKernel:
     """The kernel's state bound to one model, its data and the parameters of one run.
 
+    Args:
+        model: The prepared scene.
+        data: Its data, at the start.
+        parameters: Parameters of the run; for a slower scene's own kernel ``of_scene``.
+        loop: For such a kernel that of the bridge's loop, whose handle is its device.
+
     Attributes:
         state: One element of ``STATE_DTYPE``.
         row: One element of ``TICK_DTYPE``, written by each tick.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        parameters: RunParameters,
+        loop: BoundKernel | None = None,
     ) -> None:
         """Binds; the tool's present pose and energy are those of the run's start.
 
@@ -173,7 +189,11 @@ class BoundKernel:
         """
         self.state = np.zeros(1, STATE_DTYPE)
         self.row = np.zeros(1, TICK_DTYPE)
-        self._model, self._data = model, data  # the addresses in the state point into them
+        self._model, self._data, self._loop = (
+            model,
+            data,
+            loop,
+        )  # the addresses in the state point into them
         self._owned: dict[str, NDArray[np.generic]] = {}
         self._restore_springs: Callable[[State], None] | None = None
         self._bind_model(parameters)
@@ -252,8 +272,8 @@ class BoundKernel:
         """Continues after the scene's data were set back to a start.
 
         The handle is placed at its start, and the device's pose belongs to it from the next tick
-        on. The change of the scene's storage is work of the external port. Energy that the device
-        received before is not forgotten.
+        on; a slower scene's handle stays that of its loop. The change of the scene's storage is
+        work of the external port. Energy that the device received before is not forgotten.
         """
         s = self._record
         before = float(s["energy"]["kinetic"] + s["energy"]["potential"])
@@ -265,7 +285,8 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
-        let_go(s["guard"])
+        if self._loop is None:
+            let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
             direct(restart_lossless, s)(s)
         elif s["shown"]["is_shown"]:
@@ -346,6 +367,8 @@ class BoundKernel:
         s = self._record
         self._take_tool_pose()
         bind_poses(s["run"], s["pose"], parameters)
+        if self._loop is not None:
+            follow_handle(s["pose"], self._loop.state["pose"][0])
         if parameters.scheme == Scheme.MASSLESS:
             mujoco.mj_fwdPosition(self._model, self._data)
             balance_contacts(s)

@@ -209,7 +209,7 @@ class ClosedLoop:
         parameters = setup.parameters(sample, effective)
         binding = slow = BoundKernel(scene.model, scene.data, parameters)
         if scene_ticks:
-            slow = BoundKernel(scene.model, scene.data, parameters.of_scene)
+            slow = BoundKernel(scene.model, scene.data, parameters.of_scene, binding)
         if knock is not None:
             device.displace(knock)
         intervals = (
