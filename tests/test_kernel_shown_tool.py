@@ -52,17 +52,17 @@ def rms(values: NDArray[np.float64]) -> float:
 class Loop:
     """The ticks of a loop in front of a slower scene, or of one that steps in every tick (0)."""
 
-    def __init__(self, scene: str, ticks: int, **values: Any) -> None:
+    def __init__(self, scene: str, ticks: int, law: Coupling = LAW, **values: Any) -> None:
         self.ticks, self.scene = ticks, load_scene(scene, **values)
         method = method_named("lossless").with_contact(None)
-        prepare(self.scene, LAW, max(ticks, 1) * T, 1, method, warns=False)
-        self.scene.set_gains(*method.gains(LAW, max(ticks, 1) * T))
+        prepare(self.scene, law, max(ticks, 1) * T, 1, method, warns=False)
+        self.scene.set_gains(*method.gains(law, max(ticks, 1) * T))
         self.scene.reset()
         parameters = RunParameters(
             grip=self.scene.grip,
             period=T,
             substeps=1,
-            coupling=LAW,
+            coupling=law,
             force_limit=10.0,
             torque_limit=0.5,
             ramp_ticks=0,
