@@ -280,13 +280,15 @@ def _turned(wrench: NDArray[np.float64], quaternion: NDArray[np.float64]) -> NDA
 
     With q = (w, u): v + 2 u × (u × v) − 2 w u × v.
     """
-    w, u = quaternion[:, :1], quaternion[:, 1:]
-    parts = []
+    w, x, y, z = (quaternion[:, k] for k in range(4))
+    turned = np.empty_like(wrench)
     for start in (0, 3):
-        v = wrench[:, start : start + 3]
-        once = 2.0 * np.cross(u, v)
-        parts.append(v + np.cross(u, once) - w * once)
-    turned = np.concatenate(parts, axis=1)
+        a, b, c = (wrench[:, start + k] for k in range(3))
+        # u × v, twice
+        p, q, r = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+        turned[:, start] = a + (y * r - z * q) - w * p
+        turned[:, start + 1] = b + (z * p - x * r) - w * q
+        turned[:, start + 2] = c + (x * q - y * p) - w * r
     # which of two NaN a sum keeps is the processor's choice
     return np.where(np.isfinite(turned), turned, np.nan)
 
