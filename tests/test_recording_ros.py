@@ -179,3 +179,20 @@ def test_messages_that_say_something_else_are_found_in_a_file_sealed_with_them(
     report = audit(forged)
     assert report.verdict != "passive"
     assert problem in report.reason
+
+
+def test_a_schema_that_names_other_numbers_is_found(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bytes are those of the ticks, but a reader would take x for y."""
+    cut, forged = tmp_path / "cut.mcap", tmp_path / "forged.mcap"
+    cut.write_bytes(run.read_bytes()[:-30])
+    name, text = TOPICS["/tool_pose"]
+    swapped = text.replace(b"Point\nfloat64 x\nfloat64 y", b"Point\nfloat64 y\nfloat64 x")
+    assert swapped != text
+    with monkeypatch.context() as change:
+        change.setitem(TOPICS, "/tool_pose", (name, swapped))
+        repair(cut, forged)
+    problems = read_recording(forged).problems
+    assert any("/tool_pose has another schema" in problem for problem in problems)
+    assert audit(forged).verdict != "passive"

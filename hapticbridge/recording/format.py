@@ -98,15 +98,15 @@ def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
 
 def record_dtype(schema: bytes) -> np.dtype[np.void] | None:
     """Returns the record that a schema of this or an earlier version describes, or None."""
-    described = _without_comments(schema)
+    described = without_comments(schema)
     present = {line.rpartition(" ")[2] for line in described}
     lacking = [name for name in LATER_FIELDS if name not in present]
     names = [name for name in TICK_DTYPE.names or () if name not in lacking]
     record = np.dtype([(name, TICK_DTYPE[name]) for name in names])
-    return record if _without_comments(tick_schema(record)) == described else None
+    return record if without_comments(tick_schema(record)) == described else None
 
 
-def _without_comments(schema: bytes) -> list[str]:
+def without_comments(schema: bytes) -> list[str]:
     """Returns the lines of a schema; those of earlier versions have no units."""
     lines = schema.decode(errors="replace").splitlines()
     return [line.partition("#")[0].rstrip() for line in lines]

@@ -156,7 +156,13 @@ class Contents:
         topic, encoding = fields.text(), fields.text()
         if topic == layout.EVENT_TOPIC and encoding == layout.EVENT_ENCODING:
             self._topics[channel] = topic
-        if topic in ros_messages.TOPICS and encoding == layout.TICK_ENCODING:
+        if topic in ros_messages.TOPICS:
+            name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
+            own_name, own_text = ros_messages.TOPICS[topic]
+            found = name, schema_encoding, encoding, layout.without_comments(text)
+            own = own_name, layout.TICK_SCHEMA_ENCODING, layout.TICK_ENCODING
+            if found != (*own, layout.without_comments(own_text)):
+                raise DamageError(f"its topic {topic} has another schema than '{own_name}'")
             self._topics[channel], self.has_messages = topic, True
         if topic == layout.TICK_TOPIC and channel not in self._topics:
             name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
