@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE
+from hapticbridge.kernel.codes import HANDLE, added_actuators, hand_count, name_of_hand
 
 Write = tuple[str, int, list[float]]
 """Field of ``mjData``, index of the first number in it, and the numbers."""
@@ -51,16 +51,18 @@ def input_writes(
             )
     writes: list[Write] = []
     actuators = [model.actuator(i).name for i in range(model.nactuator)]
-    own = [name for name in actuators if name not in COUPLING_ACTUATORS]
+    added = {actuators[i] for i in added_actuators(model)}
+    own = [name for name in actuators if name not in added]
     for name, value in (ctrl or {}).items():
         actuator_id = _index("actuator", name, own, actuators)
         count = int(model.actuator_ctrlnum[actuator_id])
         numbers = _numbers(f"control of actuator '{name}'", value, (count,))
         writes.append(("ctrl", int(model.actuator_ctrladr[actuator_id]), numbers))
     bodies = [model.body(i).name for i in range(model.nbody)]
+    handles = {name_of_hand(HANDLE, hand) for hand in range(hand_count(model))}
     movable = [bodies[i] for i in range(model.nbody) if model.body_mocapid[i] >= 0]
     for name, value in (mocap or {}).items():
-        body_id = _index("mocap body", name, [n for n in movable if n != HANDLE], bodies)
+        body_id = _index("mocap body", name, [n for n in movable if n not in handles], bodies)
         mocap_id = int(model.body_mocapid[body_id])
         numbers = _numbers(f"pose of mocap body '{name}'", value, (3, 7))
         writes.append(("mocap_pos", 3 * mocap_id, numbers[:3]))
@@ -79,7 +81,7 @@ def input_writes(
         numbers = _numbers(f"force of joint '{name}'", value, (count,))
         writes.append(("qfrc_applied", first, numbers))
     for name, value in (body_wrench or {}).items():
-        body_id = _index("body", name, [n for n in bodies[1:] if n != HANDLE], bodies)
+        body_id = _index("body", name, [n for n in bodies[1:] if n not in handles], bodies)
         numbers = _numbers(f"wrench of body '{name}'", value, (6,))
         writes.append(("xfrc_applied", 6 * body_id, numbers))
     return writes

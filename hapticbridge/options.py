@@ -406,6 +406,11 @@ class RunSetup:
         Raises:
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
+        if scene.other_grips:
+            raise SceneError(
+                f"scene '{scene.name}' was loaded with {1 + len(scene.other_grips)} grips, and a "
+                f"run has one hand; load it with one of {choices((scene.grip, *scene.other_grips))}"
+            )
         method, period, substeps = (
             options.rendering_method,
             period_of(options.rate),

@@ -17,12 +17,20 @@ from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import HANDLE, WELD_NAME, Scheme, added_id, coupling_ids
+from hapticbridge.kernel.codes import (
+    HANDLE,
+    WELD_NAME,
+    Scheme,
+    added_actuators,
+    added_id,
+    coupling_ids,
+    name_of_hand,
+)
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
 from hapticbridge.kernel.parameters import SLOW_SCHEMES, RunParameters, checked_substeps
 from hapticbridge.kernel.rigid_contact import finish_contacts
-from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.state import BoundKernel, Place
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered, refuse_overlap
@@ -562,9 +570,10 @@ class Rehearsal:
         self.model, self.data = scene.model, mujoco.MjData(scene.model)
         mujoco.mj_copyData(self.data, scene.model, scene.data)
         self._parameters = replace(parameters, scheme=Scheme.IMPLICIT, substeps=1)
-        first = self.model.actuator_outadr[coupling_ids(self.model)[0]]
+        self._place = Place(scene.hand)
+        first = self.model.actuator_outadr[coupling_ids(self.model, scene.hand)[0]]
         self._outputs = slice(first, first + 6)
-        self._handle = self.model.body_mocapid[self.model.body(HANDLE).id]
+        self._handle = self.model.body_mocapid[self.model.body(name_of_hand(HANDLE, scene.hand)).id]
 
     def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
         """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
@@ -577,7 +586,7 @@ class Rehearsal:
         """
         data = self.data
         data.mocap_pos[self._handle], data.mocap_quat[self._handle] = handle[:3], handle[3:]
-        bound = BoundKernel(self.model, data, self._parameters)
+        bound = BoundKernel(self.model, data, self._parameters, place=self._place)
         record, step = bound.state[0], bound.step
         finish, work = direct(finish_contacts, record), 0
         try:
@@ -755,7 +764,7 @@ def _stiffness_without_hand(
     model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
 ) -> NDArray[np.float64]:
     """Returns −∂Q/∂q of some degrees of freedom at rest, without the coupling."""
-    start, own, columns = data.qpos.copy(), list(coupling_ids(model)), []
+    start, own, columns = data.qpos.copy(), list(added_actuators(model)), []
     bias = model.actuator_biasprm[own].copy()
     model.actuator_biasprm[own] = 0.0
     try:

@@ -42,10 +42,30 @@ def added_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     return int(mujoco.mj_name2id(model, kind, name))
 
 
-def coupling_ids(model: mujoco.MjModel) -> tuple[int, ...]:
-    """Returns the ids of the six actuators of the coupling, in the order of a wrench."""
+def name_of_hand(name: str, hand: int) -> str:
+    """Returns the name that a hand has, from hand 0: the name itself, then ``…_2``, ``…_3``."""
+    return name if hand == 0 else f"{name}_{hand + 1}"
+
+
+def coupling_ids(model: mujoco.MjModel, hand: int = 0) -> tuple[int, ...]:
+    """Returns the ids of the six actuators of a hand's coupling, in the order of a wrench."""
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-    return tuple(added_id(model, kind, name) for name in COUPLING_ACTUATORS)
+    return tuple(added_id(model, kind, name_of_hand(name, hand)) for name in COUPLING_ACTUATORS)
+
+
+def hand_count(model: mujoco.MjModel) -> int:
+    """Returns the number of hands that a scene has handles for; 0 without a handle."""
+    kind, count = mujoco.mjtObj.mjOBJ_BODY, 1
+    if added_id(model, kind, HANDLE) < 0:
+        return 0
+    while mujoco.mj_name2id(model, kind, name_of_hand(HANDLE, count)) >= 0:
+        count += 1
+    return count
+
+
+def added_actuators(model: mujoco.MjModel) -> tuple[int, ...]:
+    """Returns the ids of the actuators of all couplings, hand by hand."""
+    return tuple(i for hand in range(hand_count(model)) for i in coupling_ids(model, hand))
 
 
 class Scheme(IntEnum):

@@ -28,7 +28,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
-from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
+from hapticbridge.kernel.handle import (
+    handle_of_step,
+    note_tool,
+    tool_after_step,
+    tool_motion,
+)
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.ledger import meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
@@ -48,6 +53,8 @@ LEVEL_DTYPE = np.dtype(
         ("share", "<f8", 2),
         ("previous", "<f8", 2),
         ("compliance", "<f8", 2),
+        ("tried", "<f8", 2),
+        ("length", "<f8", 2),
         ("is_solved", "<i8"),
         ("reads_poses", "<i8"),
         ("repetitions", "<i8"),
@@ -57,9 +64,10 @@ LEVEL_DTYPE = np.dtype(
 )
 """Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
 the tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
-``compliance`` σ. ``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins
-or a callback read the bodies' poses then; ``repetitions`` counts repetitions since the start;
-``state_before`` is the address of MuJoCo's state before the step."""
+``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖.
+``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins or a callback read
+the bodies' poses then; ``repetitions`` counts repetitions since the start; ``state_before`` is the
+address of MuJoCo's state before the step."""
 
 
 def bind_level(
@@ -163,49 +171,71 @@ def _share_at_level(level: float, size: float, share: float, compliance: float) 
 
 
 @compiled
+def _shares_to_try(s: State, count: int) -> tuple[bool, tuple[float, float]]:
+    """Returns True if the step's wrench is at its level or below; and the shares to try otherwise.
+
+    ``count`` is the number of repetitions of the step so far.
+    """
+    level = s.level
+    force, torque = applied_wrench(s, 1.0)
+    sizes = (norm(force), norm(torque))
+    is_done = True
+    wanted = (level.share[0], level.share[1])
+    for ch in range(2):
+        c, size = level.share[ch], sizes[ch]
+        u = size / c
+        if count > 0 and c != level.tried[ch]:
+            u_last = level.length[ch]
+            change = level.tried[ch] * u_last - size
+            if abs(change) > 1e-12 * level.level[ch]:
+                level.compliance[ch] = max((u - u_last) / change, 0.0)
+        new = _share_at_level(level.level[ch], size, c, level.compliance[ch])
+        if count > REPETITIONS // 2:
+            new = 0.5 * (c + new)
+        if abs(new - c) * u > TOLERANCE * level.level[ch]:
+            is_done = False
+        wanted = (new, wanted[1]) if ch == 0 else (wanted[0], new)
+    return is_done, wanted
+
+
+@compiled
+def _try_shares(s: State, wanted: tuple[float, float]) -> None:
+    """Sets the shares of the step's repetition."""
+    level = s.level
+    force, torque = applied_wrench(s, 1.0)
+    level.length[0], level.length[1] = norm(force) / level.share[0], norm(torque) / level.share[1]
+    for ch in range(2):
+        level.tried[ch], level.share[ch] = level.share[ch], wanted[ch]
+    set_gains(s, 1.0)
+
+
+@compiled
+def _start_again(s: State, count: int) -> None:
+    """Repeats the step that just ended, after ``count`` repetitions, within the tank."""
+    if count == 0:
+        _copy_state(s, False)
+        if s.level.reads_poses or _has_loaded_body(s):  # which act at the start's positions
+            mj_kinematics(s.mj.model, s.mj.data)
+    _repeat_step(s)
+    spend_within_tank(s)
+
+
+@compiled
 def solve_level(s: State) -> bool:
     """Repeats the step that just ended until its wrench is at the level or below.
 
     Returns:
         True if the step was repeated; kinematics must then be refreshed again.
     """
-    level = s.level
-    last = (0.0, 0.0)
-    shares = (level.share[0], level.share[1])
     count = 0
     for _ in range(REPETITIONS):
-        force, torque = applied_wrench(s, 1.0)
-        sizes = (norm(force), norm(torque))
-        is_done = True
-        wanted = shares
-        for ch in range(2):
-            c, size = level.share[ch], sizes[ch]
-            u = size / c
-            if count > 0 and c != shares[ch]:
-                u_last = last[ch]
-                change = shares[ch] * u_last - size
-                if abs(change) > 1e-12 * level.level[ch]:
-                    level.compliance[ch] = max((u - u_last) / change, 0.0)
-            new = _share_at_level(level.level[ch], size, c, level.compliance[ch])
-            if count > REPETITIONS // 2:
-                new = 0.5 * (c + new)
-            if abs(new - c) * u > TOLERANCE * level.level[ch]:
-                is_done = False
-            wanted = (new, wanted[1]) if ch == 0 else (wanted[0], new)
+        is_done, wanted = _shares_to_try(s, count)
         if is_done or not math.isfinite(wanted[0] + wanted[1]):
             break
-        last = (sizes[0] / level.share[0], sizes[1] / level.share[1])
-        shares = (level.share[0], level.share[1])
-        level.share[0], level.share[1] = wanted[0], wanted[1]
-        set_gains(s, 1.0)
-        if count == 0:
-            _copy_state(s, False)
-            if level.reads_poses or _has_loaded_body(s):  # which act at the start's positions
-                mj_kinematics(s.mj.model, s.mj.data)
-        _repeat_step(s)
-        spend_within_tank(s)
+        _try_shares(s, wanted)
+        _start_again(s, count)
         count += 1
-    level.repetitions += count
+    s.level.repetitions += count
     if count > 0:
         meter_ports_again(s)
     return count > 0
@@ -252,5 +282,76 @@ def limited_wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, 
         force, torque = limited_wrench(s, force, torque)
     else:
         level.flags = 0
+    note_tool(s.pose, position, orientation)
+    return force, torque, moved, turned
+
+
+# Several hands in one scene: a repetition of the step changes the wrench of every hand
+
+
+@compiled
+def _is_above(s: State) -> bool:
+    """Returns True if a hand's wrench is above its level, or its gains are reduced."""
+    level = s.level
+    position, orientation, moved, turned = tool_motion(s)
+    handle = handle_of_step(s, True)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
+    return bool(is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1])
+
+
+@compiled
+def _solve_levels(states: NDArray[np.void]) -> bool:
+    """Does for all hands together what ``solve_level`` does for one.
+
+    The first state is that of the scene.
+    """
+    count = 0
+    for _ in range(REPETITIONS * states.size):
+        is_done = True
+        for i in range(states.size):
+            is_settled, wanted = _shares_to_try(states[i], count)
+            if not math.isfinite(wanted[0] + wanted[1]):
+                return count > 0
+            is_done = is_done and is_settled
+        if is_done:
+            break
+        for i in range(states.size):
+            _, wanted = _shares_to_try(states[i], count)
+            _try_shares(states[i], wanted)
+        _start_again(states[0], count)
+        count += 1
+    states[0].level.repetitions += count
+    if count > 0:
+        meter_ports_again(states[0])
+    return count > 0
+
+
+@compiled
+def settle_levels(states: NDArray[np.void]) -> None:
+    """Repeats the step that just ended until no hand's wrench is above its level.
+
+    The bodies' poses are those of the step's end then.
+    """
+    first = states[0]
+    mj_kinematics(first.mj.model, first.mj.data)
+    is_above = False
+    for i in range(states.size):
+        is_above = _is_above(states[i]) or is_above
+    if not is_above or not first.level.is_solved:
+        return
+    if _solve_levels(states):
+        mj_kinematics(first.mj.model, first.mj.data)
+    for i in range(states.size):
+        _foresee_shares(states[i])
+
+
+@compiled
+def settled_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
+    """Evaluates a hand's law after ``settle_levels``; else as ``limited_wrench_after_step``."""
+    position, orientation, moved, turned = tool_motion(s)
+    handle = handle_of_step(s, True)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    force, torque = limited_wrench(s, force, torque)
     note_tool(s.pose, position, orientation)
     return force, torque, moved, turned

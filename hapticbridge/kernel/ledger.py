@@ -78,6 +78,9 @@ ENERGY_DTYPE = np.dtype(
         ("throughput", "<f8"),
         ("slack", "<f8"),
         ("slack_share", "<f8"),
+        ("others_work", "<f8"),
+        ("others_slack", "<f8"),
+        ("others_throughput", "<f8"),
         ("first_unstrict", "<i8"),
         ("first_active", "<i8"),
         ("first_device_excess", "<i8"),
@@ -89,7 +92,8 @@ ENERGY_DTYPE = np.dtype(
 )
 """Sub-record ``energy``, written by this module alone. Energies and works in J, since the start;
 ``first_*`` are the ticks at which a condition first failed, -1 before; ``step_*`` are works of the
-newest step; the last two hold what a moved mocap body leaves until the step is done."""
+newest step; the last two hold what a moved mocap body leaves until the step is done. ``others_*``
+are the sums over the other hands of the scene, 0 with one hand."""
 
 
 def start_energies(energy: Part) -> None:
@@ -119,7 +123,7 @@ def note_moved_mocap_bodies(s: State) -> None:
     previous = floats(mj.mocap_previous, 7 * mj.nmocap)
     shift = floats(mj.mocap_shift, 6 * mj.nmocap)
     for m in range(mj.nmocap):
-        if m == mj.handle_mocap_id:
+        if mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.coupling_count:
             continue
         has_moved = False
         for i in range(3):
@@ -254,7 +258,7 @@ def opened_by_mocap(s: State, contact: int) -> float:
     change = 0.0
     for side in range(2):
         m = mocap_of[body_of[geoms[side]]]
-        if m < 0 or m == mj.handle_mocap_id:
+        if m < 0 or mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.coupling_count:
             continue
         p, d = 3 * m, 6 * m
         arm = subtract(vector_of(point), vector_of(positions[p:]))
@@ -304,9 +308,9 @@ def _actuator_work(s: State) -> float:
     power = 0.0
     for i in range(mj.nv):
         power += force[i] * qvel[i]
-    first = mj.coupling_output_adr
-    forces = floats(mj.actuator_force, first + 6)
-    for output in range(first, first + 6):
+    first, own = mj.coupling_output_adr, 6 * mj.coupling_count
+    forces = floats(mj.actuator_force, first + own)
+    for output in range(first, first + own):
         power -= forces[output] * moment_dot(s, output, mj.qvel)
     count = ints(mj.nefmA, 1)[0]
     if count > 0:
@@ -315,7 +319,7 @@ def _actuator_work(s: State) -> float:
         stiffnesses = floats(pointer_at(mj.efm_ak), count)
         for k in range(count):
             actuator = ids[k]
-            if mj.coupling_actuator_id <= actuator < mj.coupling_actuator_id + 6:
+            if mj.coupling_actuator_id <= actuator < mj.coupling_actuator_id + own:
                 continue
             adr = ints(mj.outadr, actuator + 1)[actuator]
             num = ints(mj.outnum, actuator + 1)[actuator]
@@ -448,6 +452,29 @@ def take_scene_energies(energy: Part, scene: Part) -> None:
 
 
 @compiled
+def add_up_hands(states: NDArray[np.void]) -> None:
+    """Gives every hand's account the scene's storage and ports, and what the other hands did.
+
+        E_k = S_k − S_{k−1} − Σ_i (f_i·δx_i + τ_i·δφ_i) − W_actuators − W_external
+
+    The first state meters the scene; i runs over all hands.
+    """
+    for i in range(states.size):
+        energy = states[i].energy
+        if i > 0:
+            take_scene_energies(energy, states[0].energy)
+        work = slack = throughput = 0.0
+        for j in range(states.size):
+            if j != i:
+                other = states[j].energy
+                work += other.coupling_work
+                slack += other.slack
+                throughput += other.throughput
+        energy.others_work, energy.others_slack = work, slack
+        energy.others_throughput = throughput
+
+
+@compiled
 def set_kinetic_energy(energy: Part, kinetic: float) -> None:
     """Replaces the kinetic energy by that of the velocity which a method balances."""
     energy.kinetic = kinetic
@@ -506,16 +533,33 @@ def close_balance(s: State) -> bool:
     Returns:
         True if the balance is finite.
     """
+    add_slack(s)
+    return judge_balance(s)
+
+
+@compiled
+def add_slack(s: State) -> None:
+    """Adds the slack of the tick, of one coupling."""
     energy = s.energy
     moved, turned = vector_of(s.loop.motion), vector_of(s.loop.motion[3:6])
     energy.slack += 0.5 * s.coupling.slack_stiffness * dot(moved, moved)
     energy.slack += 0.5 * s.coupling.slack_rotational_stiffness * dot(turned, turned)
+
+
+@compiled
+def judge_balance(s: State) -> bool:
+    """Does the rest of ``close_balance``, once the slack is added.
+
+    The works and the slack are those of all hands, so every hand's account judges one environment.
+    """
+    energy = s.energy
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
+    created -= energy.others_work
     if s.run.scheme == Scheme.SHOWN:  # lent to the scene, which gives it back first
         created -= max(s.shown.scene_work - energy.coupling_work, 0.0)
     energy.environment_energy = created
-    allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput)
+    allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput + energy.others_throughput)
     if s.run.watches_device:
         _judge_device(s, stored, allowed)
     _judge_environment(s, created, allowed)
@@ -529,8 +573,9 @@ def _judge_environment(s: State, created: float, allowed: float) -> None:
     if created > allowed:
         if energy.first_unstrict < 0:
             energy.first_unstrict = s.loop.tick
-        energy.slack_share = max(energy.slack_share, created / (energy.slack + allowed))
-        if created > energy.slack + allowed and energy.first_active < 0:
+        slack = energy.slack + energy.others_slack
+        energy.slack_share = max(energy.slack_share, created / (slack + allowed))
+        if created > slack + allowed and energy.first_active < 0:
             energy.first_active = s.loop.tick
 
 

@@ -316,6 +316,8 @@ _IDS = (
     "coupling_actuator_id",
     "coupling_output_adr",
     "coupling_ctrl_adr",
+    "coupling_count",
+    "metered_mocaps",
 )
 _FACTS = (
     "equality_capacity",

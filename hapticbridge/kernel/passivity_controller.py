@@ -99,9 +99,11 @@ def guarded_energy(s: State) -> float:
         G + q min(S − S_0, 0),    q = force_scale / scale
 
     G is the sum of w·δp − b ‖δp‖²/t in J; S_0 is the scene's storage at the start. Storage that the
-    scene has given up since then has paid for as much.
+    scene has given up since then has paid for as much, and so has the work of other hands, which is
+    taken off S.
     """
-    lost = min(s.energy.kinetic + s.energy.potential - s.energy.start_energy, 0.0)
+    energy = s.energy
+    lost = min(energy.kinetic + energy.potential - energy.start_energy - energy.others_work, 0.0)
     return float(s.observer.net_device_energy + (s.run.force_scale / s.run.scale) * lost)
 
 
@@ -204,11 +206,11 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer, energy = s.observer, s.energy
     limit = observer.energy_credit_limit
     stored = energy.kinetic + energy.potential - energy.start_energy
-    over = energy.environment_energy - energy.slack
+    over = energy.environment_energy - (energy.slack + energy.others_slack)
     created = observer.created_energy + (over - observer.previous_created)
     observer.created_energy = max(created, -limit)
     observer.previous_created = over
-    net = stored - energy.actuator_work - energy.external_work
+    net = stored - energy.actuator_work - energy.external_work - energy.others_work
     change = net - observer.previous_net_storage
     gained = (s.run.force_scale / s.run.scale) * change
     observer.previous_net_storage = net

@@ -25,14 +25,15 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.errors import HapticBridgeError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
@@ -42,6 +43,8 @@ from hapticbridge.kernel.codes import (
     State,
     added_id,
     coupling_ids,
+    hand_count,
+    name_of_hand,
 )
 from hapticbridge.kernel.colliders import bind_colliders
 from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
@@ -160,6 +163,24 @@ STATE_DTYPE = np.dtype(
 """The kernel's state; the module's docstring has a table of its sub-records."""
 
 
+class Place(NamedTuple):
+    """Place of a hand's state among those of several hands.
+
+    Attributes:
+        hand: Number of the hand in the scene, from 0. The first hand's state meters the scene.
+        state: Its element of an array of states; None for a state of its own, which meters too.
+        row: Its element of an array of records; None for a record of its own.
+    """
+
+    hand: int = 0
+    state: NDArray[np.void] | None = None
+    row: NDArray[np.void] | None = None
+
+
+ALONE = Place()
+"""Place of a hand that is alone."""
+
+
 class BoundKernel:
     """The kernel's state bound to one model, its data and the parameters of one run.
 
@@ -168,6 +189,7 @@ class BoundKernel:
         data: Its data, at the start.
         parameters: Parameters of the run; for a slower scene's own kernel ``of_scene``.
         loop: For such a kernel that of the bridge's loop, whose handle is its device.
+        place: Place of the hand's state among those of several hands.
 
     Attributes:
         state: One element of ``STATE_DTYPE``.
@@ -180,6 +202,7 @@ class BoundKernel:
         data: mujoco.MjData,
         parameters: RunParameters,
         loop: BoundKernel | None = None,
+        place: Place = ALONE,
     ) -> None:
         """Binds; the tool's present pose and energy are those of the run's start.
 
@@ -187,13 +210,11 @@ class BoundKernel:
             SceneError: MuJoCo's memory layout differs from its description
                 (``mujoco_c.addresses``).
         """
-        self.state = np.zeros(1, STATE_DTYPE)
-        self.row = np.zeros(1, TICK_DTYPE)
-        self._model, self._data, self._loop = (
-            model,
-            data,
-            loop,
-        )  # the addresses in the state point into them
+        self.state = np.zeros(1, STATE_DTYPE) if place.state is None else place.state
+        self.row = np.zeros(1, TICK_DTYPE) if place.row is None else place.row
+        self._hand, self._meters_scene = place.hand, place.hand == 0 or place.state is None
+        # the addresses in the state point into them
+        self._model, self._data, self._loop = model, data, loop
         self._owned: dict[str, NDArray[np.generic]] = {}
         self._restore_springs: Callable[[State], None] | None = None
         self._bind_model(parameters)
@@ -299,9 +320,13 @@ class BoundKernel:
         for name, value in values.items():
             mj[name] = value
         self._own(owned)
-        first, *_ = coupling_ids(model)
-        mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, HANDLE)
-        handle_id = added_id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE)
+        first, *_ = coupling_ids(model, self._hand)
+        handle = name_of_hand(HANDLE, self._hand)
+        mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, handle)
+        handle_id = added_id(model, mujoco.mjtObj.mjOBJ_BODY, handle)
+        hands = hand_count(model)
+        mj["coupling_count"] = hands
+        mj["metered_mocaps"] = model.nmocap - hands if self._meters_scene else 0
         mj["handle_mocap_id"] = model.body_mocapid[handle_id]
         grip = mj["grip_site_id"] = model.site(parameters.grip).id
         mj["grip_body_id"] = model.site_bodyid[grip]
@@ -309,7 +334,7 @@ class BoundKernel:
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
-        mj["has_actuators"] = model.nactuator > len(COUPLING_ACTUATORS) or bool(
+        mj["has_actuators"] = model.nactuator > hands * len(COUPLING_ACTUATORS) or bool(
             np.any(model.jnt_actgravcomp)
         )
         if parameters.scheme == Scheme.MASSLESS:
@@ -343,7 +368,8 @@ class BoundKernel:
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, np.asarray(parameters.axes, dtype=np.float64))
         run["axes_quaternion"] = quaternion
-        bind_coupling(s["coupling"], parameters, _whole_gains(self._model, parameters))
+        gains = _whole_gains(self._model, parameters, self._hand)
+        bind_coupling(s["coupling"], parameters, gains)
         self._owned |= bind_level(
             s["level"],
             self._model,
@@ -359,7 +385,7 @@ class BoundKernel:
         bind_observer(s["observer"], parameters.guarding)
         bind_watch(s["watch"], parameters)
         bind_shown(s["shown"], parameters)
-        is_rigid = parameters.is_rigid and not parameters.scene_ticks
+        is_rigid = parameters.is_rigid and not parameters.scene_ticks and self._meters_scene
         own = replace(parameters, is_rigid=is_rigid)
         self._owned |= bind_contact(s["contact"], self._model, self._data, own)
 
@@ -393,13 +419,57 @@ class BoundKernel:
         mocap_previous[: model.nmocap, 3:] = data.mocap_quat
 
 
-def _whole_gains(model: mujoco.MjModel, parameters: RunParameters) -> tuple[float, ...]:
-    """Returns the whole gains of the coupling's actuators, for forces and then for torques."""
+class BoundHands:
+    """States of several hands, bound to one model and its data (``kernel.hands``).
+
+    Attributes:
+        states: One element of ``STATE_DTYPE`` per hand; the first one meters the scene.
+        rows: One record of ``TICK_DTYPE`` per hand.
+        hands: The bound kernel of each hand.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, parameters: Sequence[RunParameters]
+    ) -> None:
+        """Binds; ``parameters`` are those of each hand, in the order of the scene's handles.
+
+        Raises:
+            HapticBridgeError: The hands' periods differ, or a method does not suit several hands.
+            SceneError: As for ``BoundKernel``.
+        """
+        for each in parameters:
+            if each.scheme != Scheme.IMPLICIT or each.substeps != 1 or each.scene_ticks:
+                raise HapticBridgeError(
+                    "several hands need method 'implicit' or 'compensated', one substep, and a "
+                    "scene that steps in every tick"
+                )
+            if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
+                raise HapticBridgeError("all hands of a scene need one period and one contact")
+        self.states = np.zeros(len(parameters), STATE_DTYPE)
+        self.rows = np.zeros(len(parameters), TICK_DTYPE)
+        self.hands = tuple(
+            BoundKernel(
+                model,
+                data,
+                each,
+                place=Place(i, self.states[i : i + 1], self.rows[i : i + 1]),
+            )
+            for i, each in enumerate(parameters)
+        )
+
+    @property
+    def step(self) -> MujocoStep:
+        """MuJoCo's part of a tick through the Python bindings (``BoundKernel.step``)."""
+        return self.hands[0].step
+
+
+def _whole_gains(model: mujoco.MjModel, parameters: RunParameters, hand: int) -> tuple[float, ...]:
+    """Returns the whole gains of a hand's actuators, for forces and then for torques."""
     if parameters.scheme == Scheme.MIDPOINT:  # the model may have half of them
         forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
         return (*forces, *torques)
     gains: list[float] = []
-    first, *_ = coupling_ids(model)
+    first, *_ = coupling_ids(model, hand)
     for actuator in (first, first + 3):
         bias = model.actuator_biasprm[actuator]
         gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]

@@ -177,7 +177,7 @@ def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tupl
 
 
 @compiled
-def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elapsed: float) -> int:
+def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elapsed: float) -> int:
     """Checks a sample, observes the energy of the previous tick, and moves the handle.
 
     Returns:
@@ -213,7 +213,7 @@ def _take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elap
         meter_delay(s, max(elapsed, s.run.period), interval)
     else:
         skip_delay(s)
-    if s.mj.nmocap > 1 and s.run.scheme != Scheme.SHOWN:
+    if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)
     if s.coupling.tuning_ticks > 0:
         max_stretch, max_twist = retune(s)
@@ -263,7 +263,7 @@ def before_step(
     """
     s = state[0]
     if substep == 0:
-        code = _take_sample(s, sample, row, elapsed)
+        code = take_sample(s, sample, row, elapsed)
         if code != OK:
             return code
     scheme = s.run.scheme
@@ -395,7 +395,8 @@ def _has_failed(s: State) -> bool:
 
 
 @compiled
-def _active_contacts(s: State) -> int:
+def active_contacts(s: State) -> int:
+    """Returns the count of contacts that act, or in some schemes exist, after a step."""
     if s.run.scheme == Scheme.SHOWN:
         return int(s.shown.contacts)
     if s.contact.is_rigid:
@@ -448,16 +449,44 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if not is_last:
         add_coupling_work(s.energy, loop.law_work)
         return OK
+    return send_wrench(s, row, active_contacts(s))
+
+
+@compiled
+def keep_wrench(s: State, force: Vector, torque: Vector, moved: Vector, turned: Vector) -> None:
+    """Keeps a wrench on the tool, its work and the tool's motion, with one evaluation per tick."""
+    loop = s.loop
+    loop.law_work = dot(force, moved) + dot(torque, turned)
+    store_vector(loop.motion[0:3], moved)
+    store_vector(loop.motion[3:6], turned)
+    store_vector(loop.wrench_on_tool[0:3], force)
+    store_vector(loop.wrench_on_tool[3:6], torque)
+
+
+@compiled
+def send_wrench(s: State, row: NDArray[np.void], contacts: int) -> int:
+    """Computes the wrench on the device of that on the tool, and the tick's flags.
+
+    Args:
+        s: The bound state.
+        row: The bound record.
+        contacts: Count of contacts with a force in the scene.
+
+    Returns:
+        As ``answer_step``.
+    """
+    loop = s.loop
+    force, torque = vector_of(loop.wrench_on_tool), vector_of(loop.wrench_on_tool[3:6])
     square = dot(force, force) + dot(torque, torque)
     # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
     is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
     if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or _has_failed(s):
-        return _refuse(s)
+        return refuse_tick(s)
     _render(s, force, torque)
     if foreseen_excess(s) > s.guard.max_energy:
-        _refuse(s)
+        refuse_tick(s)
         return GAVE_ENERGY
-    loop.active_contacts = _active_contacts(s)
+    loop.active_contacts = contacts
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
@@ -514,21 +543,29 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
         loop.has_positions = 0  # it was computed with the springs of the other form
     add_coupling_work(s.energy, loop.law_work)
     if not close_balance(s):
-        return _refuse(s)
+        return refuse_tick(s)
     fill_tank(s)
-    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
-    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_device[3:6])))
-    loop.peak_tool_force = max(loop.peak_tool_force, norm(vector_of(loop.wrench_on_tool)))
-    loop.peak_tool_torque = max(loop.peak_tool_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
     if has_positions and not is_sound(s):
         loop.has_positions = 0
-    _record(s, row)
-    loop.tick += 1
+    end_tick(s, row)
     return OK
 
 
 @compiled
-def _refuse(s: State) -> int:
+def end_tick(s: State, row: NDArray[np.void]) -> None:
+    """Notes the peaks, completes the record, and counts the tick."""
+    loop = s.loop
+    loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
+    loop.peak_torque = max(loop.peak_torque, norm(vector_of(loop.wrench_on_device[3:6])))
+    loop.peak_tool_force = max(loop.peak_tool_force, norm(vector_of(loop.wrench_on_tool)))
+    loop.peak_tool_torque = max(loop.peak_tool_torque, norm(vector_of(loop.wrench_on_tool[3:6])))
+    _record(s, row)
+    loop.tick += 1
+
+
+@compiled
+def refuse_tick(s: State) -> int:
+    """Sets the wrench on the device to zero and flags a trip; returns ``BAD_RESULT``."""
     s.loop.flags = TRIP
     for i in range(6):
         s.loop.wrench_on_device[i] = 0.0

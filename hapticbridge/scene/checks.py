@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, coupling_ids
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators
 from hapticbridge.scene.source import SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
@@ -64,7 +64,8 @@ def check_metered(model: mujoco.MjModel, integrator: str, method: str) -> None:
     velocity. RK4 uses four forces and keeps none.
     """
     names = [model.actuator(i).name or str(i) for i in range(model.nactuator)]
-    own = [i for i in range(model.nactuator) if i not in coupling_ids(model)]
+    added = added_actuators(model)
+    own = [i for i in range(model.nactuator) if i not in added]
     if integrator == "implicitfast":
         own = [i for i in own if _depends_on_velocity(model, i)]
     elif integrator != "RK4":

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from hapticbridge.kernel.codes import HANDLE
+from hapticbridge.kernel.codes import HANDLE, coupling_ids, hand_count, name_of_hand
 from hapticbridge.scene.source import SourceFile
 
 # Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
@@ -45,6 +45,15 @@ START_KEYFRAME = "home"
 """Name of the keyframe that a scene starts from; without it a scene starts from ``qpos0``."""
 
 
+def handles(model: mujoco.MjModel, grip: str) -> tuple[tuple[int, int], ...]:
+    """Returns the ids of body and grip's site of every handle; ``grip`` is that of the first."""
+    found = [(int(model.body(HANDLE).id), int(model.site(grip).id))]
+    for hand in range(1, hand_count(model)):
+        site_id = int(model.actuator_trnid[coupling_ids(model, hand)[0], 0])
+        found.append((int(model.body(name_of_hand(HANDLE, hand)).id), site_id))
+    return tuple(found)
+
+
 def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
     """Resets the data to the start, with the handle at the grip, and calls ``mj_forward``."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, START_KEYFRAME)
@@ -54,25 +63,27 @@ def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
         mujoco.mj_resetData(model, data)
     # the model's own handle pose may be outdated if its start was changed after loading
     mujoco.mj_kinematics(model, data)
-    handle = model.body_mocapid[model.body(HANDLE).id]
-    data.mocap_pos[handle] = data.site(grip).xpos
-    data.mocap_quat[handle] = data.site_xquat[model.site(grip).id]
+    for body_id, site_id in handles(model, grip):
+        data.mocap_pos[model.body_mocapid[body_id]] = data.site_xpos[site_id]
+        data.mocap_quat[model.body_mocapid[body_id]] = data.site_xquat[site_id]
     mujoco.mj_forward(model, data)
 
 
 def seat_handle(model: mujoco.MjModel, grip: str) -> None:
-    """Places the handle at the grip, in ``qpos0`` and in every keyframe of a compiled model."""
+    """Places every handle at its grip, in ``qpos0`` and in every keyframe of a compiled model."""
     data = mujoco.MjData(model)
-    body_id, site_id = model.body(HANDLE).id, model.site(grip).id
-    mocap_id = int(model.body_mocapid[body_id])
+    placed = handles(model, grip)
     mujoco.mj_kinematics(model, data)
-    model.body_pos[body_id] = data.site_xpos[site_id]
-    model.body_quat[body_id] = data.site_xquat[site_id]
+    for body_id, site_id in placed:
+        model.body_pos[body_id] = data.site_xpos[site_id]
+        model.body_quat[body_id] = data.site_xquat[site_id]
     for key in range(model.nkey):
         mujoco.mj_resetDataKeyframe(model, data, key)
         mujoco.mj_kinematics(model, data)
-        model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
-        model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
+        for body_id, site_id in placed:
+            mocap_id = int(model.body_mocapid[body_id])
+            model.key_mpos[key].reshape(-1, 3)[mocap_id] = data.site_xpos[site_id]
+            model.key_mquat[key].reshape(-1, 4)[mocap_id] = data.site_xquat[site_id]
 
 
 def hold_servos(model: mujoco.MjModel) -> tuple[str, ...]:

@@ -11,13 +11,22 @@ together with the contacts.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, PREFIX, WELD_NAME, coupling_ids
+from hapticbridge.kernel.codes import (
+    COUPLING_ACTUATORS,
+    HANDLE,
+    PREFIX,
+    WELD_NAME,
+    added_actuators,
+    name_of_hand,
+)
 from hapticbridge.scene.checks import (
     NOTABLE_OVERLAP,
     Overlap,
@@ -181,12 +190,12 @@ def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> floa
     return float(0.5 * force if axis >= 3 else force)
 
 
-def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
-    """Adds a mocap body, the handle, with its site, and the six coupling actuators.
+def attach_handles(spec: mujoco.MjSpec, grips: Sequence[str]) -> None:
+    """Adds a mocap body, the handle, with its site, and six coupling actuators for every hand.
 
     Args:
         spec: The user's scene; changed in place.
-        grip: Name of the site on the tool.
+        grips: Name of the site that each hand holds; two hands may hold one tool.
 
     Raises:
         SceneError: The scene has a name that starts with ``PREFIX``.
@@ -197,24 +206,35 @@ def attach_handle(spec: mujoco.MjSpec, grip: str) -> None:
             f"the scene has the name '{taken[0]}', and names that start with '{PREFIX}' are those "
             "that the bridge adds; rename it"
         )
+    for hand, grip in enumerate(grips):
+        _attach_handle(spec, name_of_hand(HANDLE, hand))
+        for axis, name in enumerate(COUPLING_ACTUATORS):
+            actuator = name_of_hand(name, hand)
+            _add_coupling_actuator(spec, actuator, axis, (grip, name_of_hand(HANDLE, hand)))
+
+
+def _attach_handle(spec: mujoco.MjSpec, name: str) -> None:
     # in a specification of its own: a <default> of the scene could rotate the handle's site, and
     # boundmass could give it mass
     handle_spec = mujoco.MjSpec()
-    handle = handle_spec.worldbody.add_body(name=HANDLE, mocap=True)
-    handle.add_site(name=HANDLE)
+    handle = handle_spec.worldbody.add_body(name=name, mocap=True)
+    handle.add_site(name=name)
     body = spec.worldbody.add_frame().attach_body(handle, PREFIX, "")
-    body.name = body.sites[0].name = HANDLE
-    for axis, name in enumerate(COUPLING_ACTUATORS):
-        _add_coupling_actuator(spec, name, axis, grip)
+    body.name = body.sites[0].name = name
 
 
-def _add_coupling_actuator(spec: mujoco.MjSpec, name: str, axis: int, grip: str) -> None:
-    """Adds an actuator with every field set, so that no <default> of the scene applies."""
+def _add_coupling_actuator(
+    spec: mujoco.MjSpec, name: str, axis: int, sites: tuple[str, str]
+) -> None:
+    """Adds an actuator with every field set, so that no <default> of the scene applies.
+
+    ``sites`` are grip and handle.
+    """
     actuator = spec.add_actuator(name=name)
     gear = np.zeros(6)
     gear[axis] = 1.0
     actuator.trntype = mujoco.mjtTrn.mjTRN_SITE
-    actuator.target, actuator.refsite, actuator.slidersite = grip, HANDLE, ""
+    actuator.target, actuator.refsite, actuator.slidersite = *sites, ""
     actuator.gear = gear
     actuator.gaintype, actuator.gainprm = mujoco.mjtGain.mjGAIN_FIXED, np.zeros(10)
     actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, np.zeros(10)
@@ -347,7 +367,7 @@ def limit_motors_alone(
     for joint in joints:
         model.jnt_actfrclimited[joint] = 0
         arms = moments[model.actuator_outadr, model.jnt_dofadr[joint]]
-        drivers = [i for i in np.flatnonzero(arms).tolist() if i not in coupling_ids(model)]
+        drivers = [i for i in np.flatnonzero(arms).tolist() if i not in added_actuators(model)]
         shared += len(drivers) > 1
         for actuator in drivers:
             low, high = sorted(model.jnt_actfrcrange[joint] / arms[actuator])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,7 +24,7 @@ from hapticbridge.scene.compile import clause, compiled, hold_servos, seat_handl
 from hapticbridge.scene.grip import add_grip
 from hapticbridge.scene.handle import (
     announce_overlaps,
-    attach_handle,
+    attach_handles,
     exclude_nested,
     limit_motors_alone,
     set_options,
@@ -108,7 +108,7 @@ class SceneSource:
 
 def load_scene(
     source: str | Path | mujoco.MjSpec,
-    grip: str = "grip",
+    grip: str | Sequence[str] = "grip",
     *,
     as_is: bool = False,
     **parameters: float,
@@ -124,7 +124,9 @@ def load_scene(
             with 6 digits, and the assets that are in ``MjSpec.assets`` or in a file. A recording
             keeps this written form, so the audit compiles the scene that ran.
         grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
-            ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``).
+            ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``). Several hands hold
+            several grips, in order; each has a handle and a coupling of its own (``kernel.hands``),
+            and two may hold one tool.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
             coupling, force limits of joints, a tool inside something); else it is changed, and
             ``Scene.changes`` lists the changes.
@@ -220,7 +222,7 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
 
 def compile_scene(
     source: SceneSource,
-    grip: str = "grip",
+    grip: str | Sequence[str] = "grip",
     *,
     as_is: bool = False,
     warns: bool = True,
@@ -231,7 +233,7 @@ def compile_scene(
 
     Args:
         source: Result of ``read_scene``, possibly with a changed specification; it is not modified.
-        grip: Site, ``BODY`` or ``BODY@x,y,z``.
+        grip: Site, ``BODY`` or ``BODY@x,y,z``, or several of them, as for ``load_scene``.
         as_is: If true, a scene that must be changed to be felt is refused.
         warns: If true, deviations of the run from the file are issued as warnings.
         checks_start: If true, a start that is not finite is refused.
@@ -244,26 +246,35 @@ def compile_scene(
         UserWarning: The run deviates from the file in a detail.
     """
     path, spec = source.path, source.spec.copy()
+    grips = (grip,) if isinstance(grip, str) else tuple(grip)
+    if not grips:
+        raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
     with _refused(path):
-        about_grip = add_grip(spec, grip, source.sources)
-    attach_handle(spec, grip)
+        about_grip = [said for each in grips for said in add_grip(spec, each, source.sources)]
+    attach_handles(spec, grips)
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = compiled(spec, source.sources)
-        if not as_is and (excluded := exclude_nested(spec, model, grip)):
+        if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, compiled(spec, source.sources)
-        concerns = [*source.concerns, *about_grip, *check_model(model, grip)]
-        seat_handle(model, grip)
+        concerns = [*source.concerns, *about_grip]
+        for each in dict.fromkeys(grips):
+            concerns += check_model(model, each)
+        seat_handle(model, grips[0])
         if not as_is:
             changes += hold_servos(model)
         data, values = mujoco.MjData(model), dict(source.parameters)
-        scene = Scene(path, grip, model, data, source.sources, values, changes, as_is, _spec=spec)
+        scene = Scene(
+            path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
+        )
+        scene.other_grips = grips[1:]
         scene.reset()
-        scene.changes += limit_motors_alone(model, scene.data, grip, as_is=as_is)
+        for each in dict.fromkeys(grips):
+            scene.changes += limit_motors_alone(model, scene.data, each, as_is=as_is)
     if checks_start:
-        check_start(model, scene.data, grip)
+        check_start(model, scene.data, grips[0])
     if as_is:
-        refuse_overlap(model, scene.data, grip)
+        refuse_overlap(model, scene.data, grips[0])
     else:
         scene.changes += announce_overlaps(model, scene.data)
     if warns:

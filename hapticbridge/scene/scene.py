@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, HANDLE, WELD_NAME
+from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
@@ -75,6 +75,8 @@ class Scene:
         changes: What differs from the file, each as ``name: old → new``.
         as_is: True if the scene must not be changed to be felt.
         is_carried: True if the weight of the tool is compensated (``carry_tool``).
+        other_grips: Names of the sites that further hands hold.
+        hand: Number of the hand that holds ``grip``, from 0 (``of_hand``).
     """
 
     path: Path
@@ -86,6 +88,8 @@ class Scene:
     changes: tuple[str, ...] = ()
     as_is: bool = False
     is_carried: bool = False
+    other_grips: tuple[str, ...] = ()
+    hand: int = 0
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
@@ -102,6 +106,13 @@ class Scene:
             raise SceneError(f"scene '{self.name}' is in use by another bridge; load it again")
         self._is_claimed = True
 
+    def of_hand(self, hand: int) -> Scene:
+        """Returns the scene as one of its hands holds it; model and data are shared.
+
+        It is outdated once the model is replaced (``carry_tool``).
+        """
+        return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1], hand=hand)
+
     def release(self) -> None:
         """Releases the scene for another bridge."""
         self._is_claimed = False
@@ -113,7 +124,7 @@ class Scene:
 
     def reset(self) -> None:
         """Resets the scene to ``home`` or ``qpos0``, with the handle at the grip."""
-        go_to_start(self.model, self.data, self.grip)
+        go_to_start(self.model, self.data, (self.grip, *self.other_grips)[0])
 
     def grip_pose(self) -> tuple[float, ...]:
         """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m."""
@@ -195,15 +206,14 @@ class Scene:
     def set_gains(
         self, force: tuple[float, float, float], torque: tuple[float, float, float]
     ) -> None:
-        """Sets control gain, stiffness and damping of the coupling's actuators.
+        """Sets control gain, stiffness and damping of the actuators of this hand's coupling.
 
         Args:
             force: Gains of the three translational actuators, in SI units per m and m/s.
             torque: Gains of the three rotational actuators, in SI units per rad and rad/s.
         """
-        for axis, name in enumerate(COUPLING_ACTUATORS):
+        for axis, actuator_id in enumerate(coupling_ids(self.model, self.hand)):
             gain, stiffness, damping = force if axis < 3 else torque  # forces come first
-            actuator_id = self.model.actuator(name).id
             self.model.actuator_gainprm[actuator_id, 0] = gain
             self.model.actuator_biasprm[actuator_id, 1] = -stiffness
             self.model.actuator_biasprm[actuator_id, 2] = -damping
@@ -223,8 +233,9 @@ class Scene:
         self._spec.body(HANDLE).gravcomp = 1.0
         self._recompile(self._spec)
         model = self.model
-        body_id = model.site_bodyid[model.site(self.grip).id]
-        model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
+        for grip in (self.grip, *self.other_grips):
+            body_id = model.site_bodyid[model.site(grip).id]
+            model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
         self.is_carried = True
         self.changes += (f"weight of the tool: felt → carried ({reason})",)
         self.reset()

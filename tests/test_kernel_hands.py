@@ -1,0 +1,150 @@
+"""Two hands in one scene: one balance for both, the same body held twice, two bodies in contact."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from two_hands import (
+    BAR,
+    PEG_AND_BLOCK,
+    SCENES,
+    UNPAID,
+    attacked,
+    bound_hands,
+    two_handed,
+    unmoved,
+)
+
+import hapticbridge as hb
+from hapticbridge.coupling import Coupling
+from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.kernel.hands import whole_tick_of_hands
+from hapticbridge.kernel.state import BoundHands, BoundKernel
+from hapticbridge.kernel.tick import whole_tick
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+from hapticbridge.rendering import method_named, unguarded_parameters
+from hapticbridge.scene import load_scene
+
+PERIOD = 1e-3
+COUPLING = Coupling(800.0, 1.0, 0.5, 1e-3)
+IMPLICIT = method_named("implicit").with_contact(None)
+
+
+def test_one_hand_among_several_equals_one_hand_to_the_bit() -> None:
+    rows = []
+    for is_among_several in (False, True):
+        scene = load_scene("peg_in_hole")
+        parameters = unguarded_parameters(scene, COUPLING, PERIOD, 1, IMPLICIT)
+        sample, row = np.zeros(1, SAMPLE_DTYPE), np.zeros(1, TICK_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        kernel = BoundKernel(scene.model, scene.data, parameters)
+        if is_among_several:
+            hands = BoundHands(scene.model, scene.data, [parameters])
+            kernel, row = hands.hands[0], hands.rows
+        kept = []
+        for k in range(400):
+            sample["position"][0] = 2e-3 * np.sin(0.02 * k), 0.0, -5e-5 * k
+            if is_among_several:
+                assert whole_tick_of_hands(hands.states, sample, row, PERIOD)
+            else:
+                row = kernel.row
+                assert whole_tick(kernel.state, sample, row, PERIOD)
+            kept.append(row.copy())
+        rows.append(np.concatenate(kept))
+    assert np.any(rows[0]["contacts"] > 0)
+    assert rows[0].tobytes() == rows[1].tobytes()
+
+
+def test_a_bar_in_two_hands_carries_the_force_from_one_to_the_other() -> None:
+    scene = two_handed(BAR)
+    bound = bound_hands(scene, (COUPLING, COUPLING), PERIOD, IMPLICIT)
+    samples = unmoved()
+    samples["position"][1, 0] = 0.01
+    for _ in range(3000):
+        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
+    pull = bound.rows["wrench_on_tool"][:, 0]
+    # two springs in series, 10 mm long together: 800/2 N/m · 10 mm
+    assert pull == pytest.approx([-4.0, 4.0], abs=1e-6)
+    assert bound.rows["wrench_on_device"][:, 0] == pytest.approx([4.0, -4.0], abs=1e-6)
+
+
+def test_both_accounts_judge_one_environment_whose_work_adds_up() -> None:
+    scene = two_handed(PEG_AND_BLOCK)
+    bound = bound_hands(scene, (COUPLING, COUPLING), PERIOD, IMPLICIT)
+    samples, work = unmoved(), np.zeros(2)
+    data, before = scene.data, bound.rows["tool_position"].copy()
+    turned = np.zeros(3)
+    for hand in range(2):
+        before[hand] = data.site(scene.of_hand(hand).grip).xpos
+    orientation = np.array([data.site_xquat[scene.model.site(g).id] for g in ("left", "right")])
+    for k in range(1500):
+        samples["position"][0, 2] = -1e-5 * min(k, 1000)
+        samples["position"][1, 0] = 2e-3 * np.sin(0.01 * k)
+        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
+        for hand, row in enumerate(bound.rows):
+            mujoco.mju_subQuat(turned, row["tool_quaternion"], orientation[hand])
+            mujoco.mju_rotVecQuat(turned, turned.copy(), orientation[hand])
+            wrench = row["wrench_on_tool"]
+            work[hand] += wrench[:3] @ (row["tool_position"] - before[hand]) + wrench[3:] @ turned
+            before[hand], orientation[hand] = row["tool_position"], row["tool_quaternion"]
+    assert np.any(bound.rows["contacts"] > 0)
+    assert bound.rows["coupling_work"] == pytest.approx(work, abs=1e-12)
+    mujoco.mj_forward(scene.model, data)
+    stored = data.energy.sum()  # at rest at the start, without weight
+    expected = stored - work.sum()
+    assert bound.rows["environment_energy"] == pytest.approx([expected, expected], abs=1e-12)
+    assert expected < -1e-6
+
+
+def test_a_device_may_receive_what_the_other_hand_puts_in() -> None:
+    scene = two_handed(BAR)
+    bound = bound_hands(scene, (COUPLING, COUPLING), PERIOD, IMPLICIT)
+    samples = unmoved()
+    for k in range(2000):  # the left hand drags the right one along, against a pull
+        samples["position"][:, 0] = -5e-5 * k, -5e-5 * max(k - 100, 0)
+        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
+    left, right = bound.states["energy"]["device_energy"]
+    assert left < -0.05
+    assert right > 0.05
+    assert bound.states["observer"]["guarded_energy"].max() < 1e-3
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_no_two_hands_get_energy_out_of_a_scene(scene: str) -> None:
+    outcomes = [attacked(seed, scene) for seed in range(20)]
+    assert all(outcome.ticks == 1500 for outcome in outcomes)
+    assert max(outcome.most for outcome in outcomes) <= UNPAID
+    assert max(outcome.created for outcome in outcomes) <= UNPAID
+    assert sum(outcome.repetitions > 0 for outcome in outcomes) > 10
+
+
+def test_levels_settled_one_after_the_other_create_energy() -> None:
+    outcomes = [attacked(seed, "bar", is_joint=False) for seed in range(20)]
+    assert max(outcome.created for outcome in outcomes) > 1000 * UNPAID
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"substeps": 2}, "several hands need method 'implicit' or 'compensated', one substep"),
+        ({"scheme": 4}, "several hands need method 'implicit' or 'compensated'"),
+    ],
+)
+def test_what_several_hands_cannot_have_is_refused(change: dict[str, object], message: str) -> None:
+    with pytest.raises(HapticBridgeError, match=message):
+        bound_hands(two_handed(BAR), (COUPLING, COUPLING), PERIOD, IMPLICIT, **change)
+
+
+def test_a_bridge_refuses_a_scene_with_several_grips() -> None:
+    message = "was loaded with 2 grips, and a run has one hand; load it with one of 'left', 'right'"
+    with pytest.raises(SceneError, match=message):
+        hb.Bridge(two_handed(BAR), clock=hb.SimulatedClock())
+
+
+def test_each_hand_has_its_handle_at_its_own_grip() -> None:
+    scene = two_handed(BAR)
+    handles = scene.data.mocap_pos[-2:]
+    assert handles[:, 0] == pytest.approx([-0.1, 0.1])
+    with pytest.raises(SceneError, match="no grip is named"):
+        load_scene("point_mass", ())

@@ -1,0 +1,250 @@
+"""Scenes for two hands, and hands that attack them from both sides at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.jit import compiled
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.force_level import keep_state, limited_wrench_after_step
+from hapticbridge.kernel.hands import before_hands, close_hands, whole_tick_of_hands
+from hapticbridge.kernel.ledger import meter_ports
+from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.kernel.state import BoundHands
+from hapticbridge.kernel.tick import active_contacts, advance, keep_wrench, send_wrench
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.rendering import Method, method_named, prepare
+from hapticbridge.scene import Scene, load_scene
+
+BAR = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="bar">
+      <freejoint/>
+      <geom type="capsule" size="0.01" fromto="-0.1 0 0 0.1 0 0" mass="0.2"/>
+      <site name="left" pos="-0.1 0 0"/>
+      <site name="right" pos="0.1 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""A bar in free space, held at both ends."""
+
+PEG_AND_BLOCK = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <default><geom condim="3" friction="0.4"/></default>
+  <worldbody>
+    <body name="peg" pos="0 0 0.052">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>
+      <geom type="capsule" size="0.01" fromto="0 0 -0.02 0 0 0.04" mass="0.1"/>
+      <site name="left"/>
+    </body>
+    <body name="block">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="0.3" diaginertia="3e-4 3e-4 3e-4"/>
+      <geom type="box" size="0.03 0.03 0.02" mass="0.3"/>
+      <site name="right"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""A peg in one hand above a block in the other; both float. They are held at their centres and have
+equal moments of inertia: a thin peg that a single hand spins at 100 rad/s creates energy in
+MuJoCo's explicit rotation, and that is not what is tested here."""
+
+SCENES = {"bar": BAR, "peg_and_block": PEG_AND_BLOCK}
+
+START = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+UNPAID = 1e-6
+"""Largest energy in J that both hands may have beyond what they put in; rounding leaves less."""
+
+
+def two_handed(xml: str) -> Scene:
+    """Loads a scene whose sites ``left`` and ``right`` are held."""
+    return load_scene(mujoco.MjSpec.from_string(xml), ("left", "right"))
+
+
+def bound_hands(
+    scene: Scene,
+    couplings: tuple[Coupling, Coupling],
+    period: float,
+    method: Method,
+    **changes: object,
+) -> BoundHands:
+    """Prepares a scene for two hands without devices, and binds their states."""
+    prepare(scene, couplings[0], period, 1, method, warns=False)
+    laws = tuple(method.law_coupling(coupling, period) for coupling in couplings)
+    scene.of_hand(1).set_gains(*method.gains(laws[1], period))
+    basis: dict[str, object] = {
+        "period": period,
+        "substeps": 1,
+        "force_limit": 1e9,
+        "torque_limit": 1e9,
+        "ramp_ticks": 0,
+        "device_origin": START,
+        "device_start": START,
+        "scheme": method.scheme,
+        "is_rigid": method.is_rigid,
+    }
+    parameters = [
+        RunParameters(
+            grip=scene.of_hand(hand).grip,
+            coupling=laws[hand],
+            handle_origin=scene.of_hand(hand).grip_pose(),
+            **(basis | changes),  # type: ignore[arg-type] # a mapping of fields
+        )
+        for hand in range(2)
+    ]
+    return BoundHands(scene.model, scene.data, parameters)
+
+
+def unmoved() -> NDArray[np.void]:
+    """Returns one sample per hand, of devices at their start."""
+    samples = np.zeros(2, SAMPLE_DTYPE)
+    samples["quaternion"][:, 0] = 1.0
+    return samples
+
+
+@compiled
+def one_after_the_other(
+    states: NDArray[np.void], samples: NDArray[np.void], rows: NDArray[np.void], elapsed: float
+) -> bool:
+    """Runs a tick as a bridge must not: each hand's level is settled as if it were alone.
+
+    The wrench of the first hand is evaluated before the second one repeats the step.
+    """
+    if before_hands(states, samples, rows, elapsed) != OK:
+        return False
+    keep_state(states[1])
+    advance(states[0:1])
+    meter_ports(states[0])
+    for i in range(states.size):
+        force, torque, moved, turned = limited_wrench_after_step(states[i], True)
+        keep_wrench(states[i], force, torque, moved, turned)
+    for i in range(states.size):
+        if send_wrench(states[i], rows[i : i + 1], active_contacts(states[0])) != OK:
+            return False
+    return close_hands(states, rows) == OK
+
+
+@compiled
+def attack(
+    states: NDArray[np.void],
+    samples: NDArray[np.void],
+    rows: NDArray[np.void],
+    moves: NDArray[np.float64],
+    habits: NDArray[np.float64],
+) -> tuple[float, float, int]:
+    """Moves both devices, and counts the energy that they get beyond what they burn and put in.
+
+    A hand pushes for some ticks and follows the force for as many, at a share of the speed w/b.
+
+    Args:
+        states, samples, rows: As for ``whole_tick_of_hands``.
+        moves: Velocity of pushing in m/s and rad/s by tick, hand and axis, (n, 2, 6).
+        habits: b in N s/m, b_r in N m s/rad, pace of following, by hand its ticks of a push, and 1
+            for levels that are settled one after the other.
+
+    Returns:
+        Largest energy in J, largest Σ E_k of both accounts in J, and count of completed ticks.
+    """
+    b, b_r, pace = habits[0], habits[1], habits[2]
+    period = states[0].run.period
+    net, most, created = 0.0, 0.0, 0.0
+    for k in range(moves.shape[0]):
+        for hand in range(2):
+            s, length = states[hand], int(habits[3 + hand])
+            w = s.loop.wrench_on_device
+            d, t = moves[k, hand, :3] * period, moves[k, hand, 3:] * period
+            if (k // length) % 2 == 1:
+                d, t = w[:3] * (pace / b * period), w[3:] * (pace / b_r * period)
+            d *= min(1.0, 3.0 * period / (np.sqrt(np.sum(d * d)) + 1e-30))
+            t *= min(1.0, 20.0 * period / (np.sqrt(np.sum(t * t)) + 1e-30))
+            net += np.sum((w[:3] - b / period * d) * d) + np.sum((w[3:] - b_r / period * t) * t)
+            for i in range(3):
+                samples[hand].position[i] += d[i]
+            q = samples[hand].quaternion
+            angle = np.sqrt(np.sum(t * t))
+            if angle > 0.0:
+                c, n = np.cos(0.5 * angle), np.sin(0.5 * angle) / angle
+                x, y, z = n * t[0], n * t[1], n * t[2]
+                e, f, g, h = q[0], q[1], q[2], q[3]
+                q[0] = c * e - x * f - y * g - z * h
+                q[1] = c * f + x * e + y * h - z * g
+                q[2] = c * g - x * h + y * e + z * f
+                q[3] = c * h + x * g - y * f + z * e
+        if habits[5] == 0.0:
+            is_done = whole_tick_of_hands(states, samples, rows, period)
+        else:
+            is_done = one_after_the_other(states, samples, rows, period)
+        if not is_done:
+            return most, created, k
+        energy = states[0].energy
+        released = min(energy.kinetic + energy.potential - energy.start_energy, 0.0)
+        owed = 0.0
+        for hand in range(2):
+            owed += states[hand].coupling.owed[0] + states[hand].coupling.owed[1]
+        most = max(most, net + released - owed)
+        created = max(created, energy.environment_energy, states[1].energy.environment_energy)
+    return most, created, moves.shape[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of an attack: energies in J, completed ticks, and ticks at a force level."""
+
+    most: float
+    created: float
+    ticks: int
+    repetitions: int
+
+
+def attacked(seed: int, scene: str, ticks: int = 1500, *, is_joint: bool = True) -> Outcome:
+    """Runs a random attack on a scene of ``SCENES``, with devices that just bear their couplings.
+
+    ``is_joint`` is False to settle the hands' force levels one after the other.
+    """
+    rng = np.random.default_rng([seed, 26])
+    rate = float(rng.choice([500, 1000, 2000]))
+    period, method = 1.0 / rate, method_named(str(rng.choice(["implicit", "compensated"])))
+    b = float(rng.choice([0.5, 2.0, 5.0]))
+    b_r = 1e-3 * b
+    couplings = []
+    for _ in range(2):
+        share = rng.uniform(0.2, 1.0)
+        damping, damping_r = share * b * rng.uniform(0, 0.5), share * b_r * rng.uniform(0, 0.5)
+        couplings.append(
+            Coupling(
+                2 * (share * b - damping) * rate * (1 - 1e-9),
+                damping,
+                2 * (share * b_r - damping_r) * rate * (1 - 1e-9),
+                damping_r,
+            )
+        )
+    bound = bound_hands(
+        two_handed(SCENES[scene]),
+        (couplings[0], couplings[1]),
+        period,
+        method,
+        force_limit=10 ** rng.uniform(-0.5, 1.2),
+        torque_limit=10 ** rng.uniform(-2.0, -0.3),
+        device_damping=b,
+        device_rotational_damping=b_r,
+        guarding=GuardParameters(has_hand=True),
+    )
+    speed = 10 ** rng.uniform(-1.0, 0.3)
+    noise = rng.standard_normal((ticks // 20 + 1, 2, 6)).repeat(20, axis=0)[:ticks]
+    moves = noise * np.array([speed] * 3 + [3.0 * speed] * 3)
+    pace, lengths = rng.uniform(0.05, 0.6), rng.integers(5, 150, 2)
+    habits = np.array([b, b_r, pace, *lengths, not is_joint], dtype=float)
+    most, created, done = attack(bound.states, unmoved(), bound.rows, moves, habits)
+    return Outcome(most, created, done, int(bound.states["level"]["repetitions"].sum()))
