@@ -44,6 +44,9 @@ REASONS = {
     # devices and their guardian
     "device/transport/hid.py: self._wake.wait()": f"{DAEMON} longer than LONGEST_WRITE",
     "device/rawhid/serial.py: self._ports.sleep(PAUSE)": "until the time of its caller is over",
+    "device/touch/device.py: self._time.sleep(0.001)": "its loop ends with a time",
+    "device/touch/device.py: self._time.sleep(0.1 * CALIBRATION_TIME)": "its loop ends with a time",
+    "device/wheel/evdev.py: os.read(file, size)": "the file is opened with O_NONBLOCK",
     "device/watchdog.py: select.select([ready], [], [], START_PATIENCE)": "its last argument",
     # records, and the processes that read them
     "recording/recorder.py: for line in answers": f"{DAEMON} longer than STANDSTILL",
