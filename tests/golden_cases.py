@@ -646,7 +646,7 @@ def session_text(name: str, folder: Path) -> str:
     lines = session_file(name).read_text(encoding="utf-8").splitlines()
     commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
     plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
-    plain |= dict.fromkeys((dhd.VARIABLE, hd.VARIABLE), "/no/such.so")
+    plain |= dict.fromkeys((dhd.FILES.variable, hd.FILES.variable), "/no/such.so")
     shown = []
     models = str(Path(hb.__file__).parents[1])
     for command in commands:

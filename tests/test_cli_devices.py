@@ -272,7 +272,7 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
 def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
     call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
 ) -> None:
-    for variable in (dhd.VARIABLE, hd.VARIABLE):
+    for variable in (dhd.FILES.variable, hd.FILES.variable):
         monkeypatch.setenv(variable, "/no/such.so")
     with socket.socket() as unused:
         unused.bind(("localhost", 0))  # nobody listens there

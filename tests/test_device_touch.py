@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import ctypes.util
 import math
-import shutil
-import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,7 @@ from hapticbridge.device import open_device
 from hapticbridge.device.driver import FoundDevice, ignore_message
 from hapticbridge.device.touch import device as touch
 from hapticbridge.device.touch.device import RealWaiting, TouchDevice, open_touch
-from hapticbridge.device.touch.hd import VARIABLE, Hd
+from hapticbridge.device.touch.hd import FILES
 from hapticbridge.device.touch.servo import Servo
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -300,36 +297,6 @@ def test_a_spec_names_library_device_and_numbers(virtual: HdStub) -> None:
     device.close()
 
 
-def test_the_library_is_named_or_found(
-    virtual: HdStub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv(VARIABLE, virtual.file)
-    assert touch.medium() == f"OpenHaptics' library was found: {virtual.file}"
-    monkeypatch.delenv(VARIABLE)
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: virtual.file)
-    assert virtual.file in touch.medium()
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
-    monkeypatch.setattr("hapticbridge.device.touch.hd.NAMES", {})
-    assert "was not found: install OpenHaptics and the Touch driver" in touch.medium()
-    with pytest.raises(DeviceError, match="name its file with library=FILE"):
-        open_device("touch")
-    broken = tmp_path / "libHD.so"
-    broken.write_bytes(b"no library")
-    with pytest.raises(DeviceError, match="cannot be loaded"):
-        open_device(f"touch:library={broken}")
-
-
-def test_another_library_is_told_from_openhaptics(tmp_path: Path) -> None:
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler (cc)")
-    source, target = tmp_path / "a.c", tmp_path / "other.so"
-    source.write_text("int hdInitDevice(void) { return 1; }")
-    subprocess.run([compiler, "-shared", "-fPIC", source, "-o", target], check=True)
-    with pytest.raises(DeviceError, match="has no hdDisableDevice: it is not OpenHaptics' libr"):
-        Hd(str(target))
-
-
 def test_a_device_on_usb_is_listed_with_what_it_lacks(
     virtual: HdStub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -338,10 +305,10 @@ def test_a_device_on_usb_is_listed_with_what_it_lacks(
         vendor=0x2988, product=0x302, transport="usb", problem="libusb cannot be loaded",
     )  # fmt: skip
     monkeypatch.setattr(usb_search, "find", lambda driver: [plugged])
-    monkeypatch.setenv(VARIABLE, "/no/such.so")
+    monkeypatch.setenv(FILES.variable, "/no/such.so")
     (device,) = touch.find()
     assert device.problem is not None
     assert device.problem.startswith("the library '/no/such.so' cannot be loaded")
-    monkeypatch.setenv(VARIABLE, virtual.file)
+    monkeypatch.setenv(FILES.variable, virtual.file)
     (device,) = touch.find()
     assert device.problem is None

@@ -124,7 +124,7 @@ class Scene:
 
     def reset(self) -> None:
         """Resets the scene to ``home`` or ``qpos0``, with the handle at the grip."""
-        go_to_start(self.model, self.data, (self.grip, *self.other_grips)[0])
+        go_to_start(self.model, self.data, self.grip)
 
     def grip_pose(self) -> tuple[float, ...]:
         """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m."""

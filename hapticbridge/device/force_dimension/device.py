@@ -43,6 +43,7 @@ from hapticbridge.device.driver import (
     select_device,
 )
 from hapticbridge.device.force_dimension.dhd import (
+    FILES,
     MAX_WATCHDOG,
     MODELS,
     SATURATED,
@@ -51,7 +52,6 @@ from hapticbridge.device.force_dimension.dhd import (
     Dhd,
     Model,
     limits_of,
-    located,
 )
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.watchdog import SHORTEST_WATCHDOG, SILENCE, SilenceDetector, watchdog_time
@@ -265,7 +265,7 @@ def open_forcedimension(options: Mapping[str, object], notify: Notify) -> ForceD
     """
     numbers = stated_numbers(options, _NUMBERS)
     gravity = stated_switch(options, "gravity")
-    dhd = Dhd(located(options.get("library")))
+    dhd = Dhd(FILES.located(options.get("library")))
     device = select_device(DRIVER, _listed(dhd), options.get("serial"))
     return ForceDimensionDevice(
         dhd, int(device.path), gravity=gravity, numbers=numbers, notify=notify
@@ -275,7 +275,7 @@ def open_forcedimension(options: Mapping[str, object], notify: Notify) -> ForceD
 def find() -> list[FoundDevice]:
     """Lists the library's devices, or the kernel's list without the library."""
     try:
-        return _listed(Dhd(located()))
+        return _listed(Dhd(FILES.located()))
     except DeviceError as error:
         return [replace(device, problem=str(error)) for device in usb_search.find(DRIVER)]
 
@@ -283,7 +283,7 @@ def find() -> list[FoundDevice]:
 def medium() -> str:
     """Returns a sentence on whether the library was found."""
     try:
-        return f"Force Dimension's library was found: {Dhd(located()).path}"
+        return f"Force Dimension's library was found: {Dhd(FILES.located()).path}"
     except DeviceError as error:
         return str(error)
 

@@ -9,16 +9,13 @@ bounded here.
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from ctypes import POINTER, c_byte, c_char_p, c_double, c_int, c_ubyte, c_uint, c_ushort
 from dataclasses import dataclass
 from typing import Any
 
 from hapticbridge.device.base import TIMING, USUAL_TORQUE_LIMIT, usual_delay
+from hapticbridge.device.transport.maker_library import LibraryFiles, MakerLibrary
 from hapticbridge.errors import DeviceError
 
 # Device types of Force Dimension's library
@@ -93,9 +90,6 @@ def limits_of(
     return limits["force"], limits["torque"]
 
 
-VARIABLE = "HAPTICBRIDGE_DHD"
-"""Environment variable with the library's file, used without the option ``library``."""
-
 TIMEGUARD, SATURATED = 1, 2
 """Return codes: no newer sample; a motor is saturated. Success is 0."""
 
@@ -131,46 +125,28 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 """Functions that are called, with the types of result and arguments."""
 
-NAMES = {
-    "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
-    "darwin": ("libdrd.dylib", "libdhd.dylib"),
-    "win32": ("drd64.dll", "dhd64.dll"),
-}
-"""Usual file names of the library, by ``sys.platform``. DRD contains all of DHD."""
+FILES = LibraryFiles(
+    variable="HAPTICBRIDGE_DHD",
+    stems=("drd", "dhd"),
+    names={
+        "linux": ("libdrd.so.3", "libdrd.so", "libdhd.so.3", "libdhd.so"),
+        "darwin": ("libdrd.dylib", "libdhd.dylib"),
+        "win32": ("drd64.dll", "dhd64.dll"),
+    },
+    missing="Force Dimension's library (DHD) was not found: install the SDK of forcedimension.com",
+)
+"""Files of the library. DRD contains all of DHD."""
 
 
-class Dhd:
-    """The loaded library, with every used function bound to its signature.
-
-    Args:
-        path: Its file.
+class Dhd(MakerLibrary):
+    """The loaded library.
 
     Raises:
-        DeviceError: The library cannot be loaded, or lacks a function.
+        DeviceError: It cannot be loaded, or lacks a function.
     """
 
     def __init__(self, path: str) -> None:
-        try:
-            library = ctypes.CDLL(path)
-        except OSError as error:
-            reason = " ".join(str(error).split())
-            raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
-        self.path = path
-        self._functions: dict[str, Any] = {}
-        for name, (result, arguments) in FUNCTIONS.items():
-            try:
-                function = getattr(library, name)
-            except AttributeError:
-                raise DeviceError(
-                    f"'{path}' has no {name}: it is not Force Dimension's library, or is older "
-                    "than 3.3"
-                ) from None
-            function.restype, function.argtypes = result, arguments
-            self._functions[name] = function
-
-    def __getitem__(self, name: str) -> Any:
-        """Returns a function of ``FUNCTIONS``."""
-        return self._functions[name]
+        super().__init__(path, FUNCTIONS, "Force Dimension's library, or is older than 3.3")
 
     def now(self) -> float:
         """Returns the time of the library's own clock in s."""
@@ -212,31 +188,3 @@ class Dhd:
             times.append(now - last)
             last = now
         return len(times) / (last - begin), usual_delay(times)
-
-
-def located(library: object = None) -> str:
-    """Returns the library's file.
-
-    Args:
-        library: File named by the user; None selects the environment variable, else the usual
-            names.
-
-    Raises:
-        DeviceError: The library was not found; the message names its source and the option.
-    """
-    named = library or os.environ.get(VARIABLE)
-    if named:
-        return str(named)
-    for name in ("drd", "dhd"):
-        if (found := ctypes.util.find_library(name)) is not None:
-            return found
-    for name in NAMES.get(sys.platform, ()):
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return name
-    raise DeviceError(
-        "Force Dimension's library (DHD) was not found: install the SDK of forcedimension.com and "
-        f"name its file with library=FILE or {VARIABLE}"
-    )

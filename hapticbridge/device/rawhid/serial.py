@@ -152,6 +152,11 @@ class SystemPorts:
 
 
 def _group(path: str) -> str:
+    """Returns the name of the group that owns a port; Debian's where there is none to be read.
+
+    ``Path.group`` raises OSError without the port, KeyError for a group without a name, and
+    NotImplementedError on Windows, which has no groups.
+    """
     try:
         return Path(path).group()
     except (OSError, KeyError, NotImplementedError):

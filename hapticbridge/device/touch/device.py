@@ -43,6 +43,7 @@ from hapticbridge.device.touch.hd import (
     CALIBRATED,
     CALIBRATION_STYLE,
     CALLBACK,
+    FILES,
     FORCE_OUTPUT,
     MAX_CONTINUOUS_FORCE,
     MAX_FORCE,
@@ -54,7 +55,6 @@ from hapticbridge.device.touch.hd import (
     SERIAL_NUMBER,
     TOP_PRIORITY,
     Hd,
-    located,
 )
 from hapticbridge.device.touch.servo import Servo, ServoSample
 from hapticbridge.device.transport import usb as usb_search
@@ -371,7 +371,7 @@ def open_touch(
     numbers = stated_numbers(options, _NUMBERS)
     turns = stated_switch(options, "turn")
     return TouchDevice(
-        Hd(located(options.get("library"))),
+        Hd(FILES.located(options.get("library"))),
         str(options.get("config", "")),
         turns=turns,
         numbers=numbers,
@@ -383,7 +383,7 @@ def open_touch(
 def find() -> list[FoundDevice]:
     """Lists the devices on USB by the kernel's word, because the library only opens them."""
     try:
-        Hd(located())
+        Hd(FILES.located())
         problem = None
     except DeviceError as error:
         problem = str(error)
@@ -393,7 +393,7 @@ def find() -> list[FoundDevice]:
 def medium() -> str:
     """Returns a sentence on whether the library was found."""
     try:
-        return f"OpenHaptics' library was found: {Hd(located()).path}"
+        return f"OpenHaptics' library was found: {Hd(FILES.located()).path}"
     except DeviceError as error:
         return str(error)
 

@@ -8,16 +8,11 @@ library: a call returns nothing, and ``hdGetError`` removes the newest one from 
 from __future__ import annotations
 
 import ctypes
-import ctypes.util
-import os
-import sys
 from ctypes import c_char_p, c_double, c_int, c_uint, c_ulong, c_ushort, c_void_p
 from typing import Any
 
+from hapticbridge.device.transport.maker_library import LibraryFiles, MakerLibrary
 from hapticbridge.errors import DeviceError
-
-VARIABLE = "HAPTICBRIDGE_HD"
-"""Environment variable with the library's file, used without the option ``library``."""
 
 CURRENT_BUTTONS, CURRENT_POSITION, CURRENT_TRANSFORM = 0x2000, 0x2050, 0x2052
 CURRENT_FORCE = 0x2700
@@ -90,45 +85,28 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 """Functions that are called, with the types of result and arguments."""
 
-NAMES = {"linux": ("libHD.so.3.4", "libHD.so.3", "libHD.so"), "win32": ("hd.dll",)}
-"""Usual file names of the library, by ``sys.platform``."""
+FILES = LibraryFiles(
+    variable="HAPTICBRIDGE_HD",
+    stems=("HD",),
+    names={"linux": ("libHD.so.3.4", "libHD.so.3", "libHD.so"), "win32": ("hd.dll",)},
+    missing="OpenHaptics' library (libHD) was not found: install OpenHaptics and the Touch driver "
+    "of 3D Systems",
+)
+"""Files of the library."""
 
 MANY = 64
 """Largest number of errors taken from the queue at once, so that a broken library cannot hang."""
 
 
-class Hd:
-    """The loaded library, with every used function bound to its signature.
-
-    Args:
-        path: Its file.
+class Hd(MakerLibrary):
+    """The loaded library.
 
     Raises:
-        DeviceError: The library cannot be loaded, or lacks a function.
+        DeviceError: It cannot be loaded, or lacks a function.
     """
 
     def __init__(self, path: str) -> None:
-        try:
-            library = ctypes.CDLL(path)
-        except OSError as error:
-            reason = " ".join(str(error).split())
-            raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
-        self.path = path
-        self._functions: dict[str, Any] = {}
-        for name, (result, arguments) in FUNCTIONS.items():
-            try:
-                function = getattr(library, name)
-            except AttributeError:
-                raise DeviceError(
-                    f"'{path}' has no {name}: it is not OpenHaptics' library (HD), or is older "
-                    "than 3.0"
-                ) from None
-            function.restype, function.argtypes = result, arguments
-            self._functions[name] = function
-
-    def __getitem__(self, name: str) -> Any:
-        """Returns a function of ``FUNCTIONS``."""
-        return self._functions[name]
+        super().__init__(path, FUNCTIONS, "OpenHaptics' library (HD), or is older than 3.0")
 
     def errors(self) -> list[int]:
         """Empties the library's queue of errors; returns their codes, the newest first."""
@@ -165,30 +143,3 @@ class Hd:
         value = c_int()
         self["hdGetIntegerv"](parameter, ctypes.addressof(value))
         return 0 if self.errors() else value.value
-
-
-def located(library: object = None) -> str:
-    """Returns the library's file.
-
-    Args:
-        library: File named by the user; None selects the environment variable, else the usual
-            names.
-
-    Raises:
-        DeviceError: The library was not found; the message names its source and the option.
-    """
-    named = library or os.environ.get(VARIABLE)
-    if named:
-        return str(named)
-    if (found := ctypes.util.find_library("HD")) is not None:
-        return found
-    for name in NAMES.get(sys.platform, ()):
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return name
-    raise DeviceError(
-        "OpenHaptics' library (libHD) was not found: install OpenHaptics and the Touch driver of "
-        f"3D Systems and name its file with library=FILE or {VARIABLE}"
-    )

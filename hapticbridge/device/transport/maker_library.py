@@ -1,0 +1,93 @@
+"""Libraries of devices' makers, which users install themselves, loaded at run time."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from hapticbridge.errors import DeviceError
+
+Signatures = Mapping[str, tuple[Any, tuple[Any, ...]]]
+"""Types of result and arguments by a function's name."""
+
+
+class MakerLibrary:
+    """A loaded library, with every used function bound to its signature.
+
+    Args:
+        path: Its file.
+        functions: Functions that are called.
+        about: Name of the library and its oldest version that has them, for messages.
+
+    Attributes:
+        path: Its file.
+
+    Raises:
+        DeviceError: The library cannot be loaded, or lacks a function.
+    """
+
+    def __init__(self, path: str, functions: Signatures, about: str) -> None:
+        try:
+            library = ctypes.CDLL(path)
+        except OSError as error:
+            reason = " ".join(str(error).split())
+            raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
+        self.path = path
+        self._functions: dict[str, Any] = {}
+        for name, (result, arguments) in functions.items():
+            try:
+                function = getattr(library, name)
+            except AttributeError:
+                raise DeviceError(f"'{path}' has no {name}: it is not {about}") from None
+            function.restype, function.argtypes = result, arguments
+            self._functions[name] = function
+
+    def __getitem__(self, name: str) -> Any:
+        """Returns a function that was bound."""
+        return self._functions[name]
+
+
+@dataclass(frozen=True, slots=True)
+class LibraryFiles:
+    """Places where a maker's library may be.
+
+    Attributes:
+        variable: Environment variable with its file, used without the option ``library``.
+        stems: Names for the linker, without prefix and ending.
+        names: File names by ``sys.platform``.
+        missing: Sentence if it is in none of them, which names its source; the option follows.
+    """
+
+    variable: str
+    stems: tuple[str, ...]
+    names: Mapping[str, tuple[str, ...]]
+    missing: str
+
+    def located(self, library: object = None) -> str:
+        """Returns the library's file.
+
+        Args:
+            library: File named by the user; None selects the environment variable, else the usual
+                names.
+
+        Raises:
+            DeviceError: The library was not found.
+        """
+        named = library or os.environ.get(self.variable)
+        if named:
+            return str(named)
+        for stem in self.stems:
+            if (found := ctypes.util.find_library(stem)) is not None:
+                return found
+        for name in self.names.get(sys.platform, ()):
+            try:
+                ctypes.CDLL(name)
+            except OSError:
+                continue
+            return name
+        raise DeviceError(f"{self.missing} and name its file with library=FILE or {self.variable}")
