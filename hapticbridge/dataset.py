@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.files import import_extra
+from hapticbridge.files import import_extra, reason_of
 from hapticbridge.film import Shot, states
 from hapticbridge.record import force_on_hand
 from hapticbridge.recording import RecordingFile, open_recording
@@ -422,10 +422,7 @@ def write_dataset(
         writer.close()
         draft.rename(folder)
     except OSError as error:
-        reason = error.strerror or str(error)
-        if not folder.absolute().parent.is_dir():
-            reason = f"the folder {folder.parent} does not exist"
-        raise RecordingError(f"cannot write '{folder}': {reason}") from None
+        raise RecordingError(f"cannot write '{folder}': {reason_of(error, folder)}") from None
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     return WrittenDataset(folder, tuple(counts))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.export_viewers import FoxgloveSink, RerunSink
-from hapticbridge.files import import_extra
+from hapticbridge.files import import_extra, reason_of
 from hapticbridge.record import FLAG_LEGEND, TableColumns, Timeline, due_times
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.reader import CUTTING_EVENTS
@@ -290,10 +290,7 @@ def export(
         for written, file in zip(drafts, files, strict=True):
             written.replace(file)
     except OSError as error:
-        reason = error.strerror or str(error)
-        if not target.absolute().parent.is_dir():
-            reason = f"the folder {target.parent} does not exist"
-        raise RecordingError(f"cannot write '{target}': {reason}") from None
+        raise RecordingError(f"cannot write '{target}': {reason_of(error, target)}") from None
     finally:
         for written in drafts:
             with suppress(OSError):

@@ -89,6 +89,13 @@ def read_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+def reason_of(error: OSError, target: Path) -> str:
+    """Returns the reason why a file or folder cannot be written, in words."""
+    if not target.absolute().parent.is_dir():
+        return f"the folder {target.parent} does not exist"
+    return error.strerror or str(error)
+
+
 def remove_file(path: Path) -> None:
     """Removes a regular file; does nothing if there is none, or it cannot be removed."""
     if path.is_file():

@@ -86,6 +86,26 @@ def test_the_tool_is_seen_where_the_record_says_at_the_moment_asked_for(
     assert (code, "exists" in err) == (2, True)
 
 
+def test_a_scene_without_a_light_is_lit_and_one_with_its_own_stays(
+    sway: Path, tmp_path: Path
+) -> None:
+    dark = SCENE.replace('<light pos="0 0 1"/>', "")
+    visual = '<visual><headlight ambient="0.05 0.05 0.05" diffuse="0 0 0"/></visual>'
+    chosen = dark.replace("<statistic", f"{visual}<statistic")
+    shot = Shot(at=0.0, camera="above", width=160, height=120)
+
+    def floor(scene: str, name: str) -> float:
+        file, picture = tmp_path / f"{name}.xml", tmp_path / f"{name}.png"
+        file.write_text(scene)
+        recorded(tmp_path / f"{name}.mcap", str(file), f"trajectory:{sway.parent / 'hand.csv'}")
+        drawn_or_skip(tmp_path / f"{name}.mcap", picture, shot)
+        patch = np.asarray(Image.open(picture).convert("L"))[20:30, 110:120]
+        return float(np.median(patch))
+
+    assert floor(dark, "dark") > 180, "MuJoCo's own headlight gives 141"
+    assert floor(chosen, "chosen") < 60, "a headlight that the file sets is the author's"
+
+
 # imageio-ffmpeg leaves its pipes to the garbage collector
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("script", ["", "#!/bin/sh\nexit 1"])

@@ -27,7 +27,13 @@ from hapticbridge.lab.chart.chart import (
     open_workload,
     pareto_front,
 )
-from hapticbridge.lab.chart.output import prepared_files, recommendation, recommended, write_chart
+from hapticbridge.lab.chart.output import (
+    draw_chart,
+    prepared_files,
+    recommendation,
+    recommended,
+    write_chart,
+)
 from hapticbridge.lab.chart.workload import Score, Verdict
 from hapticbridge.lab.methods import METHODS
 
@@ -303,6 +309,19 @@ def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object,
     assert said in text
     good = made_up(0.3, 0.9)
     assert recommended([flawed, good]) is good  # type: ignore[list-item]
+
+
+def test_picture_says_why_a_cheaper_method_is_passed_over(chart: Chart) -> None:
+    good, kicks = made_up(0.02, 0.5), made_up(0.01, 0.4, method="explicit")
+    panel = chart.workload.panels[0]
+    points = tuple(replace(each, panel=panel.key) for each in (good, kicks))
+    axes = draw_chart(replace(chart, measurements=points)).axes[0]
+    legend = axes.get_legend()
+    assert legend is not None
+    words = " ".join(" ".join(text.get_text().split()) for text in legend.get_texts())
+    assert "recommended for 1 kHz: implicit" in words
+    assert "not explicit: it may kick on a real device" in words
+    assert "not implicit" not in words
 
 
 def test_error_that_grows_at_a_smaller_step_is_called_luck() -> None:

@@ -141,6 +141,20 @@ def test_no_peak_of_a_curve_is_lost_wherever_it_stands() -> None:
             assert set(drawn_at[drawn != 0.0]) == {float(at)}
 
 
+def test_lateness_is_drawn_by_its_powers_of_ten(run_file: Path) -> None:
+    recording = read_recording(run_file)
+    ticks = recording.ticks.copy()
+    late = 10.0 ** np.linspace(2.0, 7.0, len(ticks))  # ns: 0.1 µs to 10 ms
+    ticks["wake_ns"] = ticks["deadline_ns"] + late.astype(np.int64)
+    axes = draw_timing(evidence_of(changed(recording, ticks=ticks))).axes[0]
+    counts = [patch.get_height() for patch in axes.patches]
+    assert axes.get_xscale() == "log"
+    assert sum(counts) == len(ticks)
+    # evenly spread over powers of ten, but for what is below 1 µs
+    assert max(counts[1:]) < 2 * np.median(counts[1:]) + 2
+    assert counts[0] >= 0.19 * len(ticks)
+
+
 def test_what_the_guard_did_is_drawn_and_told(run_file: Path, tmp_path: Path) -> None:
     """Samples that stay away, a controller, a re-seating and a trip, made up in a quiet run."""
     recording = read_recording(run_file)

@@ -94,13 +94,30 @@ fingertip."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SceneUnderCheck:
-    """A scene under check.
+class CompiledScene:
+    """A scene with its files, which is all that a rule without a motion needs.
 
     Attributes:
         source: The scene as its files describe it.
         scene: The scene as it runs, with handle and coupling.
         places: Lines of the files on which elements are written.
+    """
+
+    source: SceneSource
+    scene: Scene
+    places: Places
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """Compiled scene with handle, at its running time step."""
+        return self.scene.model
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneUnderCheck(CompiledScene):
+    """A scene under check: a compiled scene, and a motion that it was led through.
+
+    Attributes:
         info: Data sheet of the device.
         coupling: Requested K and B.
         period: T in s.
@@ -118,9 +135,6 @@ class SceneUnderCheck:
             or ``scene``, MuJoCo's own.
     """
 
-    source: SceneSource
-    scene: Scene
-    places: Places
     info: DeviceInfo
     coupling: Coupling
     period: float
@@ -134,11 +148,6 @@ class SceneUnderCheck:
     observation: Observation | None = None
     motion_fault: str = ""
     contact: Literal["rigid", "scene"] = "rigid"
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """Compiled scene with handle, at its running time step."""
-        return self.scene.model
 
     @property
     def is_rigid(self) -> bool:

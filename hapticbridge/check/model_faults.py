@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, SceneUnderCheck
+from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, CompiledScene, SceneUnderCheck
 from hapticbridge.check.fault import Fault, length, number, others, weight
 from hapticbridge.check.inventory import VISUAL, geom_uses
 from hapticbridge.check.physics import (
@@ -34,43 +33,12 @@ from hapticbridge.scene.contacts import (
 # Faults that are felt at once, and seen without a motion
 
 
-class CompiledScene(Protocol):
-    """Part of a ``SceneUnderCheck`` that a rule without a motion needs."""
-
-    @property
-    def source(self) -> SceneSource:
-        """The scene as its files describe it."""
-
-    @property
-    def scene(self) -> Scene:
-        """The scene as it runs."""
-
-    @property
-    def places(self) -> Places:
-        """Lines of the files."""
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """The compiled scene."""
-
-
-@dataclass(frozen=True, slots=True)
-class _LoadedScene:
-    source: SceneSource
-    scene: Scene
-    places: Places
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        return self.scene.model
-
-
 def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
     """Yields faults that make a run feel wrong from its first second: units, angles, creep.
 
     They need no motion, so that a run can tell them at its start. The scene is reset.
     """
-    loaded = _LoadedScene(source, scene, Places(source, scene.model))
+    loaded = CompiledScene(source, scene, Places(source, scene.model))
     for rule in (_units, _angles, _frictions):
         scene.reset()
         yield from rule(loaded)
