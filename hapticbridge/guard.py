@@ -21,6 +21,7 @@ from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
 from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.units import format_energy
 
 # Limits of the wrench and of the run
 
@@ -292,9 +293,13 @@ _REMEDIES = {
     STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
     TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
-    GAVE_ENERGY: "lower --stiffness; if the scene's motors are meant to push the hand, raise "
-    "--energy-limit",
+    GAVE_ENERGY: "lower --stiffness",
 }
+_LIMIT_MOTORS = (
+    "the scene's motors did {} of work until then: limit their force (forcerange) or let them "
+    "start at rest (ctrl in keyframe 'home'); if they are meant to push the hand, --energy-limit "
+    "is what it may get"
+)
 _DIVERGED = (
     "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
     "stiffness or the period"
@@ -309,16 +314,20 @@ def trip_reason(code: int, tick: int) -> str:
     return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
 
 
-def with_remedy(reason: str) -> str:
-    """Appends the remedy to a reason, for the message to the user.
+def trip_remedy(reason: str, motor_work: float) -> str:
+    """Returns the remedy for a trip, for the message to the user; empty if none is known.
 
-    Exception and recording keep the bare reason, because it is compared when the run is repeated. A
-    reason that is not from ``trip_reason`` is returned unchanged.
+    Exception and recording keep the bare reason, because it is compared when the run is repeated.
+
+    Args:
+        reason: Result of ``trip_reason``, or a sentence that ends with it.
+        motor_work: Work of the scene's own motors until then in J, which may be the cause.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
-            return f"{reason}; {remedy}"
-    return reason
+            is_pushed = code == GAVE_ENERGY and motor_work > USUAL_ENERGY
+            return _LIMIT_MOTORS.format(format_energy(motor_work)) if is_pushed else remedy
+    return ""
 
 
 CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}

@@ -69,6 +69,28 @@ def one_of(kind: str, faults: tuple[Fault, ...]) -> Fault:
     return fault
 
 
+RUBS = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
+<joint name="x" type="slide" axis="1 0 0" frictionloss="3" {attributes}/>
+<geom type="box" size=".02 .02 .02" mass="{mass}"/><site name="grip"/></body></worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("mass", [0.2, 0.01, 1e-4])
+@pytest.mark.parametrize(
+    "attributes", ["", 'solreffriction="0.002 1" solimpfriction="0.999 0.999 0.001"']
+)
+def test_what_is_written_against_creep_ends_it(
+    tmp_path: Path, mass: float, attributes: str
+) -> None:
+    def creeps(written_there: str) -> list[Fault]:
+        found = faults_in(tmp_path, RUBS.format(mass=mass, attributes=written_there))
+        return [fault for fault in found if fault.kind == "creeping friction"]
+
+    for fault in creeps(attributes):
+        assert not creeps(fault.change.partition(" (")[0])
+    assert bool(creeps(attributes)) is (not attributes or mass < 0.1)
+
+
 def test_mended_scene_has_no_fault(tmp_path: Path) -> None:
     assert faults_of(bench(tmp_path / "scene")) == ()
 

@@ -59,6 +59,26 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
         assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
 
 
+STICK = """<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 .1"/>
+<body name="stick" pos="0 0 .1001" euler="10 0 0">
+{joint}<geom type="box" size=".02 .02 .1" mass="0.2"/><site name="grip"/>
+</body></worldbody></mujoco>"""
+"""A stick on its edge, which falls otherwise on soft contacts than on rigid ones."""
+
+
+def test_a_tool_that_falls_over_when_it_is_let_go_is_no_fault(tmp_path: Path) -> None:
+    assert moved(scene(tmp_path, STICK.format(joint="<freejoint/>"))).jnd == 0.0
+    other = STICK.format(joint="<freejoint/>").replace(
+        "</worldbody>",
+        '<body name="tool" pos="1 0 1"><joint/><geom size=".01"/>'
+        '<site name="held"/></body></worldbody>',
+    )
+    source = scene(tmp_path, other)
+    found = own_motion(source, compile_scene(source, "held"), Setting(NO_HAND, PERIOD))
+    assert found is not None
+    assert (found.body, found.jnd > 1.0) == ("stick", True)
+
+
 def test_a_short_step_is_kept_where_the_scene_needs_it(tmp_path: Path) -> None:
     needs = scene(tmp_path, FILTER)
     assert moved(needs).jnd > 1.0

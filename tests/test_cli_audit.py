@@ -260,3 +260,5 @@ def test_a_tripped_run_is_not_called_passive_alone(call: Called, tmp_path: Path)
     assert code == 1
     assert out.splitlines()[0].endswith("passive (strict) until the guard tripped")
     assert "likely cause" not in out
+    assert "what to change: check the motion's unit (m) and speed" in out
+    assert out.splitlines()[-1] == "next: hapticbridge guide faults"

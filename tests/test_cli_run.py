@@ -108,6 +108,41 @@ def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> 
     assert "than the stretch limit; check the motion's unit (m)" in err
 
 
+DRIVEN = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
+<joint name="x" type="slide" axis="1 0 0"/><geom type="box" size=".02 .02 .02" mass="0.1"/>
+<site name="grip"/></body></worldbody>
+<actuator><position joint="x" kp="2000" kv="20"/></actuator>
+<keyframe><key name="home" ctrl="0.1"/></keyframe></mujoco>"""
+"""A motor that pulls the tool out of the hand from the first tick on."""
+
+
+def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_the_trip(
+    call: Called, tmp_path: Path
+) -> None:
+    scene, record = tmp_path / "driven.xml", tmp_path / "driven.mcap"
+    scene.write_text(DRIVEN)
+    code, _, err = call("run", scene, "--fast", "--duration", 0.2, "--record", record)
+    assert code == 3
+    assert "most of it from motors, springs or parts of the scene" in err
+    assert "this tool weighs" not in err
+    assert "than the limit; the scene's motors did " in err
+    assert "lower --stiffness" not in err
+    _, out, _ = call("audit", record)
+    assert "what to change: the scene's motors did " in out
+    scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))  # as the remedy says
+    assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0
+
+
+def test_a_hand_without_an_end_of_its_motion_runs_for_five_simulated_seconds(
+    call: Called, tmp_path: Path
+) -> None:
+    scene = tmp_path / "slide.xml"
+    scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))
+    code, out, err = call("run", scene, "--fast")
+    assert (code, "ran                 5.000 s" in out) == (0, True)
+    assert "has no end: this run takes 5 s of simulated time (--duration takes another)" in err
+
+
 def test_a_diverging_scene_trips_and_leaves_no_log_beside_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

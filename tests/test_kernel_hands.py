@@ -122,6 +122,7 @@ def test_no_two_hands_get_energy_out_of_a_scene(scene: str) -> None:
 def test_levels_settled_one_after_the_other_create_energy() -> None:
     outcomes = [attacked(seed, "bar", is_joint=False) for seed in range(20)]
     assert max(outcome.created for outcome in outcomes) > 1000 * UNPAID
+    assert any(outcome.is_active for outcome in outcomes)
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,7 @@ def test_lateness_is_drawn_by_its_powers_of_ten(run_file: Path) -> None:
     late = 10.0 ** np.linspace(2.0, 7.0, len(ticks))  # ns: 0.1 µs to 10 ms
     ticks["wake_ns"] = ticks["deadline_ns"] + late.astype(np.int64)
     axes = draw_timing(evidence_of(changed(recording, ticks=ticks))).axes[0]
-    counts = [patch.get_height() for patch in axes.patches]
+    counts = [bar.get_height() for bar in axes.containers[0]]
     assert axes.get_xscale() == "log"
     assert sum(counts) == len(ticks)
     # evenly spread over powers of ten, but for what is below 1 µs

@@ -64,6 +64,9 @@ SCENES = {"bar": BAR, "peg_and_block": PEG_AND_BLOCK}
 
 START = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
+TICKS = 1500
+"""Ticks of an attack."""
+
 UNPAID = 1e-6
 """Largest energy in J that both hands may have beyond what they put in; rounding leaves less."""
 
@@ -200,15 +203,24 @@ def attack(
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Result of an attack: energies in J, completed ticks, and ticks at a force level."""
+    """Result of an attack.
+
+    Attributes:
+        most: Largest energy in J of both hands beyond what they put in and their devices burned.
+        created: Largest energy in J that the scene created, within the slack or not.
+        is_active: True if it created more than the slack.
+        ticks: Completed ticks.
+        repetitions: Ticks at a force level.
+    """
 
     most: float
     created: float
+    is_active: bool
     ticks: int
     repetitions: int
 
 
-def attacked(seed: int, scene: str, ticks: int = 1500, *, is_joint: bool = True) -> Outcome:
+def attacked(seed: int, scene: str, ticks: int = TICKS, *, is_joint: bool = True) -> Outcome:
     """Runs a random attack on a scene of ``SCENES``, with devices that just bear their couplings.
 
     ``is_joint`` is False to settle the hands' force levels one after the other.
@@ -247,4 +259,6 @@ def attacked(seed: int, scene: str, ticks: int = 1500, *, is_joint: bool = True)
     pace, lengths = rng.uniform(0.05, 0.6), rng.integers(5, 150, 2)
     habits = np.array([b, b_r, pace, *lengths, not is_joint], dtype=float)
     most, created, done = attack(bound.states, unmoved(), bound.rows, moves, habits)
-    return Outcome(most, created, done, int(bound.states["level"]["repetitions"].sum()))
+    is_active = int(bound.states[0]["energy"]["first_active"]) >= 0
+    count = int(bound.states["level"]["repetitions"].sum())
+    return Outcome(most, created, is_active, done, count)

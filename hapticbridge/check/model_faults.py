@@ -159,8 +159,27 @@ def _frictions(case: CompiledScene) -> Iterator[Fault]:
             place,
             f"the dry friction of {place.element}, {loss:g} {unit}, creeps by {moved} under half "
             f"of it (solref {_numbers(solref)}, impedance {solimp[0]:g}), where it should hold",
-            f'solreffriction="{_reference(case)}" solimpfriction="0.999 0.999 0.001"',
+            _firm_friction(case, CREEP_LOAD * loss, inertia, is_slide=bool(is_slide)),
         )
+
+
+FIRM_IMPEDANCES = 0.999, 0.9999
+"""Impedances that are proposed for dry friction, without unit; MuJoCo takes no larger one."""
+
+
+def _firm_friction(case: CompiledScene, force: float, inertia: float, *, is_slide: bool) -> str:
+    """Returns settings of a joint with which dry friction holds a force, as they are written."""
+    solref = REFERENCE_STEPS * float(case.model.opt.timestep), 1.0
+    fastest = FASTEST_CREEP if is_slide else FASTEST_TURN
+    for impedance in FIRM_IMPEDANCES:
+        solimp = impedance, impedance, 0.001
+        speed = creep_speed(force, solref, solimp, inertia)
+        change = f'solreffriction="{_reference(case)}" solimpfriction="{_listed(solimp)}"'
+        if speed <= fastest:
+            return change
+    lacking = 1.01 * inertia * (speed / fastest - 1.0)
+    unit = "kg" if is_slide else "kg m²"
+    return f'{change} armature="{lacking:.2g}" ({unit} of inertia, which the hand feels)'
 
 
 def _depth_words(
@@ -191,7 +210,11 @@ def _reference(case: CompiledScene) -> str:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return f'"{" ".join(f"{value:g}" for value in values)}"'
+    return f'"{_listed(values)}"'
+
+
+def _listed(values: Sequence[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 # Faults of sizes and shapes: units, filled holes, a distant grip, a small device

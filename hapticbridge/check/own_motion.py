@@ -117,7 +117,8 @@ def own_motion(source: SceneSource, scene: Scene, setting: Setting) -> OwnMotion
         JND = ‖p − q‖ / max(1 mm, 0.07 ‖p − p_0‖)
 
     with a body's centre of mass p under the file's own integrator, time step, solver and contacts,
-    q in the bridge, and p_0 at the start. The body with the largest JND counts.
+    q in the bridge, and p_0 at the start. The body with the largest JND counts; a tool with a free
+    joint does not, because without a hand it falls, and with one the hand moves it.
 
     Args:
         source: The scene; it is not changed.
@@ -176,11 +177,22 @@ class _FileMotion:
         data.qpos[:] = scene.data.qpos
         _place_bodies(data)
         apart = np.linalg.norm(data.xipos - self.end, axis=1)
+        apart[_free_tool(scene)[: apart.size]] = 0.0
         moved = np.linalg.norm(self.end - self.start, axis=1)
         most = int(np.argmax(apart / np.maximum(LEAST, SHARE * moved)))
         name = str(data.model.body(most).name) or str(most)
         motion = float(apart[most]), float(moved[most])
         return OwnMotion(name, *motion, step, self.seconds, created)
+
+
+def _free_tool(scene: Scene) -> NDArray[np.bool_]:
+    """Returns True for each body of a tool that only the hand holds: it falls without one."""
+    model = scene.model
+    trees = model.body_treeid
+    tree = trees[model.site(scene.grip).bodyid[0]]
+    root = np.flatnonzero(trees == tree)[0]
+    is_free = model.jnt_type[model.body_jntadr[root]] == mujoco.mjtJoint.mjJNT_FREE
+    return np.asarray((trees == tree) & is_free, dtype=bool)
 
 
 def _place_bodies(data: mujoco.MjData) -> None:

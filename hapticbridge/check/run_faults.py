@@ -165,7 +165,10 @@ def _energy_created(case: SceneUnderCheck, seen: Observation) -> Fault:
     used = f"{number(100 * seen.slack_share)} % of the coupling's slack, which covers it"
     if seen.environment == "active":
         used = "more than the coupling's slack covers"
-    sentence = f"contacts or joints created energy in the motion: {used}"
+    sentence = (
+        f"contacts or joints created energy in the motion: {used}; a hand that yields, as in a "
+        "run, may see less"
+    )
     if not seen.meetings or case.is_rigid:
         return _created_without_contact(case, sentence)
     pair = max(seen.meetings, key=lambda each: seen.meetings[each].force)

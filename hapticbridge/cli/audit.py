@@ -26,6 +26,7 @@ from hapticbridge.audit.batch import (
 from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
+from hapticbridge.guard import trip_remedy
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.reader import CUT
@@ -190,14 +191,17 @@ class Audit:
             out.print_json(json.dumps([json.loads(report.to_json())]))
         else:
             _print_report(report)
-            if report.verdict == "active":
-                self._print_cause(report)
+            self._print_cause(report)
         if self.plot is not None or self.report is not None:
             self._draw(report)
         return report.exit_code
 
     def _print_cause(self, report: AuditReport) -> None:
-        """Prints the largest excess of an active run, its likely cause and what to change."""
+        """Prints the largest excess of an active run, or a trip, and what to change."""
+        if report.verdict != "active":
+            if "trip" in report.events:
+                _print_trip(report)
+            return
         evidence = Evidence.of(read_recording(report.path))
         excess = evidence and excess_of(evidence, report, in_process=self.in_process)
         if excess:
@@ -325,6 +329,14 @@ def _print_report(report: AuditReport) -> None:
     ]
     if energies:
         out.print(f"  {', '.join(energies)}")
+
+
+def _print_trip(report: AuditReport) -> None:
+    """Prints what to change after a trip of a run that was passive until then."""
+    work = report.energies.get("actuator_work", 0.0)
+    if remedy := trip_remedy(report.reason, work):
+        out.print(f"what to change: {plain(remedy)}")
+    out.print("next: hapticbridge guide faults")
 
 
 @dataclass(frozen=True, slots=True)

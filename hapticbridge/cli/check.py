@@ -281,7 +281,7 @@ class Check:
         "settings",
         "grip",
         "motion",
-        "workspace",
+        "contact",
         "plot",
         "lean",
         "budget",
@@ -374,6 +374,9 @@ class Check:
             print_inventory(inventory)
             print_cost(cost)
             print_faults(faults)
+            if not faults:
+                grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
+                out.print(f"next: hapticbridge run {plain(shlex.quote(self.scene))}{grip}")
         lean = self._looked_for(case, budget) if wants_lean else None
         written = None if lean is None else self._print_lean(lean)
         if self.as_json:

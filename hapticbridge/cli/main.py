@@ -91,9 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sentence, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
         print(sentence, file=sys.stderr)
     except SafetyTrip as trip:
-        from hapticbridge.guard import with_remedy  # noqa: PLC0415 - imports numba
+        from hapticbridge.guard import trip_remedy  # noqa: PLC0415 - imports numba
 
-        code = _say("safety trip", with_remedy(str(trip)), SAFETY_TRIP)
+        work = float(trip.records["actuator_work"][-1]) if len(trip.records) else 0.0
+        parts = str(trip), trip_remedy(str(trip), work)
+        code = _say("safety trip", "; ".join(filter(None, parts)), SAFETY_TRIP)
     except HapticBridgeError as error:
         code = _say("error", error)
     except BrokenPipeError:  # as in 'hapticbridge --help | head'

@@ -12,11 +12,13 @@ from pathlib import Path
 from signal import Signals
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+import numpy as np
 import tyro
 from rich.markup import escape
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import device_conditions, run_conditions
+from hapticbridge.check.case import DEFAULT_SECONDS
 from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
@@ -93,9 +95,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         and math.isclose(attainable.rotational_damping, coupling.rotational_damping)
     ):
         err.print(
-            f"[yellow]warning:[/yellow] requested B = {coupling.damping:g} N s/m, B_r = "
-            f"{coupling.rotational_damping:g} N m s/rad: less than method {method.name} can show "
-            "at this stiffness and rate; lower the stiffness or raise the rate"
+            f"  requested B = {coupling.damping:g} N s/m, B_r = {coupling.rotational_damping:g} "
+            f"N m s/rad: less than method {method.name} has at this stiffness and rate"
         )
     for sentence in _without_motor(setup):
         err.print(f"  {sentence}")
@@ -191,12 +192,31 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
     """Yields a sentence on the load of the tool at rest, if it is a heavy one."""
     load = parameters.guarding.idle_force - setup.guard.idle_force
     in_hand = setup.workspace.scales[1] * load
-    if setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf:
-        sag = format_si(load / parameters.coupling.stiffness, "m")
+    if not (setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf):
+        return
+    sag = format_si(load / parameters.coupling.stiffness, "m")
+    if load > OTHER_LOAD * _weight_of_tool(setup.scene):
+        yield (
+            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
+            "it from motors, springs or parts of the scene that push the tool"
+        )
+    else:
         yield (
             f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
             "the handle; --no-tool-weight carries it"
         )
+
+
+OTHER_LOAD = 2.0
+"""Load at rest relative to the tool's weight above which most of it is not weight; no unit."""
+
+
+def _weight_of_tool(scene: Scene) -> float:
+    """Returns the weight in N of all that moves with the tool; gravcomp does not count."""
+    model = scene.model
+    trees = model.body_treeid
+    mass = model.body_mass[trees == trees[model.site(scene.grip).bodyid[0]]]
+    return float(mass.sum() * np.linalg.norm(model.opt.gravity))
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +265,8 @@ class Run:
     from the list of 'hapticbridge devices'."""
     duration: float | None = None
     """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
-    default the run ends with the device's motion, or with Ctrl-C."""
+    default the run ends with the device's motion; without an end of it with Ctrl-C, or after 5 s of
+    --fast."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
@@ -432,7 +453,7 @@ class Run:
             notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
-        summary = bridge.run(self.duration)
+        summary = bridge.run(self._duration(device.info))
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
@@ -444,6 +465,16 @@ class Run:
                 out.print(plain(line))
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _duration(self, info: DeviceInfo) -> float | None:
+        """Returns the duration of the run in s; None until it is stopped."""
+        if self.duration is not None or info.duration is not None or not self.fast or self.view:
+            return self.duration
+        notify(
+            f"the simulated hand's motion has no end: this run takes {DEFAULT_SECONDS:g} s of "
+            "simulated time (--duration takes another)"
+        )
+        return DEFAULT_SECONDS
 
     def _options(self, info: DeviceInfo) -> BridgeOptions:
         return BridgeOptions(

@@ -101,7 +101,7 @@ def lead_sentence(report: AuditReport, worst: float | None) -> str:
 
 def _excess_sentence(report: AuditReport, joules: str) -> str:
     if report.port == "device":
-        return f"Not safe: the device was given up to {joules} that neither hand nor scene put in"
+        return f"Not safe: the hand got up to {joules} that neither it nor the scene put in"
     limit = "the coupling's slack pays for" if report.environment == "active" else "it got"
     return f"Not safe: the scene gave out up to {joules} more than {limit}"
 

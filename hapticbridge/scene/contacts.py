@@ -276,16 +276,15 @@ def contact_concerns(
     concerns = []
     if numbers.grade == "active" and numbers.is_too_stiff:
         concerns.append(
-            f"is stiffer than any that stayed passive in tests (impedance {numbers.impedance:.3g}, "
-            f"stiffness {numbers.stiffness:.3g} inertia/step²; at most {LARGEST_IMPEDANCE:g} and "
-            f"{STIFFEST:g}) and may create more energy than the coupling's slack allows; write "
-            f'{instead} and solimp="0.9 0.95 0.001"'
+            f"has {_excess(numbers)} than any that stayed passive in tests, and may create more "
+            f"energy than the coupling's slack allows; write {instead} and "
+            'solimp="0.9 0.95 0.001"'
         )
     elif numbers.grade == "active":
         concerns.append(
             f"relaxes within {steps:.2g} time steps (2 d_w timeconst dampratio²) and may create "
-            f"more energy than the coupling's slack allows; write {instead}, or at least a "
-            f"relaxation of {HEAVY_SLACK_STEPS:g} steps"
+            f"more energy than the coupling's slack allows; write {instead}, or for a tool of 0.1 "
+            f'kg or more solref="{REFERENCE_STEPS * timestep:g} 1" solimp="0.9 0.95 0.001"'
         )
     if cone == "pyramidal" and condim > 1 and friction < LOW_FRICTION:
         concerns.append(
@@ -306,6 +305,18 @@ def contact_concerns(
             f'solref="{REFERENCE_STEPS * timestep:g} 1"; write {instead} unless this is intended'
         )
     return concerns
+
+
+def _excess(numbers: ContactNumbers) -> str:
+    """Names the numbers of a setting that is too stiff which exceed the rule's."""
+    found = []
+    if numbers.impedance > LARGEST_IMPEDANCE * (1 + ROUNDING):
+        found.append(f"a larger impedance ({numbers.impedance:.3g}, at most {LARGEST_IMPEDANCE:g})")
+    if numbers.stiffness > STIFFEST * (1 + ROUNDING):
+        found.append(
+            f"a larger stiffness ({numbers.stiffness:.3g} inertia/step², at most {STIFFEST:g})"
+        )
+    return " and ".join(found)
 
 
 # Contacts of a scene, checked against the measured rule
