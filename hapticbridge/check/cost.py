@@ -29,6 +29,7 @@ from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import TAIL, Ring
 from hapticbridge.recording.recorder import NOBODY_READS
 from hapticbridge.scene import Scene
+from hapticbridge.units import format_si
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -157,15 +158,16 @@ class Cost:
         if not self.highest_rate < rate:
             return None
         highest = math.floor(self.highest_rate)
-        p99, left = 1e6 * self.all_ticks.p99, 1e6 * TICK_SHARE * case.period
+        p99, left = self.all_ticks.p99, TICK_SHARE * case.period
         lower = f"and run with --rate {highest}; or " if highest >= LOWEST_RATE else ""
         ticks = math.ceil(self.all_ticks.p99 / (TICK_SHARE * case.period))
         beside = f"{rate / min(max(ticks, 2), MAX_SCENE_TICKS):.3g}"
         return Fault(
             "rate",
             case.places.option("timestep"),
-            f"cannot hold {rate:g} Hz here: 99 of 100 ticks take up to {p99:.3g} µs; beside the "
-            f"device and late wake-ups {left:.3g} µs of a period are left for them",
+            f"cannot hold {rate:g} Hz here: 99 of 100 ticks take up to "
+            f"{format_si(p99, 's')}; beside the device and late wake-ups {format_si(left, 's')} of "
+            "a period are left for them",
             f"'hapticbridge run' lets it step beside the loop, with --scene-rate {beside}; or "
             f"{case.places.option_change('timestep', f'{1.0 / max(highest, 1):.3g}')} {lower}"
             "see with 'hapticbridge check --lean' what may go",

@@ -259,9 +259,10 @@ def _growth(growth: Growth, unit: str) -> str:
     if growth.base is None or growth.per_one is None:
         return ""
     most = growth.steps[-1]
+    none = f"{format_si(growth.base, 's')} with none, " if growth.base > 0 else ""  # not a line
     return (
-        f"grows by {1e6 * growth.per_one:.2g} µs per {unit}: {1e6 * growth.base:.3g} µs with none, "
-        f"{1e6 * most[2]:.3g} µs with {most[0]}"
+        f"grows by {format_si(growth.per_one, 's')} per {unit}: {none}"
+        f"{format_si(most[2], 's')} with {most[0]}"
     )
 
 
