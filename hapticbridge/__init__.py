@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hapticbridge.errors import SafetyTrip as SafetyTrip
     from hapticbridge.errors import SceneError as SceneError
     from hapticbridge.guard import Limits as Limits
+    from hapticbridge.hands import Grasp as Grasp
     from hapticbridge.options import BridgeOptions as BridgeOptions
     from hapticbridge.options import Workspace as Workspace
     from hapticbridge.record import SAMPLE_DTYPE as SAMPLE_DTYPE

@@ -25,8 +25,21 @@ from hapticbridge.commands.command import Stop
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_read
-from hapticbridge.errors import CommandError, DeviceError, HapticBridgeError, SceneError
+from hapticbridge.errors import (
+    CommandError,
+    DeviceError,
+    HapticBridgeError,
+    SceneError,
+    choices,
+)
 from hapticbridge.guard import trip_reason
+from hapticbridge.hands import (
+    DeviceGroup,
+    Grasp,
+    devices_for_run,
+    resolve_hands,
+    scene_of_grasps,
+)
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
 from hapticbridge.options import (
@@ -63,7 +76,8 @@ class Bridge:
     Args:
         scene: A loaded scene, a shipped scene's name, or a path to MJCF.
         device: An open device, or a string for ``open_device``. A device opened from a string is
-            closed if the bridge is refused.
+            closed if the bridge is refused. Several hands are named by a ``Grasp`` each, with its
+            grip, device and coupling.
         coupling: Stiffness and damping to be felt; None selects the stiffest safe coupling, and a
             mapping such as ``{"damping": 2.0}`` changes gains of it.
         options: Rate, method, workspace, limits, buttons; see ``BridgeOptions``.
@@ -75,8 +89,8 @@ class Bridge:
         **changes: Fields of ``BridgeOptions`` that differ from ``options``.
 
     Attributes:
-        setup: The resolved setup: scene, coupling, method, guard.
-        device: The device.
+        setup: The resolved setup: scene, coupling, method, guard; of several hands, the first's.
+        device: The device; of several hands, all of them as one.
         clock: Clock of the run.
         output: Destinations of the records.
 
@@ -88,7 +102,7 @@ class Bridge:
     def __init__(
         self,
         scene: Scene | str | Path,
-        device: Device | str = "simulated",
+        device: Device | str | Sequence[Grasp] = "simulated",
         coupling: Coupling | Mapping[str, float] | None = None,
         options: BridgeOptions = DEFAULT_OPTIONS,
         *,
@@ -109,23 +123,65 @@ class Bridge:
                 f"clock is the class {self.clock.__name__}; it must be an object of it: "
                 f"{self.clock.__name__}()"
             )
-        loaded = scene if isinstance(scene, Scene) else load_scene(scene)
-        with device_for_run(loaded, device, self.clock) as self.device:
-            self.setup = RunSetup.resolve(
-                loaded,
-                self.device.info,
-                coupling,
-                options,
-                self.clock,
-                is_recorded=path is not None,
-            )
+        self.device: Device
+        self.setup: RunSetup
+        self._others: tuple[RunSetup, ...] = ()
+        if isinstance(device, Sequence) and not isinstance(device, str):
+            self._resolve_hands(scene, device, coupling, options)
+        else:
+            self._resolve(scene, device, coupling, options)
         self._stop = StopRequest()
         self._session: Session | None = None
+
+    def _resolve(
+        self,
+        scene: Scene | str | Path,
+        device: Device | str,
+        coupling: Coupling | Mapping[str, float] | None,
+        options: BridgeOptions,
+    ) -> None:
+        loaded = scene if isinstance(scene, Scene) else load_scene(scene)
+        if loaded.other_grips:
+            grips = choices((loaded.grip, *loaded.other_grips))
+            raise SceneError(
+                f"scene '{loaded.name}' was loaded with {1 + len(loaded.other_grips)} grips, and "
+                f"one device holds one; name a Grasp per hand, or load it with one of {grips}"
+            )
+        with device_for_run(loaded, device, self.clock) as self.device:
+            is_recorded = self.output.path is not None
+            self.setup = RunSetup.resolve(
+                loaded, self.device.info, coupling, options, self.clock, is_recorded=is_recorded
+            )
+
+    def _resolve_hands(
+        self,
+        scene: Scene | str | Path,
+        grasps: Sequence[Grasp],
+        coupling: Coupling | Mapping[str, float] | None,
+        options: BridgeOptions,
+    ) -> None:
+        if not all(isinstance(grasp, Grasp) for grasp in grasps):
+            raise HapticBridgeError("several hands are named by a Grasp each: Grasp(GRIP, DEVICE)")
+        if coupling is not None:
+            raise HapticBridgeError("each of several hands has a coupling of its own: Grasp(…)")
+        if self.output.observer is not None:
+            raise HapticBridgeError("the view shows one hand; leave it out with several")
+        loaded = scene_of_grasps(scene, grasps)
+        with devices_for_run(loaded, grasps, self.clock) as devices:
+            self.setup, *others = resolve_hands(
+                loaded,
+                grasps,
+                [device.info for device in devices],
+                options,
+                self.clock,
+                is_recorded=self.output.path is not None,
+            )
+        self.device, self._others = DeviceGroup(devices), tuple(others)
 
     def __enter__(self) -> Self:
         if self._session is not None:
             raise HapticBridgeError("a bridge is opened once; make a new one for another run")
-        self._session = Session(self.setup, self.device, self.clock, self.output, self._stop)
+        self._session = Session(self.setups, self.device, self.clock, self.output, self._stop)
         return self
 
     def __exit__(
@@ -182,7 +238,7 @@ class Bridge:
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
         read_device, write_device = checked_read(self.device), self.device.write
-        state, row, sample = kernel.bound.state, kernel.bound.row, kernel.sample
+        state, row, sample = kernel.state, kernel.row, kernel.sample
         before, answer, finish = kernel.before, kernel.answer, kernel.finish
         step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half
         stream, rows, cursors, wrench = session.stream, kernel.rows, kernel.cursors, kernel.wrench
@@ -263,6 +319,7 @@ class Bridge:
         if isinstance(command, Stop):
             self.stop(by)
             return
+        self._refuse_several("commands")
         if self._session is None or not self._session.is_open:
             raise CommandError(_NOT_OPEN)
         self._session.commands.offer(command, by)
@@ -276,7 +333,12 @@ class Bridge:
         Args:
             events: Events of the recording (``commands.CHANGES``), in order.
         """
+        self._refuse_several("commands")
         self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
+
+    def _refuse_several(self, what: str) -> None:
+        if len(self.setups) > 1:
+            raise CommandError(f"a run of several hands takes no {what} but to stop")
 
     def set_input(
         self,
@@ -323,6 +385,11 @@ class Bridge:
         self._open_session().inputs.append(writes)
 
     @property
+    def setups(self) -> tuple[RunSetup, ...]:
+        """The setup of each hand."""
+        return self.setup, *self._others
+
+    @property
     def scene(self) -> Scene:
         """The scene."""
         return self.setup.scene
@@ -350,11 +417,14 @@ class Bridge:
 
     @property
     def ledger(self) -> Ledger:
-        """Energies so far, by port."""
+        """Energies so far, by port; of several hands, those at the first one's."""
         return Ledger.of(self.session.kernel.bound.state)
 
     def latest_records(self, count: int) -> NDArray[np.void]:
-        """Returns copies of the newest records (``TICK_DTYPE``), oldest first."""
+        """Returns copies of the newest ``count`` ticks' records (``TICK_DTYPE``), oldest first.
+
+        Each tick has a record per hand, in order.
+        """
         return self.session.stream.latest(count)
 
     def conditions(self) -> tuple[str, ...]:

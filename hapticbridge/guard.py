@@ -20,7 +20,6 @@ from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
-from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.units import format_energy
 
 # Limits of the wrench and of the run
@@ -184,7 +183,7 @@ def wait_until_still(
 
     Args:
         device: The started device.
-        sample: Shape (1,), ``SAMPLE_DTYPE``; receives the newest sample.
+        sample: ``SAMPLE_DTYPE``, one per hand; receives the newest sample.
         period: T in s, at which it is read.
         clock: Clock of the run. The wait happens only in real time; an injected clock also drives
             the device, which must not move before the run.
@@ -197,7 +196,7 @@ def wait_until_still(
         return
     clock = RealClock()  # a separate one, because the run's time begins with its first tick
     clock.start(round(1e9 * period))
-    anchor = np.zeros(1, SAMPLE_DTYPE)
+    anchor = np.zeros_like(sample)
     since = begun = None
     while not is_over():
         clock.wait()
@@ -205,9 +204,9 @@ def wait_until_still(
         device.write(_NO_FORCE)
         now = clock.now()
         begun = now if begun is None else begun
-        moved = float(np.linalg.norm(sample["position"][0] - anchor["position"][0]))
+        moved = float(np.linalg.norm(sample["position"] - anchor["position"], axis=1).max())
         if since is None or not moved <= STILL_DISTANCE:
-            anchor[0], since = sample[0], now
+            anchor[:], since = sample, now
         elif now - since >= 1e9 * STILL_TIME:
             return
         if now - begun > 1e9 * PATIENCE:

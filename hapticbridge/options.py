@@ -406,11 +406,6 @@ class RunSetup:
         Raises:
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
-        if scene.other_grips:
-            raise SceneError(
-                f"scene '{scene.name}' was loaded with {1 + len(scene.other_grips)} grips, and a "
-                f"run has one hand; load it with one of {choices((scene.grip, *scene.other_grips))}"
-            )
         method, period, substeps = (
             options.rendering_method,
             period_of(options.rate),
@@ -540,28 +535,41 @@ class RunSetup:
             SceneError: The scene must not be changed (``Scene.as_is``).
             HapticBridgeError: A value is out of range.
         """
-        parameters, scene, most = self.parameters(start, effective), self.scene, self.limits.force
+        parameters = self.parameters(start, effective)
+        if reason := self.overload(parameters):
+            self.carry(reason)
+            return self.parameters(start, effective)
+        return parameters
+
+    def overload(self, parameters: RunParameters) -> str:
+        """Returns why the device cannot hold the tool, as a clause; empty if it can."""
+        scene, most = self.scene, self.limits.force
         if not self.method.has_law or self.info.is_prescribed or scene.is_carried:
-            return parameters
+            return ""
         if (force := self._sent(holding_force(scene, parameters))) > most:
             weightless = self._sent(holding_force(scene, parameters, has_weight=False))
             if weightless > max(most, force / 2):
-                return parameters  # motors or springs push, more than the weight
-            reason = f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
-        elif (force := self._sent(toppling_force(scene, parameters))) > most:
-            reason = (
+                return ""  # motors or springs push, more than the weight
+            return f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+        if (force := self._sent(toppling_force(scene, parameters))) > most:
+            return (
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "
                 f"{force:.3g} N, and the device holds {most:.3g} N"
             )
-        else:
-            return parameters
-        if scene.as_is:
+        return ""
+
+    def carry(self, reason: str) -> None:
+        """Lets the scene carry the tools' weight, for a result of ``overload``.
+
+        Raises:
+            SceneError: The scene must not be changed (``Scene.as_is``).
+        """
+        if self.scene.as_is:
             raise SceneError(
                 f"the tool is too heavy ({reason}): let its weight be carried (--no-tool-weight, "
                 "or without --as-is)"
             )
-        scene.carry_tool(reason)
-        return self.parameters(start, effective)
+        self.scene.carry_tool(reason)
 
     def _sent(self, force: float) -> float:
         return self.workspace.scales[1] * force

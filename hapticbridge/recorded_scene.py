@@ -22,15 +22,18 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.handle import stretch_at
+from hapticbridge.kernel.hands import simulate_hands
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
+from hapticbridge.recording.format import further_hands
 from hapticbridge.rendering import (
     check_prepared,
     method_named,
     prepare,
+    prepare_hands,
     static_load,
     unguarded_parameters,
 )
@@ -62,7 +65,8 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
     The machine code of its method is loaded here first: the child inherits it.
     """
     method = method_of(recording.meta)
-    load_machine_code(method.name, method.contact, parameters.scene_ticks > 0)
+    is_of_hands = "hands" in recording.meta
+    load_machine_code(method.name, method.contact, parameters.scene_ticks > 0, is_of_hands)
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
@@ -70,7 +74,7 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
 
 
 @cache
-def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
+def load_machine_code(name: str, contact: str, is_slow: bool, is_of_hands: bool = False) -> None:
     """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
     A child process may not write it, and each would load it again.
@@ -84,6 +88,20 @@ def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
         parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
+        if is_of_hands:
+            hands = BoundHands(scene.model, scene.data, [parameters])
+            alone = np.zeros((1, 1), SAMPLE_DTYPE)
+            alone["quaternion"][..., 0] = 1.0
+            simulate_hands(
+                hands.states,
+                alone,
+                np.zeros((1, 1), np.int64),
+                np.zeros(1),
+                hands.rows,
+                np.zeros((1, 1), TICK_DTYPE),
+            )
+            hands.release()
+            return
         parameters = replace(parameters, scene_ticks=2 * is_slow)
         kernel = BoundKernel(scene.model, scene.data, parameters)
         sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
@@ -163,7 +181,7 @@ def recorded_values(meta: Mapping[str, str]) -> dict[str, float]:
 
 
 def load_unpacked(
-    main: Path, grip: str, values: Mapping[str, float], meta: Mapping[str, str]
+    main: Path, grip: str | tuple[str, ...], values: Mapping[str, float], meta: Mapping[str, str]
 ) -> Scene:
     """Loads an unpacked scene with these values of its parameters, its tool carried as recorded.
 
@@ -181,8 +199,12 @@ def load_unpacked(
     return scene
 
 
-def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Scene:
+def compile_recorded(
+    recording: RecordingFile, parameters: RunParameters, *others: RunParameters
+) -> Scene:
     """Compiles the attached sources, and prepares the scene for the recorded method.
+
+    ``others`` are the parameters of further hands.
 
     It belongs into a child process with limits (``confinement``), unless the recording is trusted.
 
@@ -194,10 +216,16 @@ def compile_recorded(recording: RecordingFile, parameters: RunParameters) -> Sce
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
             main = unpack_scene(recording, Path(folder))
             home, meta = f"{main.parent}/", recording.meta
-            scene = load_unpacked(main, parameters.grip, recorded_values(meta), meta)
+            grips = parameters.grip, *(each.grip for each in others)
+            grip = grips if others else parameters.grip
+            scene = load_unpacked(main, grip, recorded_values(meta), meta)
             requested, method = requested_of(meta), method_of(meta)
             steps = parameters.scene_period, parameters.substeps
-            prepare(scene, requested, *steps, method, warns=False)
+            if others:
+                couplings = [requested, *(requested_of(meta | own) for own in further_hands(meta))]
+                prepare_hands(scene, couplings, parameters.period, method, warns=False)
+            else:
+                prepare(scene, requested, *steps, method, warns=False)
             check_prepared(scene.model, parameters, method)
     except RecordingError:
         raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -486,6 +486,27 @@ def prepare(
     if not method.is_rigid:
         refuse_overlap(scene.model, scene.data, scene.grip)
     return effective
+
+
+def prepare_hands(
+    scene: Scene, couplings: Sequence[Coupling], period: float, method: Method, warns: bool = True
+) -> None:
+    """Prepares a scene for several hands, as ``prepare`` does for one, with a step per tick.
+
+    Args:
+        scene: Changed in place.
+        couplings: The requested coupling of each hand.
+        period: T in s.
+        method: The rendering method.
+        warns: As for ``prepare``.
+
+    Raises:
+        SceneError: As for ``prepare``.
+    """
+    prepare(scene, couplings[0], period, 1, method, warns=warns)
+    for hand, coupling in enumerate(couplings):
+        law = method.law_coupling(coupling, period)
+        scene.of_hand(hand).set_gains(*method.gains(law, period))
 
 
 UNLIMITED = 1e30

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -24,8 +24,8 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
-from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.recording import Attachment
+from hapticbridge.recording.format import HANDS_KEY
 from hapticbridge.rendering import RIGID, SCENE, Method, method_named
 from hapticbridge.scene import Scene
 
@@ -210,21 +210,24 @@ def attachments(scene: Scene) -> list[Attachment]:
 def describe_run(
     scene: Scene,
     parameters: RunParameters,
-    binding: BoundKernel,
+    state: NDArray[np.void],
     *,
     requested: Coupling,
     method: str,
     device: DeviceInfo,
     clock: str,
 ) -> dict[str, str]:
-    """Returns the recording's metadata; ``parameters_of`` is the inverse."""
+    """Returns the metadata of a hand's records; ``parameters_of`` is the inverse.
+
+    ``state`` is the kernel's before the first tick.
+    """
     coupling = parameters.coupling
     effective = parameters.effective
     meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
     meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
     meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
     for name, count in STARTS.items():
-        start = start_of(binding.state, name)
+        start = start_of(state, name)
         meta[name] = json.dumps(start if count > 1 else start[0])
     return meta | {
         "period_s": repr(parameters.period),
@@ -252,6 +255,20 @@ def describe_run(
         ),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def describe_hands(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
+    """Returns the recording's metadata from those of each hand; of one hand, just its own.
+
+    The first hand's are those of the run; ``hands`` holds what differs in each other hand.
+    """
+    first, *others = found
+    if not others:
+        return dict(first)
+    differing = [
+        {name: text for name, text in each.items() if text != first.get(name)} for each in others
+    ]
+    return {**first, HANDS_KEY: json.dumps(differing)}
 
 
 def method_of(meta: Mapping[str, str]) -> Method:

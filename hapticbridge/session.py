@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,17 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock, slept_ns
 from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
+from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
+from hapticbridge.hands import DeviceGroup
 from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
-from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
+from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands, publish_hands
+from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
     answer_step,
     before_step,
@@ -48,8 +52,8 @@ from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.snapshot import Snapshot
-from hapticbridge.rendering import prepare
-from hapticbridge.run_description import attachments, describe_run, start_state
+from hapticbridge.rendering import prepare, prepare_hands
+from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
 from hapticbridge.signals import deferring_stops
 from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
 from hapticbridge.summary import RunOutcome, Summary
@@ -107,7 +111,7 @@ class RecordOutput:
     signer: Signer | None = None
 
     def open_stream(
-        self, period: float, snapshot: Snapshot | None, *, may_wait: bool
+        self, period: float, snapshot: Snapshot | None, *, may_wait: bool, hands: int = 1
     ) -> RecordStream:
         """Returns the ring of the records; the files are opened when the stream is started.
 
@@ -115,6 +119,7 @@ class RecordOutput:
             period: T in s.
             snapshot: Shared memory with the scene's positions, for the observer.
             may_wait: True if the loop may wait for the recorder.
+            hands: Number of hands.
 
         Raises:
             RecordingError: There is no memory for the ring.
@@ -126,6 +131,7 @@ class RecordOutput:
             may_wait=may_wait,
             observer=self.observer,
             snapshot=str(snapshot and snapshot.name),
+            hands=hands,
         )
 
 
@@ -157,18 +163,20 @@ class TickKernel:
     process with the last force on the motors.
 
     Args:
-        sample: The loop's sample, ``SAMPLE_DTYPE``, shape (1,).
+        sample: The loop's sample, ``SAMPLE_DTYPE``, one per hand.
         stream: Receives the records.
 
     Attributes:
         before, answer, finish: Machine code of ``before_step``, ``answer_step`` and
-            ``finish_tick`` of ``kernel.tick``.
-        sample: The device's newest sample.
+            ``finish_tick`` of ``kernel.tick``, or of their like in ``kernel.hands``.
+        sample: Each device's newest sample.
         rows, cursors: Records and cursors of the ring.
-        bound: Kernel state that belongs to the scene; its ``state`` and ``row``.
+        bound: Kernel state that belongs to the scene; of several hands, that of the first.
+        hands: Bound states of all hands if there are several; else None.
+        state, row: Bound state and record, one element per hand.
         step, first_half, second_half: MuJoCo's step for the method, and its two parts around
             the sample in a tick that was computed ahead.
-        wrench: Wrench on the device, shape (6,), in N and N m.
+        wrench: Wrench on the device, shape (6,), in N and N m; of several hands, (n, 6).
         external_flags: Flags of the sample, shape (1,), for the kernel.
         is_ahead: True if a tick computes the first half of the next one.
     """
@@ -178,15 +186,45 @@ class TickKernel:
         state, row = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE)
         rows, cursors = self.rows, self.cursors
         head, numbers = np.zeros(1, np.int64), np.zeros(1)
+        self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
+        self.hands: BoundHands | None = None
+        self.before: Callable[..., int]
+        self.answer: Callable[..., int]
+        self.finish: Callable[..., int]
+        self._publish: Callable[..., bool]
+        if sample.size > 1:
+            self._load_hands(sample.size)
+            return
         self.before = direct(before_step, state, sample, row, 0, 0.0)
         self.answer = direct(answer_step, state, row, 0)
         self.finish = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
-        self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
+
+    def _load_hands(self, count: int) -> None:
+        """Loads the machine code of several hands, whose ticks have one step and no half."""
+        states, own = np.zeros(count, STATE_DTYPE), np.zeros(count, TICK_DTYPE)
+        rows, cursors = self.rows, self.cursors
+        before = direct(before_hands, states, self.sample, own, 0.0)
+        answer = direct(answer_hands, states, own)
+        finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0)
+        self.before = lambda state, sample, row, _, elapsed: before(state, sample, row, elapsed)
+        self.answer = lambda state, row, _: answer(state, row)
+        self.finish = lambda *arguments: finish(*arguments[:-1])
+        self._publish = direct(publish_hands, own, rows, cursors, 0, 0, 0, 0, 0)
+
+    def bind_hands(self, hands: BoundHands) -> None:
+        """Attaches the arrays of a scene that several hands hold."""
+        self.hands, self.bound = hands, hands.hands[0]
+        self.state, self.row = hands.states, hands.rows
+        self.step, self.substeps, self.is_ahead = hands.step, range(1), False
+        self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
+        self.external_flags = np.zeros(1, np.int64)  # each hand's state has its own
+        self.wrench = hands.states["loop"]["wrench_on_device"]
 
     def bind(self, bound: BoundKernel, setup: RunSetup, slow: SlowScene | None) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
         self.bound, self.step, self.substeps = bound, bound.step, range(setup.substeps)
+        self.state, self.row = bound.state, bound.row
         if slow is not None:
             self.step, self.substeps = slow.exchange, range(1)
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
@@ -200,7 +238,7 @@ class TickKernel:
         The times are those of the record, in ns of running.
         """
         times = deadline, wake, read, write
-        is_taken = self._publish(self.bound.row, self.rows, self.cursors, *times, flags)
+        is_taken = self._publish(self.row, self.rows, self.cursors, *times, flags)
         return OK if is_taken else RING_FULL
 
     def publish_positions(self, snapshot: Snapshot, bound: BoundKernel) -> None:
@@ -215,14 +253,17 @@ class Session:
     started last, because from then on it is held. ``close`` releases in reverse order.
 
     Args:
-        setup: The resolved setup.
-        device: The device, open but not started.
+        setups: The resolved setup of each hand.
+        device: The device, open but not started; a ``DeviceGroup`` for several hands.
         clock: Clock of the run.
         output: Destinations of the records.
         stop: Requests to end the run.
 
     Attributes:
-        parameters: All that decides the run's numbers, beside scene and device motion.
+        setup: Setup of the first hand.
+        parameters: All that decides the run's numbers, beside scene and device motion; of several
+            hands, those of the first.
+        hand_parameters: The parameters of each hand.
         kernel: Arithmetic of a tick.
         stream: Records and events on their way out.
         commands: Queue of commands.
@@ -241,10 +282,16 @@ class Session:
     """
 
     def __init__(
-        self, setup: RunSetup, device: Device, clock: Clock, output: RecordOutput, stop: StopRequest
+        self,
+        setups: Sequence[RunSetup],
+        device: Device,
+        clock: Clock,
+        output: RecordOutput,
+        stop: StopRequest,
     ) -> None:
-        self.setup, self.device, self.clock, self.output = setup, device, clock, output
-        self.stop = stop
+        self._setups = tuple(setups)
+        setup = self.setup = setups[0]
+        self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
         self.stopped_by = self.signal = ""
@@ -266,16 +313,16 @@ class Session:
         resources.callback(self._release_scene)
         if not setup.tool_weight and not scene.is_carried:
             scene.carry_tool("--no-tool-weight")
-        effective = prepare(scene, setup.coupling, setup.scene_period, setup.substeps, setup.method)
+        effective = self._prepare()
         with deferring_stops():
             self._snapshot = None if self.output.observer is None else Snapshot.shared(scene.model)
             if self._snapshot is not None:
                 resources.callback(self._snapshot.close)
             self.stream = self.output.open_stream(
-                setup.period, self._snapshot, may_wait=clock.may_wait
+                setup.period, self._snapshot, may_wait=clock.may_wait, hands=len(self._setups)
             )
             resources.callback(self._close_stream)
-        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample = np.zeros(len(self._setups), SAMPLE_DTYPE)
         self.kernel = TickKernel(sample, self.stream)
         if clock.name == RealClock.name:
             pace = scene, setup.method, setup.scene_period, setup.substeps
@@ -289,18 +336,20 @@ class Session:
         # before the recorder and the scene are waited for, which may stand still
         resources.callback(self.device.close)
         sample[:] = self.device.start(setup.period)
-        refuse_implausible_pose(self.device.info, sample)
-        self.parameters = setup.holding(sample, effective)
+        for each, own in zip(self._setups, self._samples(), strict=True):
+            refuse_implausible_pose(each.info, own)
+        self.hand_parameters = self._parameters(effective)
+        self.parameters = self.hand_parameters[0]
         start = start_state(scene.model, scene.data).tobytes()
-        bound = BoundKernel(scene.model, scene.data, self.parameters)
-        resources.callback(bound.release)
-        if self.parameters.scene_ticks:
-            self.slow = SlowScene(bound, scene.model, scene.data, self.parameters)
-            if not clock.may_wait:
-                self.slow.start()
-        self.kernel.bind(bound, setup, self.slow)
-        if setup.workspace.absolute:
-            refuse_stretched_start(bound.state, sample, setup.limits)
+        if isinstance(self.device, DeviceGroup):
+            hands = BoundHands(scene.model, scene.data, self.hand_parameters)
+            resources.callback(hands.release)
+            self.kernel.bind_hands(hands)
+            self.device.external_flags = hands.states["loop"]["external_flags"]
+        else:
+            self._bind_one(resources)
+        bound = self.kernel.bound
+        self._refuse_stretched_start()
         if self.stream.is_read:
             self.stream.start(self._description(), attachments(scene))
             self.event("start")
@@ -318,16 +367,75 @@ class Session:
         period = CHECK_PERIOD if self._snapshot is None else PICTURE_PERIOD
         self._chore_ticks = max(round(period / setup.period), 1)
 
-    def _description(self) -> dict[str, str]:
-        return describe_run(
-            self.setup.scene,
-            self.parameters,
-            self.kernel.bound,
-            requested=self.setup.coupling,
-            method=self.setup.method.name,
-            device=self.device.info,
-            clock=self.clock.name,
+    def _prepare(self) -> Coupling | None:
+        """Prepares the scene; returns the measured coupling of a weld."""
+        setup, scene = self.setup, self.setup.scene
+        if len(self._setups) == 1:
+            pace = setup.scene_period, setup.substeps
+            return prepare(scene, setup.coupling, *pace, setup.method)
+        self._update_scenes()  # the model may have been replaced since they were resolved
+        couplings = [each.coupling for each in self._setups]
+        prepare_hands(scene, couplings, setup.period, setup.method)
+        return None
+
+    def _update_scenes(self) -> None:
+        scene = self.setup.scene
+        self._setups = tuple(
+            replace(each, scene=scene.of_hand(hand)) for hand, each in enumerate(self._setups)
         )
+
+    def _samples(self) -> list[NDArray[np.void]]:
+        """Returns each hand's sample as a view, shape (1,)."""
+        sample = self.kernel.sample
+        return [sample[hand : hand + 1] for hand in range(sample.size)]
+
+    def _parameters(self, effective: Coupling | None) -> list[RunParameters]:
+        """Returns the parameters of each hand; a tool that is too heavy for one is carried."""
+        if len(self._setups) == 1:
+            return [self.setup.holding(self.kernel.sample, effective)]
+        for _ in range(2):
+            pairs = zip(self._setups, self._samples(), strict=True)
+            found = [each.parameters(own, None) for each, own in pairs]
+            reasons = map(RunSetup.overload, self._setups, found)
+            reason = next(filter(None, reasons), "")
+            if not reason:
+                break
+            self.setup.carry(reason)
+            self._update_scenes()
+        return found
+
+    def _bind_one(self, resources: ExitStack) -> None:
+        """Binds the kernel of one hand, and the loop of a slower scene."""
+        scene, parameters = self.setup.scene, self.parameters
+        bound = BoundKernel(scene.model, scene.data, parameters)
+        resources.callback(bound.release)
+        if parameters.scene_ticks:
+            self.slow = SlowScene(bound, scene.model, scene.data, parameters)
+            if not self.clock.may_wait:
+                self.slow.start()
+        self.kernel.bind(bound, self.setup, self.slow)
+
+    def _refuse_stretched_start(self) -> None:
+        """Refuses an absolute pose of a device that is too far from its grip."""
+        for hand, (each, own) in enumerate(zip(self._setups, self._samples(), strict=True)):
+            if each.workspace.absolute:
+                state = self.kernel.state[hand : hand + 1]
+                refuse_stretched_start(state, own, each.limits)
+
+    def _description(self) -> dict[str, str]:
+        found: list[dict[str, str]] = []
+        for hand, each in enumerate(self._setups):
+            meta = describe_run(
+                each.scene,
+                self.hand_parameters[hand],
+                self.kernel.state[hand : hand + 1],
+                requested=each.coupling,
+                method=each.method.name,
+                device=each.info,
+                clock=self.clock.name,
+            )
+            found.append(meta)
+        return describe_hands(found)
 
     def close(self, error: BaseException | None) -> None:
         """Records the end, commands zero force, and closes recording, scene and device.
@@ -384,7 +492,7 @@ class Session:
         else:
             self.end = -1
         if self.tick:  # the device may have moved meanwhile, under zero force
-            self.kernel.bound.resume()
+            (self.kernel.hands or self.kernel.bound).resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
         # a callback that forbids the split may have been set since the bridge was opened
@@ -408,8 +516,8 @@ class Session:
         """
         setup, waiting, sample = self.setup, self.stop.waiting, self.kernel.sample
         wait_until_still(self.device, sample, setup.period, self.clock, lambda: waiting)
-        if not self.tick and not waiting and setup.workspace.absolute:
-            refuse_stretched_start(self.kernel.bound.state, sample, setup.limits)
+        if not self.tick and not waiting:
+            self._refuse_stretched_start()
         self.clock.start(round(setup.period * 1e9))
         self._slept = slept_ns()
 
@@ -514,12 +622,15 @@ class Session:
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
         )
-        setup = self.setup
-        return Summary.of(
-            self.kernel.bound.state,
-            self.parameters,
-            setup.info,
-            setup.method,
-            setup.coupling,
-            outcome,
+        first, *others = (
+            Summary.of(
+                self.kernel.state[hand : hand + 1],
+                self.hand_parameters[hand],
+                setup.info,
+                setup.method,
+                setup.coupling,
+                outcome,
+            )
+            for hand, setup in enumerate(self._setups)
         )
+        return Summary.of_hands((first, *others)) if others else first

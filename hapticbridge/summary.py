@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -163,6 +163,9 @@ WELD = "the weld in its stiffest directions at the start"
 _NAME_WIDTH = 20
 """Characters of a row's name in the text of a summary, with the space after it."""
 
+_OF_A_HAND = ("peak", "reach", "coupling work", "device energy", "slack")
+"""Rows of the text of a summary that each of several hands has of its own."""
+
 _PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
 
 
@@ -206,6 +209,10 @@ class Summary:
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
+        grip: Name of the grip that the hand holds.
+        device: Name of the device.
+        hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
+            and ``is_certified`` of the whole are then those of all of them.
     """
 
     ticks: int
@@ -233,14 +240,62 @@ class Summary:
     recording: Path | None
     reach: float | None
     has_hand: bool
+    grip: str = ""
+    device: str = ""
+    hands: tuple[Summary, ...] = ()
+
+    @staticmethod
+    def of_hands(hands: tuple[Summary, ...]) -> Summary:
+        """Returns the summary of a run of several hands; the rest is that of the first."""
+        faults = [each.fault for each in hands if each.fault is not None]
+        certified = [each.is_certified for each in hands]
+        return replace(
+            hands[0],
+            hands=hands,
+            fault=min(faults, default=None),
+            slack_share=max(each.slack_share for each in hands),
+            is_certified=False if False in certified else None if None in certified else True,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns all fields by name, with the verdict; ``hands`` only where there are several."""
+        values = asdict(self) | {"verdict": self.verdict}
+        for each in values["hands"]:  # the file is that of all hands
+            del each["hands"], each["recording"]
+        if not self.hands:
+            del values["hands"], values["grip"], values["device"]
+        return values
 
     def __str__(self) -> str:
         """Describes the run: energies, verdict, coupling, device condition and the next command."""
         return "\n".join(self._lines())
 
     def _lines(self) -> Iterator[str]:
+        if self.hands:
+            yield from self._lines_of_hands()
+            return
         for name, text in self._rows():
             yield f"{name:<{_NAME_WIDTH}}{text}"
+        yield from self._verdict_lines()
+        yield from self._coupling_lines()
+        yield from self._device_lines()
+        yield from self._last_lines()
+
+    def _lines_of_hands(self) -> Iterator[str]:
+        """Yields what all hands share, then what each has of its own."""
+        for name, text in self._rows():
+            if name not in _OF_A_HAND:
+                yield f"{name:<{_NAME_WIDTH}}{text}"
+        yield from self._verdict_lines()
+        for each in self.hands:
+            yield f"hand at '{each.grip}' on {each.device}:"
+            for name, text in each._rows():
+                if name in _OF_A_HAND:
+                    yield f"  {name:<{_NAME_WIDTH - 2}}{text}"
+            yield from (f"  {line}" for line in (*each._coupling_lines(), *each._device_lines()))
+        yield from self._last_lines()
+
+    def _verdict_lines(self) -> Iterator[str]:
         tick, port = self.fault or (0, "")
         used = f", {self.slack_share:.0%} of the slack used" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
@@ -248,13 +303,16 @@ class Summary:
         yield f"{judged}{self.verdict} ({port or self.environment}){since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"
+
+    def _coupling_lines(self) -> Iterator[str]:
         sentences = self.coupling.sentences()
         if self.coupling.law is not None:
             yield sentences[0]
         else:
             of = f": {WELD}" if self.coupling.effective else ""
             yield from (f"{sentence}{of}" for sentence in sentences)
-        yield from self._device_lines()
+
+    def _last_lines(self) -> Iterator[str]:
         if hint := self.timekeeping.hint:
             yield hint
         if self.recording is not None:
@@ -327,6 +385,7 @@ class Summary:
             scene_steps=int(state["shown"]["scene_step"][0]),
             scene_silence=parameters.period * int(state["shown"]["longest_silence"][0]),
         )
+        peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
         return cls(
             ticks=outcome.ticks,
@@ -334,7 +393,7 @@ class Summary:
             overruns=outcome.overruns,
             skipped=outcome.skipped,
             dropped=outcome.dropped,
-            **{name: float(state["loop"][name][0]) for name in _PEAKS},
+            **peaks,
             limits_reached=tuple(
                 kind
                 for kind, limit in zip(("force", "torque"), state["level"]["level"][0], strict=True)
@@ -364,4 +423,6 @@ class Summary:
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
+            grip=parameters.grip,
+            device=info.name,
         )

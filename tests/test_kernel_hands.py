@@ -16,7 +16,6 @@ from two_hands import (
     unmoved,
 )
 
-import hapticbridge as hb
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.hands import whole_tick_of_hands
@@ -135,12 +134,6 @@ def test_levels_settled_one_after_the_other_create_energy() -> None:
 def test_what_several_hands_cannot_have_is_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(HapticBridgeError, match=message):
         bound_hands(two_handed(BAR), (COUPLING, COUPLING), PERIOD, IMPLICIT, **change)
-
-
-def test_a_bridge_refuses_a_scene_with_several_grips() -> None:
-    message = "was loaded with 2 grips, and a run has one hand; load it with one of 'left', 'right'"
-    with pytest.raises(SceneError, match=message):
-        hb.Bridge(two_handed(BAR), clock=hb.SimulatedClock())
 
 
 def test_each_hand_has_its_handle_at_its_own_grip() -> None:

@@ -31,6 +31,7 @@ ORDER = (
     ("guard", "summary", "timekeeping", "export", "export_viewers", "dataset", "recorded_scene"),
     ("commands", "check"),
     ("audit", "compare", "options"),
+    ("hands",),
     ("session", "film_process", "report"),
     ("bridge", "view"),
     ("whatif",),  # runs the bridge and the audit, which do not depend on each other

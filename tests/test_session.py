@@ -16,7 +16,7 @@ from hapticbridge.session import RecordOutput, Session, StopRequest
 def test_a_session_runs_without_a_bridge_and_releases_what_it_holds() -> None:
     scene, device, clock = load_scene("point_mass"), ScriptedDevice(sway), SimulatedClock()
     setup = RunSetup.resolve(scene, device.info, None, BridgeOptions(), clock)
-    session = Session(setup, device, clock, RecordOutput(), StopRequest())
+    session = Session((setup,), device, clock, RecordOutput(), StopRequest())
     with pytest.raises(SceneError, match="in use by another bridge"):
         scene.claim()
     session.begin(0.05)
@@ -35,6 +35,6 @@ def test_a_session_that_cannot_open_closes_the_device_and_frees_the_scene() -> N
     device.start = lambda _period: fail()  # type: ignore[method-assign,assignment,return-value]
     setup = RunSetup.resolve(scene, device.info, None, BridgeOptions(), clock)
     with pytest.raises(HapticBridgeError, match="stuck"):
-        Session(setup, device, clock, RecordOutput(), StopRequest())
+        Session((setup,), device, clock, RecordOutput(), StopRequest())
     assert device.is_closed and not device.writes
     scene.claim()

@@ -167,8 +167,13 @@ class EnergyBalance:
     sums: dict[str, float]
 
     @classmethod
-    def of(cls, block: AuditedBlock, events: RunEvents, delay: int) -> EnergyBalance:
-        """Computes the balance of a block; see ``energy_balances``."""
+    def of(
+        cls, block: AuditedBlock, events: RunEvents, delay: int, others_work: Array | float = 0.0
+    ) -> EnergyBalance:
+        """Computes the balance of a block; see ``energy_balances``.
+
+        ``others_work`` is the cumulative work of other hands' couplings on the scene, (n,) in J.
+        """
         ticks, motion, parameters = block.ticks, block.motion, events.parameters
         before, gains = block.state.sums, events.gains(ticks["tick"])
         wrench = ticks["wrench_on_tool"]
@@ -183,6 +188,7 @@ class EnergyBalance:
             coupling_work = _summed(work, before["coupling_work"])
         stored = ticks["kinetic"] + ticks["potential"] - block.state.start_energy
         created = stored - coupling_work - ticks["actuator_work"] - ticks["external_work"]
+        created = created - others_work
         discarded: Array = np.zeros(1)
         if parameters.scene_ticks:
             discarded = _summed(_discarded(block, work), before["discarded"])
@@ -334,7 +340,11 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
 
 
 def energy_balances(
-    blocks: Iterable[NDArray[np.void]], state: AuditState, events: RunEvents, delay: int = 0
+    blocks: Iterable[NDArray[np.void]],
+    state: AuditState,
+    events: RunEvents,
+    delay: int = 0,
+    others: Iterator[Array] | None = None,
 ) -> Iterator[tuple[AuditedBlock, EnergyBalance]]:
     """Yields the energy balance of a run, block by block.
 
@@ -344,6 +354,8 @@ def energy_balances(
         events: External actions during the run.
         delay: Delay in ticks: the wrench of row k acted on the motion between rows k + delay and
             k + delay + 1.
+        others: Cumulative work of other hands' couplings on the scene by block, (n,) in J; None
+            without other hands.
     """
     waiting: deque[NDArray[np.void]] = deque()
     for newest in chain(blocks, [None]):
@@ -353,7 +365,8 @@ def energy_balances(
             ticks = waiting.popleft()
             following = np.concatenate([ticks[:0], *waiting])[:delay]
             block = AuditedBlock.of(ticks, following, state, events)
-            balance = EnergyBalance.of(block, events, delay)
+            others_work = 0.0 if others is None else next(others)
+            balance = EnergyBalance.of(block, events, delay, others_work)
             yield block, balance
             state = block.state_after(balance.sums)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -20,8 +20,9 @@ from hapticbridge.commands import EventApplier
 from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
+from hapticbridge.kernel.hands import simulate_hands
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
@@ -53,14 +54,14 @@ instructions round differently. A larger tolerance would hide tampering, a small
 honest recordings."""
 
 
-def attached_scene(recording: RecordingFile, parameters: RunParameters) -> Scene:
+def attached_scene(recording: RecordingFile, *parameters: RunParameters) -> Scene:
     """Compiles the attached sources, which must give the recorded model in every bit.
 
     Raises:
         ForeignModelError: Another processor compiled another model.
         RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
-    scene = compile_recorded(recording, parameters)
+    scene = compile_recorded(recording, *parameters)
     if is_as_recorded(scene, recording):
         return scene
     found = "the attached sources do not compile to the recorded model (scene_sha256)"
@@ -110,11 +111,18 @@ class Resimulator:
 
     The recording must have no ``obstacle``. Its events are applied when due.
 
+    Args:
+        recording: The recording; of several hands, the first hand's.
+        parameters: Parameters of the run.
+        scene: The attached scene, if it is compiled already.
+        others: Recording and parameters of each further hand.
+
     Attributes:
         scene: The attached scene, at its start.
         model: Its model.
         data: Its state after the last simulated tick.
-        binding: The kernel's state bound to both.
+        binding: The kernel's state bound to both; of several hands, that of the first.
+        hands: The states of all hands if there are several; else None.
         done: Number of simulated ticks.
         is_over: True after a tick that was refused; nothing follows.
 
@@ -123,7 +131,11 @@ class Resimulator:
     """
 
     def __init__(
-        self, recording: RecordingFile, parameters: RunParameters, scene: Scene | None = None
+        self,
+        recording: RecordingFile,
+        parameters: RunParameters,
+        scene: Scene | None = None,
+        others: Sequence[tuple[RecordingFile, RunParameters]] = (),
     ) -> None:
         events = recording.events
         self._changes = deque(event for event in events if event.get("event") in _CHANGES)
@@ -132,7 +144,8 @@ class Resimulator:
         ]
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
-        self.scene = scene or attached_scene(recording, parameters)
+        every = parameters, *(own for _, own in others)
+        self.scene = scene or attached_scene(recording, *every)
         self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
@@ -141,12 +154,16 @@ class Resimulator:
         restore_state(model, data, start)
         method.step(model, data)
         restore_state(model, data, start)
-        self.binding = BoundKernel(model, data, parameters)
+        self.hands = BoundHands(model, data, every) if others else None
+        self.binding = self.hands.hands[0] if self.hands else BoundKernel(model, data, parameters)
         self._slow: SlowScene | None = None
         if parameters.scene_ticks:
             self._slow = SlowScene(self.binding, model, data, parameters)
         self._commands = EventApplier(self.binding, data, method, parameters, start, self._slow)
         check_start(recording, self.binding.state)
+        if self.hands is not None:
+            for hand, (other, _) in enumerate(others, 1):
+                check_start(other, self.hands.states[hand : hand + 1])
 
     @property
     def slack(self) -> float:
@@ -158,21 +175,24 @@ class Resimulator:
 
         Only the external inputs of the records are used.
 
+        Args:
+            ticks: Records, (n,); of several hands, (n, m).
+
         Returns:
             Simulated records; fewer if it ``is_over``.
 
         Raises:
             RecordingError: An event among them is damaged.
         """
-        samples = np.zeros(len(ticks), SAMPLE_DTYPE)
+        samples = np.zeros(ticks.shape, SAMPLE_DTYPE)
         samples["position"], samples["quaternion"] = (
             ticks["device_position"],
             ticks["device_quaternion"],
         )
         samples["buttons"] = ticks["buttons"]
         outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE)
-        elapsed = self._elapsed(ticks)
-        rows = np.zeros(len(ticks), TICK_DTYPE)
+        elapsed = self._elapsed(ticks if self.hands is None else ticks[:, 0])
+        rows = np.zeros(ticks.shape, TICK_DTYPE)
         done = 0
         while done < len(ticks) and not self.is_over:
             end = len(ticks)
@@ -180,7 +200,10 @@ class Resimulator:
                 end = min(self._due(self._changes[0]) - self.done, end)
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
             given = samples[part], outside[part], elapsed[part]
-            if self._slow is not None:
+            if self.hands is not None:
+                own = self.hands.states, *given, self.hands.rows
+                count = simulate_hands(*own, rows[part])
+            elif self._slow is not None:
                 steps = np.ascontiguousarray(ticks["scene_step"][part])
                 count = self._slow.simulate(*given, steps, rows[part])
             else:
@@ -221,7 +244,7 @@ class Resimulator:
     def _apply(self, event: Mapping[str, Any]) -> None:
         self._changed = int(event["tick"])
         if event["event"] == "resume":
-            self.binding.resume()
+            (self.hands or self.binding).resume()
             return
         if event["event"] in COMMANDED:
             self._commands.apply(event)
@@ -286,8 +309,26 @@ class ReplayOutcome:
         return self.tick is not None
 
 
+@dataclass(frozen=True, slots=True)
+class AuditedHand:
+    """Records of a hand and the run that their metadata and events describe."""
+
+    recording: RecordingFile
+    run: AuditedRun
+
+
+def blocks_of_hands(hands: Sequence[AuditedHand]) -> Iterator[NDArray[np.void]]:
+    """Yields the records in blocks, (n,); of several hands, (n, m)."""
+    if len(hands) == 1:
+        yield from hands[0].recording.blocks()
+        return
+    streams = [hand.recording.blocks() for hand in hands]
+    for blocks in zip(*streams, strict=True):
+        yield np.stack(blocks, axis=1)
+
+
 def compare_resimulation(
-    recording: RecordingFile, described: AuditedRun, *, is_trusted: bool = False
+    hands: Sequence[AuditedHand], *, is_trusted: bool = False
 ) -> ReplayOutcome:
     """Simulates the recorded device motion again and compares every number except times.
 
@@ -298,49 +339,54 @@ def compare_resimulation(
         RecordingError: The attachments contradict the metadata, or an event is damaged; the file
             was changed.
     """
-    with comparison(recording, described, is_trusted=is_trusted) as outcome:
+    with comparison(hands, is_trusted=is_trusted) as outcome:
         return outcome()
 
 
 @contextmanager
 def comparison(
-    recording: RecordingFile, described: AuditedRun, *, is_trusted: bool = False
+    hands: Sequence[AuditedHand], *, is_trusted: bool = False
 ) -> Iterator[Callable[[], ReplayOutcome]]:
     """Starts ``compare_resimulation`` beside the work in the context.
 
     Yields:
         Function that waits for the outcome.
     """
+    recording, parameters = hands[0].recording, hands[0].run.parameters
     if reason := obstacle(recording):
         yield lambda: ReplayOutcome(f"{NOT_RUN}: {reason}")
         return
     if is_trusted:
-        yield lambda: _compared(recording, described, Unlimited())
+        yield lambda: _compared(hands, Unlimited())
         return
     with Confined(
-        lambda worker: asdict(_compared(recording, described, worker)),
+        lambda worker: asdict(_compared(hands, worker)),
         f"the scene of '{recording.path}'",
-        **bounds_for(recording, described.parameters),
+        **bounds_for(recording, parameters),
     ) as child:
         yield lambda: ReplayOutcome(**child.result())
 
 
-def _compared(recording: RecordingFile, described: AuditedRun, worker: Worker) -> ReplayOutcome:
+def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
+    recording, parameters = hands[0].recording, hands[0].run.parameters
+    others = [(hand.recording, hand.run.parameters) for hand in hands[1:]]
     try:
-        scene = attached_scene(recording, described.parameters)
+        scene = attached_scene(recording, parameters, *(own for _, own in others))
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
     worker.allow_run()
-    run = Resimulator(recording, described.parameters, scene)
+    run = Resimulator(recording, parameters, scene, others)
     is_exact = is_same_processor(recording)
-    if fault := first_contradiction(
-        scene_statements(run.scene, recording, described, is_exact=is_exact)
-    ):
-        raise RecordingError(fault.reason)
+    for number, hand in enumerate(hands):
+        own = run.scene.of_hand(number)
+        if fault := first_contradiction(
+            scene_statements(own, hand.recording, hand.run, is_exact=is_exact)
+        ):
+            raise RecordingError(fault.reason)
     names = [name for name in recording.record.names or () if name not in CLOCK_FIELDS]
     off, largest = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     first: tuple[int, str, float] | None = None
-    for ticks in recording.blocks():
+    for ticks in blocks_of_hands(hands):
         start = run.done
         again = run.add(ticks)
         for name in names if len(again) else ():

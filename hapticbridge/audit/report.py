@@ -58,6 +58,9 @@ class AuditReport:
         energies: Energies at the end, in J.
         events: Number of events of each kind.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
+        hands: Name of each hand's grip, if several hold the scene; else empty. The environment is
+            judged over all of them, and each device by itself; ``certified`` is False if one lacks
+            damping. Conditions and couplings name their hand, ``energies`` are the first hand's.
     """
 
     path: Path
@@ -85,6 +88,7 @@ class AuditReport:
     energies: dict[str, float] = field(default_factory=dict)
     events: dict[str, int] = field(default_factory=dict)
     accepts_unverified: bool = False
+    hands: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
@@ -94,6 +98,8 @@ class AuditReport:
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
+        if not self.hands:
+            del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
 
     @property

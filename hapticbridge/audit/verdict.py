@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,7 @@ from hapticbridge.audit.agreement import (
 )
 from hapticbridge.audit.energy import EnergyBalance, energy_balances, energy_deviations
 from hapticbridge.audit.events import AuditedRun, AuditState, RunEvents
-from hapticbridge.audit.replay import ReplayOutcome, comparison
+from hapticbridge.audit.replay import AuditedHand, ReplayOutcome, comparison
 from hapticbridge.audit.report import AuditReport, Verdict
 from hapticbridge.audit.structure import (
     TOLERANCE,
@@ -38,7 +38,9 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.record import CLOCK_FIELDS
+from hapticbridge.recording import RecordingFile
+from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
@@ -78,6 +80,8 @@ def _shorten(reason: object) -> str:
     head, mark, rest = text.partition(": ")
     return rest[:200] if mark and head.startswith("tick ") else text[:200]
 
+
+Facts = dict[str, Any]
 
 # Energies over the whole recording
 
@@ -148,6 +152,16 @@ class Decision:
     port: str = ""
     joules: float = 0.0
     slack_share: float = 0.0
+
+
+def decide_on_hands(
+    fault: Fault | None, energies: Sequence[PassivityTally], *, gap: str, strict: bool
+) -> Decision:
+    """Decides over the tallies of all hands, as ``decide`` does; the worst verdict counts."""
+    ranks = ("invalid", "active", "unverified", "passive")
+    found = [decide(fault, each, gap=gap, strict=strict) for each in energies]
+    found = found or [decide(fault, None, gap=gap, strict=strict)]
+    return min(found, key=lambda each: (ranks.index(each.verdict), each.tick or 0))
 
 
 def decide(
@@ -224,7 +238,8 @@ def verdict_on(
         RecordingError: The file is not a recording.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
-    recording = open_recording(path)
+    recordings = open_hands(path)
+    recording = recordings[0]
     signature = check_signature(recording.seal, _unsignable(recording), trusted)
     facts: dict[str, Any] = {
         "path": recording.path,
@@ -237,40 +252,49 @@ def verdict_on(
         "certified": None,
         "accepts_unverified": accepts_unverified,
     }
-    energies, outcome = None, ReplayOutcome("")
+    energies: list[PassivityTally] = []
+    outcome = ReplayOutcome("")
     try:
-        run = AuditedRun.of(recording)
-        facts |= _device_facts(run, recording)
-        sentences = facts["coupling_sentences"]
-        facts["coupling_sentences"] = sentences + run.events.changes_of_coupling(run.method)
+        hands = [AuditedHand(each, AuditedRun.of(each)) for each in recordings]
+        run = hands[0].run
+        of_hands = [_device_facts(hand.run, hand.recording) for hand in hands]
+        for hand, own in zip(hands, of_hands, strict=True):
+            own["coupling_sentences"] += hand.run.events.changes_of_coupling(hand.run.method)
+        facts |= _joined(of_hands, recordings)
         facts["duration"] = recording.count * run.parameters.period
         facts["unchecked"] = _unchecked(run)
-        fault = file_fault(recording)
+        fault = file_fault(recording) or _hands_fault(hands)
         if fault is None:
-            with comparison(recording, run, is_trusted=in_process) as replayed:
-                fault = structure_fault(recording.blocks(), run.events)
+            with comparison(hands, is_trusted=in_process) as replayed:
+                faults = [structure_fault(h.recording.blocks(), h.run.events) for h in hands]
+                fault = next(filter(None, faults), None)
                 if fault is None:
-                    energies = PassivityTally(is_watched=facts["certified"] is not True)
-                    timing = TimingTally(run.parameters)
-                    fault, facts["duration"] = _check_records(recording, run, energies, timing)
-                    facts["energies"] = energies.energies
-                    facts |= _time_facts(run, recording, timing, facts["certified"])
-                    fault = fault or first_contradiction(
-                        chain(
-                            metadata_statements(recording, run),
-                            event_statements(recording, timing),
+                    energies = [
+                        PassivityTally(is_watched=own["certified"] is not True) for own in of_hands
+                    ]
+                    timings = [TimingTally(hand.run.parameters) for hand in hands]
+                    fault, facts["duration"] = _check_records(hands, energies, timings)
+                    facts["energies"] = energies[0].energies
+                    for hand, own, timing in zip(hands, of_hands, timings, strict=True):
+                        own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
+                        fault = fault or first_contradiction(
+                            chain(
+                                metadata_statements(hand.recording, hand.run),
+                                event_statements(hand.recording, timing),
+                            )
                         )
-                    )
+                    facts |= _joined(of_hands, recordings)
                 if fault is None:
                     outcome = replayed()
                     facts["resimulation"] = outcome.agreement
                     fault = _replay_fault(outcome)
         if fault is None:
-            requested_of(recording.meta)
+            for each in recordings:
+                requested_of(each.meta)
     except RecordingError as error:
         fault = Fault(str(error))
     gap = _gap(signature, outcome)
-    found = asdict(decide(fault, energies, gap=gap, strict=strict))
+    found = asdict(decide_on_hands(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
@@ -281,6 +305,57 @@ def verdict_on(
         notes = (found["reason"], doubt, unusual_end(recording.events), facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
+
+
+def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFile]) -> Facts:
+    """Returns the facts on all hands' devices; of one hand, just its own.
+
+    Sentences name their hand. Of margin and kept time those of the worst device count.
+    """
+    if len(of_hands) == 1:
+        return of_hands[0]
+    grips = tuple(each.meta.get("grip", "") for each in recordings)
+    found: Facts = {"hands": grips, "coupling": of_hands[0]["coupling"]}
+    for name in ("conditions", "coupling_sentences"):
+        found[name] = tuple(
+            f"{grip}: {sentence}"
+            for grip, own in zip(grips, of_hands, strict=True)
+            for sentence in own[name]
+        )
+    certified = [own["certified"] for own in of_hands]
+    found["certified"] = False if False in certified else None if None in certified else True
+    margins = [own["damping_margin"] for own in of_hands if own["damping_margin"] is not None]
+    found["damping_margin"] = min(margins, default=None)
+    worst = certified.index(found["certified"])
+    if "timekeeping" in of_hands[worst]:
+        found["timekeeping"] = of_hands[worst]["timekeeping"]
+    return found
+
+
+_SHARED = ("tick", *CLOCK_FIELDS, "kinetic", "potential", "actuator_work", "external_work")
+"""Fields that the records of all hands have in common."""
+
+_SHARED_META = ("period_s", "substeps", "scene_ticks", "method", "contact", "scene_sha256", "clock")
+"""Metadata that all hands have in common."""
+
+
+def _hands_fault(hands: Sequence[AuditedHand]) -> Fault | None:
+    """Returns the first contradiction between the records of several hands, or None."""
+    first = hands[0].recording
+    for hand in hands[1:]:
+        for name in _SHARED_META:
+            if hand.recording.meta.get(name) != first.meta.get(name):
+                return Fault(f"metadata '{name}' differ between the hands", port=name)
+        blocks = zip(first.blocks(), hand.recording.blocks(), strict=True)
+        start = 0
+        for ours, theirs in blocks:
+            for name in _SHARED:
+                row = first_row(ours[name] != theirs[name])
+                if row is not None:
+                    reason = f"{name} of tick {start + row} differs between the hands"
+                    return Fault(reason, start + row, name)
+            start += len(ours)
+    return None
 
 
 def _unsignable(recording: RecordingFile) -> str:
@@ -297,22 +372,51 @@ def _gap(signature: SignatureCheck, outcome: ReplayOutcome) -> str:
 
 
 def _check_records(
-    recording: RecordingFile, run: AuditedRun, energies: PassivityTally, timing: TimingTally
+    hands: Sequence[AuditedHand],
+    energies: Sequence[PassivityTally],
+    timings: Sequence[TimingTally],
 ) -> tuple[Fault | None, float]:
-    """Compares all records with their second computation; collects energies and times.
+    """Compares all records with their second computation; collects energies and times per hand.
+
+    All hands share the scene's slack. What each did to the scene is its recorded ``coupling_work``,
+    which the second computation of its own records confirms.
 
     Returns:
         The earliest fault or None, and the due time of the last record in s.
     """
     fault, duration = None, 0.0
-    start = AuditState.at_start(recording, run.parameters)
-    delay = min(run.delay, recording.count)
-    for block, balance in energy_balances(recording.blocks(), start, run.events, delay):
-        energies.add(block.ticks, balance)
-        timing.add(block, run.events)
-        duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
-        fault = fault or _block_fault(block, balance, run.events)
+    streams = [
+        energy_balances(
+            hand.recording.blocks(),
+            AuditState.at_start(hand.recording, hand.run.parameters),
+            hand.run.events,
+            min(hand.run.delay, hand.recording.count),
+            _work_of([other.recording for other in hands if other is not hand]),
+        )
+        for hand in hands
+    ]
+    for parts in zip(*streams, strict=True):
+        slack = np.sum([balance.slack for _, balance in parts], axis=0)
+        throughput = np.sum([balance.throughput for _, balance in parts], axis=0)
+        faults = []
+        for hand, (block, own) in enumerate(parts):
+            run = hands[hand].run
+            balance = replace(own, slack=slack, throughput=throughput)
+            energies[hand].add(block.ticks, balance)
+            timings[hand].add(block, run.events)
+            duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
+            faults.append(_block_fault(block, balance, run.events))
+        found = [each for each in faults if each is not None]
+        fault = fault or min(found, key=lambda each: each.tick or 0, default=None)
     return fault, duration
+
+
+def _work_of(recordings: Sequence[RecordingFile]) -> Iterator[NDArray[np.float64]] | None:
+    """Returns the recorded work of some hands' couplings by block; None without hands."""
+    if not recordings:
+        return None
+    blocks = zip(*(recording.blocks() for recording in recordings), strict=True)
+    return (np.sum([ticks["coupling_work"] for ticks in each], axis=0) for each in blocks)
 
 
 def _block_fault(block: AuditedBlock, balance: EnergyBalance, events: RunEvents) -> Fault | None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -35,6 +35,7 @@ from hapticbridge.guard import (
     Limits,
     refuse_simulated_time,
 )
+from hapticbridge.hands import Grasp, check_grasps
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import (
     AUTO,
@@ -63,8 +64,9 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     """
     coupling, method, substeps = setup.coupling, setup.method, setup.substeps
     scene, device = escape(setup.scene.name), escape(setup.info.name)
+    at = f" at '{escape(setup.scene.grip)}'" if setup.scene.other_grips else ""
     err.print(
-        f"[bold]{scene}[/bold] on {device}, {1 / setup.period:g} Hz, method {method.name}, "
+        f"[bold]{scene}[/bold]{at} on {device}, {1 / setup.period:g} Hz, method {method.name}, "
         f"{method.contact} contacts"
     )
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
@@ -158,8 +160,9 @@ def announce_measured(bridge: Bridge) -> None:
     setup, parameters = bridge.setup, bridge.session.parameters
     for change in setup.scene.changes:
         err.print(f"  changed in the scene: {escape(change)}")
-    for sentence in _weight_in_hand(setup, parameters):
-        err.print(f"  {sentence}")
+    for each, own in zip(bridge.setups, bridge.session.hand_parameters, strict=True):
+        for sentence in _weight_in_hand(each, own):
+            err.print(f"  {sentence}")
     if setup.method.has_law:
         return
     if parameters.effective is not None:
@@ -263,6 +266,12 @@ class Run:
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), 'mouse' (drag the handle in the view, which it shows by itself), or a device
     from the list of 'hapticbridge devices'."""
+    hand: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="GRIP=DEVICE")
+    ] = ()
+    """Hold a grip with a device, in place of --grip and --device, once per hand: --hand
+    wrench=falcon --hand bolt=spacemouse. Both are named as for those two. Scale, axes, limits and
+    gains apply to every hand. The method is 'implicit' or 'compensated'."""
     duration: float | None = None
     """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
     default the run ends with the device's motion; without an end of it with Ctrl-C, or after 5 s of
@@ -375,6 +384,8 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
+        if self.hand:
+            return self._run_hands(clock)
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         is_viewed = self.view or self.device.partition(":")[0] == "mouse"
         if self.port is not None and not is_viewed:
@@ -396,6 +407,40 @@ class Run:
             device = device_for(scene, self.device, notify)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
             return chosen._feel(scene, device, clock, stack, window, interrupts)
+
+    def _run_hands(self, clock: Clock) -> int:
+        """Runs several hands, each with its grip and device; returns the exit code."""
+        if self.grip != "grip" or self.device != "simulated":
+            raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
+        pairs = [each.partition("=")[::2] for each in self.hand]
+        for each, (grip, device) in zip(self.hand, pairs, strict=True):
+            if not grip or not device:
+                raise HapticBridgeError(f"--hand is {each!r}; it must be GRIP=DEVICE")
+            refuse_simulated_time(device, clock)
+        if self.view or self.port is not None or "mouse" in (device for _, device in pairs):
+            raise HapticBridgeError(
+                "the view shows one hand: --view, --port and the mouse exclude --hand"
+            )
+        with ExitStack() as stack:
+            interrupts = stack.enter_context(interrupting_on_signals())
+            with err.status("reading and trying the scene …"), compiling(self.scene):
+                grasps = [Grasp(grip) for grip, _ in pairs]
+                check_grasps(grasps)
+                source = read_scene(self.scene, **settings_from(self.settings))
+                grips = tuple(grip for grip, _ in pairs)
+                scene = compile_scene(source, grips, as_is=self.as_is)
+            grasps = []
+            for hand, (grip, name) in enumerate(pairs):
+                opened = device_for(scene.of_hand(hand), name, notify)
+                stack.callback(opened.close)
+                limits = self._options(opened.info).limits
+                grasps.append(Grasp(grip, opened, coupling=self._gains(), limits=limits))
+            return self._feel(scene, grasps, clock, stack, None, interrupts)
+
+    def _gains(self) -> dict[str, float]:
+        """Returns the gains of the coupling that the user named."""
+        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
+        return {name: value for name, value in gains.items() if value is not None}
 
     def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
@@ -427,16 +472,18 @@ class Run:
     def _feel(
         self,
         scene: Scene,
-        device: Device,
+        device: Device | Sequence[Grasp],
         clock: Clock,
         stack: ExitStack,
         window: Window | None,
         interrupts: Interrupts,
     ) -> int:
-        """Runs the bridge on a device that is open; returns the exit code."""
-        options = self._options(device.info)
-        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
-        coupling = {name: value for name, value in gains.items() if value is not None}
+        """Runs the bridge on a device that is open, or one per hand; returns the exit code."""
+        coupling: dict[str, float] | None = None
+        if isinstance(device, Sequence):
+            options = replace(self._options(None), live=False)
+        else:
+            options, coupling = self._options(device.info), self._gains()
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
         )
@@ -445,7 +492,8 @@ class Run:
             if isinstance(device, MouseDevice):
                 window.on_hand = device.aim
         if not self.as_json:
-            announce(bridge.setup, is_method_chosen=self.method is not None)
+            for setup in bridge.setups:
+                announce(setup, is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about a minute) …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
@@ -453,13 +501,12 @@ class Run:
             notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
-        summary = bridge.run(self._duration(device.info))
+        summary = bridge.run(self._duration(bridge.device.info))
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
         if self.as_json:
-            values = asdict(summary) | {"verdict": summary.verdict}
-            print_json(values | {"recording": str(self.record or "") or None})
+            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
         else:
             for line in str(summary).splitlines():
                 out.print(plain(line))
@@ -476,7 +523,8 @@ class Run:
         )
         return DEFAULT_SECONDS
 
-    def _options(self, info: DeviceInfo) -> BridgeOptions:
+    def _options(self, info: DeviceInfo | None) -> BridgeOptions:
+        """Returns the options of a run on a device; None for several, each with its own limits."""
         return BridgeOptions(
             rate=self.rate,
             substeps=1 if self.substeps is None else self.substeps,
@@ -491,7 +539,9 @@ class Run:
                 axes=SAME_FRAME.axes if self.axes is None else self.axes,
                 absolute=self.absolute,
             ),
-            limits=Limits(
+            limits=None
+            if info is None
+            else Limits(
                 force=info.force_limit if self.force_limit is None else self.force_limit,
                 torque=info.torque_limit if self.torque_limit is None else self.torque_limit,
                 ramp=self.ramp,

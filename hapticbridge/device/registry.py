@@ -233,7 +233,8 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
 def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Device:
     """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
-    The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present.
+    The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present;
+    one of several hands follows ``NAME_GRIP.csv``.
     Every option in the specification takes precedence over the scene.
 
     Raises:
@@ -247,7 +248,8 @@ def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Devi
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
-    path = scene.path.with_suffix(".csv")
+    own = f"{scene.name}_{scene.grip}" if scene.other_grips else scene.name
+    path = scene.path.with_name(f"{own}.csv")
     if path.is_file():
         options["path"] = path
     return open_device(spec, notify=notify, **options)

@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import BAD_RESULT, OK
+from hapticbridge.jit import compiled, compiled_for_threads
+from hapticbridge.kernel.codes import BAD_RESULT, OK, RING_FULL
 from hapticbridge.kernel.force_level import (
     keep_state,
     settle_levels,
@@ -38,16 +38,21 @@ from hapticbridge.kernel.ledger import (
     meter_ports,
     refresh_energies,
 )
+from hapticbridge.kernel.mujoco_c import release_fence
 from hapticbridge.kernel.rigid_contact import fill_tank, finish_contacts, follow_speed
 from hapticbridge.kernel.tick import (
+    HEAD,
+    TAIL,
     active_contacts,
     advance,
     end_tick,
     keep_wrench,
     refuse_tick,
     send_wrench,
+    set_external_flags,
     take_sample,
 )
+from hapticbridge.kernel.timing import note_delay
 
 
 @compiled
@@ -128,7 +133,64 @@ def close_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
     fill_tank(states[0])
     for i in range(states.size):
         end_tick(states[i], rows[i : i + 1])
+        rows[i].contact_tank = rows[0].contact_tank
     return OK
+
+
+@compiled
+def publish_hands(
+    rows: NDArray[np.void],
+    ring: NDArray[np.void],
+    cursors: NDArray[np.int64],
+    deadline_ns: int,
+    wake_ns: int,
+    read_ns: int,
+    write_ns: int,
+    flags: int,
+) -> bool:
+    """Completes the records of all hands and hands them to the ring at once, in order.
+
+    Returns:
+        As ``tick.publish``.
+    """
+    head = cursors[HEAD]
+    if head - cursors[TAIL] > ring.size - rows.size:
+        return False
+    for i in range(rows.size):
+        r = rows[i]
+        r.deadline_ns, r.wake_ns, r.read_ns, r.write_ns = deadline_ns, wake_ns, read_ns, write_ns
+        r.flags |= flags
+        ring[(head + i) % ring.size] = r
+    release_fence()
+    cursors[HEAD] = head + rows.size
+    return True
+
+
+@compiled
+def finish_hands(
+    states: NDArray[np.void],
+    rows: NDArray[np.void],
+    ring: NDArray[np.void],
+    cursors: NDArray[np.int64],
+    deadline_ns: int,
+    wake_ns: int,
+    read_ns: int,
+    write_ns: int,
+    flags: int,
+) -> int:
+    """Runs ``close_hands`` and ``publish_hands`` in one call.
+
+    Returns:
+        The result of ``close_hands``, or ``RING_FULL``; with the latter, repeat ``publish_hands``.
+    """
+    code = close_hands(states, rows)
+    if code != OK:
+        return code
+    for i in range(states.size):
+        note_delay(states[i], deadline_ns, read_ns, write_ns)
+        rows[i].flags |= states[i].loop.external_flags
+    taken = publish_hands(rows, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
+    return OK if taken else RING_FULL
 
 
 @compiled
@@ -144,3 +206,35 @@ def whole_tick_of_hands(
         return False
     advance(states[0:1])
     return answer_hands(states, rows) == OK and close_hands(states, rows) == OK
+
+
+@compiled_for_threads
+def simulate_hands(
+    states: NDArray[np.void],
+    samples: NDArray[np.void],
+    external_flags: NDArray[np.int64],
+    elapsed: NDArray[np.float64],
+    own: NDArray[np.void],
+    rows: NDArray[np.void],
+) -> int:
+    """Runs the ticks of a recorded run of several hands, as ``tick.simulate_recorded`` for one.
+
+    Args:
+        states: The bound states.
+        samples: Device samples by tick and hand, (n, m).
+        external_flags: ``STALE_SAMPLE`` as recorded, (n, m).
+        elapsed: Time between two samples in s, one per tick.
+        own: The bound records.
+        rows: Receives the records, (n, m).
+
+    Returns:
+        Count of completed ticks.
+    """
+    for k in range(samples.shape[0]):
+        for i in range(states.size):
+            set_external_flags(states[i].loop, external_flags[k, i])
+        if not whole_tick_of_hands(states, samples[k], own, elapsed[k]):
+            return k
+        for i in range(states.size):
+            rows[k, i] = own[i]
+    return int(samples.shape[0])

@@ -462,6 +462,16 @@ class BoundHands:
         """MuJoCo's part of a tick through the Python bindings (``BoundKernel.step``)."""
         return self.hands[0].step
 
+    def resume(self) -> None:
+        """Starts every hand's ramp at the next tick (``BoundKernel.resume``)."""
+        for hand in self.hands:
+            hand.resume()
+
+    def release(self) -> None:
+        """Puts back what a step that was broken off left in the model, at the end of a run."""
+        for hand in self.hands:
+            hand.release()
+
 
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters, hand: int) -> tuple[float, ...]:
     """Returns the whole gains of a hand's actuators, for forces and then for torques."""

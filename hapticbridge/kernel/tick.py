@@ -564,6 +564,12 @@ def end_tick(s: State, row: NDArray[np.void]) -> None:
 
 
 @compiled
+def set_external_flags(loop: Part, flags: int) -> None:
+    """Sets ``STALE_SAMPLE`` of the next tick, as recorded."""
+    loop.external_flags = flags
+
+
+@compiled
 def refuse_tick(s: State) -> int:
     """Sets the wrench on the device to zero and flags a trip; returns ``BAD_RESULT``."""
     s.loop.flags = TRIP

@@ -7,6 +7,8 @@ still has them.
 - Topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
 and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding. Files of
 earlier versions may lack ``LATER_FIELDS``.
+- Topics ``/tick_2``, ``/tick_3`` … with equal schema: the records of further hands, if several hold
+the scene. The metadata ``hands`` hold what differs from the first hand's (``further_hands``).
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
 ``time_ns`` (since the start of the run).
 - Topics with types of ROS 2 for other programs, which follow from the above (``ros_messages``).
@@ -25,6 +27,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hapticbridge.errors import RecordingError
+from hapticbridge.files import read_json
 from hapticbridge.record import LATER_FIELDS, TICK_DTYPE, columns_of
 
 TICK_TOPIC = "/tick"
@@ -49,6 +53,39 @@ def epoch_of(meta: Mapping[str, str]) -> int:
     """Returns the Unix time of a run's start in ns; 0 if the metadata lack or spoil it."""
     text = meta.get(EPOCH_KEY, "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
+
+
+HANDS_KEY = "hands"
+
+MAX_HANDS = 8
+"""Largest number of hands in one scene. A larger one would let a foreign file name any number of
+topics."""
+
+
+def further_hands(meta: Mapping[str, str]) -> list[dict[str, str]]:
+    """Returns the metadata of each hand beyond the first that differ from the first one's.
+
+    Raises:
+        RecordingError: They are not a list of texts by name, or of too many hands.
+    """
+    try:
+        found = read_json(meta.get(HANDS_KEY, "[]"))
+    except ValueError:
+        found = None
+    is_list = isinstance(found, list) and len(found) < MAX_HANDS
+    if not is_list or not all(
+        isinstance(each, dict) and all(isinstance(value, str) for value in each.values())
+        for each in found
+    ):
+        raise RecordingError(
+            f"metadata '{HANDS_KEY}' are not texts by name for at most {MAX_HANDS} hands"
+        )
+    return list(found)
+
+
+def tick_topic(hand: int) -> str:
+    """Returns the topic with the records of a hand, from 0."""
+    return TICK_TOPIC if hand == 0 else f"{TICK_TOPIC}_{hand + 1}"
 
 
 CHUNK_SIZE = 128 * 1024

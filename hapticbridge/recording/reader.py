@@ -41,13 +41,18 @@ _MESSAGE_HEAD = _HEAD_DTYPE.itemsize
 _CDR = int.from_bytes(layout.CDR_HEADER, "little")
 
 
+Take = Callable[[NDArray[np.void], int], None]
+
+_HANDS = {layout.tick_topic(hand): hand for hand in range(layout.MAX_HANDS)}
+
+
 @dataclass
 class Contents:
     """Contents collected from a container's blocks.
 
     Attributes:
         problems: Damage, one sentence each; appended to.
-        take: Called with each run of records, in order.
+        take: Called with each run of records of a hand, in order, and the hand's number.
         record: Fields of a record; fewer than ``TICK_DTYPE`` in a file of an earlier version.
         events: Payload and JSON object of each event.
         attachments: Attachments in order.
@@ -59,7 +64,7 @@ class Contents:
     """
 
     problems: list[str]
-    take: Callable[[NDArray[np.void]], None]
+    take: Take
     record: np.dtype[np.void] = TICK_DTYPE
     events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
@@ -73,6 +78,7 @@ class Contents:
     _messages: ros_messages.Messages | None = None
     _schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     _topics: dict[int, str] = field(default_factory=dict)
+    _hands: dict[int, int] = field(default_factory=dict)
     _names: set[str] = field(default_factory=set)
 
     @property
@@ -125,7 +131,7 @@ class Contents:
                 if opcode == Opcode.MESSAGE:
                     channel = int.from_bytes(data[body : body + 2], "little")
                     topic = topics.get(channel, "")
-                    if topic == layout.TICK_TOPIC:
+                    if channel in self._hands:
                         stop = self._add_ticks(data, position, channel)
                     elif topic and self.keeps_events:
                         payload = data[position + _MESSAGE_HEAD : stop]
@@ -164,7 +170,7 @@ class Contents:
             if found != (*own, layout.without_comments(own_text)):
                 raise DamageError(f"its topic {topic} has another schema than '{own_name}'")
             self._topics[channel], self.has_messages = topic, True
-        if topic == layout.TICK_TOPIC and channel not in self._topics:
+        if topic in _HANDS and channel not in self._topics:
             name, schema_encoding, text = self._schemas.get(schema_id, ("", "", b""))
             if (name, schema_encoding) != (layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING):
                 self.refusal = (
@@ -172,18 +178,19 @@ class Contents:
                 )
                 return
             record = layout.record_dtype(text)
-            is_other = self.has_ticks and record != self.record
+            is_other = bool(self._hands) and record != self.record
             if record is None or is_other or encoding != layout.TICK_ENCODING:
                 self.refusal = (
                     f"its schema {name} has other fields than this version of hapticbridge reads"
                 )
                 return
             self.record, self._topics[channel] = record, topic
+            self._hands[channel] = _HANDS[topic]
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
         """Adds the run of records that starts here; returns its end."""
         message = _message_dtype(self.record)
-        size, count = message.itemsize, 16
+        size, count, hand = message.itemsize, 16, self._hands[channel]
         start = position
         while True:
             count = min(count, (len(data) - position) // size)
@@ -195,15 +202,15 @@ class Contents:
                 & (rows["payload"]["cdr"].view("<u4") == _CDR)
             )
             run = count if matches.all() else int(matches.argmin())
-            self.take(rows["payload"]["record"][:run])
-            if messages := self._expected():
+            self.take(rows["payload"]["record"][:run], hand)
+            if hand == 0 and (messages := self._expected()):
                 self._derived.add_all(messages.of_ticks(rows["payload"]["record"][:run]))
             position += run * size
             if run < count or count == 0:
                 break
             count *= 2  # small windows first: events may sit between every few records
         if position == start:
-            raise DamageError(f"a message on {layout.TICK_TOPIC} is not one record")
+            raise DamageError(f"a message on {layout.tick_topic(hand)} is not one record")
         return position
 
     def _add_event(self, payload: bytes) -> None:
@@ -280,6 +287,8 @@ class RecordingFile:
         seal: Entries of the seal (``recording.seal``) at the end of the file; empty without one.
         computed_seal: Digest, chain and index hash of what was read.
         problems: Damage, one sentence each; empty for an undamaged file, even a cut one.
+        hand: Number of the hand, from 0, whose records and metadata these are.
+        hands: Number of hands that held the scene.
         kept: All records if there are at most ``MAX_KEPT``, so that they are read once; else None.
     """
 
@@ -295,6 +304,8 @@ class RecordingFile:
     seal: Mapping[str, str] = field(default_factory=dict)
     computed_seal: Mapping[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
+    hand: int = 0
+    hands: int = 1
     kept: NDArray[np.void] | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -344,10 +355,12 @@ class RecordingFile:
         runs: list[NDArray[np.void]] = []
         found = held = 0
 
-        def take(run: NDArray[np.void]) -> None:
+        def take(run: NDArray[np.void], hand: int) -> None:
             nonlocal held
-            runs.append(run)
-            held += run.size  # a sum over all runs in every part would be quadratic
+            # a cut file may hold more records of one hand than of another
+            if hand == self.hand and found + held < self.count:
+                runs.append(run[: self.count - found - held])
+                held += runs[-1].size  # a sum over all runs in every part would be quadratic
 
         for _ in _read_parts(self.path, take, keeps_events=False):
             while held >= size:
@@ -388,63 +401,87 @@ class Recording(RecordingFile):
         return frame
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(path: str | Path, hand: int | None = None) -> Recording:
     """Reads a recording into memory.
 
     A cut file is read up to its last whole chunk. Damage is listed in ``problems``; readable parts
     around it are kept. Messages of a chunk are read as one structured view, so ten minutes at 1 kHz
     (600 000 records) take about a second.
 
+    Args:
+        path: The recording.
+        hand: Number of a hand, from 0, whose records are read; None for a run of one hand.
+
     Raises:
-        RecordingError: The file does not exist, cannot be read, or is not a recording of this
-            or an earlier version.
+        RecordingError: The file does not exist, cannot be read, is not a recording of this or an
+            earlier version, or is of several hands and none is named.
     """
-    return read_with_attachments(Path(path))[0]
+    return read_with_attachments(Path(path), hand)[0]
 
 
-def open_recording(path: str | Path) -> RecordingFile:
+def open_recording(path: str | Path, hand: int | None = None) -> RecordingFile:
     """Opens a recording; its ticks are loaded only if there are few (``MAX_KEPT``).
 
     The file is read once for its digest, events and damage. Memory has a limit for any length of
     the run, except for events. Events are kept in memory; a run with
     an input in every tick has one per tick.
 
+    Args:
+        path: The recording.
+        hand: As for ``read_recording``.
+
     Raises:
         RecordingError: As for ``read_recording``.
     """
     runs: list[NDArray[np.void]] = []
-    facts, _ = _read_through(Path(path), runs, max_kept=MAX_KEPT)
-    if facts["count"] > MAX_KEPT:
+    facts, _ = _read_through(Path(path), runs, hand, max_kept=MAX_KEPT)
+    if facts["count"] > sum(run.size for run in runs):
         return RecordingFile(**facts)
-    kept = _join(runs, facts["record"])
+    kept = _join(runs, facts["record"])[: facts["count"]]
     kept.flags.writeable = False
     return RecordingFile(**facts, kept=kept)
 
 
-def read_with_attachments(path: Path) -> tuple[Recording, list[Attachment]]:
+def open_hands(path: str | Path) -> tuple[RecordingFile, ...]:
+    """Opens a recording once per hand, as ``open_recording`` does; one file for a run of one hand.
+
+    Raises:
+        RecordingError: As for ``read_recording``.
+    """
+    first = open_recording(path, 0)
+    return first, *(open_recording(path, hand) for hand in range(1, first.hands))
+
+
+def read_with_attachments(
+    path: Path, hand: int | None = None
+) -> tuple[Recording, list[Attachment]]:
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
-    facts, attachments = _read_through(path, runs)
-    return Recording(**facts, ticks=_join(runs, facts["record"])), attachments
+    facts, attachments = _read_through(path, runs, hand)
+    ticks = _join(runs, facts["record"])[: facts["count"]]
+    return Recording(**facts, ticks=ticks), attachments
 
 
 def _read_through(
-    path: Path, runs: list[NDArray[np.void]], *, max_kept: float = math.inf
+    path: Path, runs: list[NDArray[np.void]], hand: int | None, *, max_kept: float = math.inf
 ) -> tuple[dict[str, Any], list[Attachment]]:
     """Reads a file; returns the fields of ``RecordingFile``, and the attachments.
 
-    ``runs`` receives the records unless there are more than ``max_kept``.
+    ``runs`` receives the records of the hand unless there are more than ``max_kept``.
     """
     digest = Digest()
-    count, last, flags = 0, -1, 0
+    counts, last, flags = [0] * layout.MAX_HANDS, [-1] * layout.MAX_HANDS, 0
+    chosen = hand or 0
 
-    def take(run: NDArray[np.void]) -> None:
-        nonlocal count, last, flags
-        digest.add_ticks(run)
-        count += run.size
-        last = int(run["tick"][-1]) if run.size else last
+    def take(run: NDArray[np.void], hand: int) -> None:
+        nonlocal flags
+        digest.add_ticks(run, hand)
+        counts[hand] += run.size
+        last[hand] = int(run["tick"][-1]) if run.size else last[hand]
+        if hand != chosen:
+            return
         flags |= int(np.bitwise_or.reduce(run["flags"]))
-        if count <= max_kept:
+        if counts[hand] <= max_kept:
             runs.append(run)
         else:
             runs.clear()
@@ -458,6 +495,9 @@ def _read_through(
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")
     meta = contents.meta or {}
+    hands = _hands_in(path, meta, hand, contents.problems)
+    if any(counts[hands:]) or (not container.is_cut and len(set(counts[:hands])) > 1):
+        contents.problems.append("its hands have different numbers of records")
     is_whole = not container.is_cut and not contents.problems
     if is_whole and (fault := contents.message_fault()):
         contents.problems.append(fault)
@@ -467,11 +507,13 @@ def _read_through(
     facts = {
         "path": path,
         "record": contents.record,
-        "count": count,
-        "last_tick": last,
+        "count": min(counts[:hands]),
+        "last_tick": min(last[:hands]),
         "flags": flags,
         "events": [event for _, event in contents.events],
-        "meta": meta,
+        "meta": meta | layout.further_hands(meta)[chosen - 1] if chosen else meta,
+        "hand": chosen,
+        "hands": hands,
         "attachments": {item.name: item.data for item in contents.attachments},
         "is_cut": container.is_cut,
         "seal": contents.seal or {},
@@ -481,8 +523,31 @@ def _read_through(
     return facts, contents.attachments
 
 
+def _hands_in(path: Path, meta: Mapping[str, str], hand: int | None, problems: list[str]) -> int:
+    """Returns the number of hands in a file; damaged metadata count as one hand.
+
+    Raises:
+        RecordingError: There are several and none is named, or no such hand.
+    """
+    try:
+        others = layout.further_hands(meta)
+    except RecordingError as error:
+        problems.append(str(error))
+        others = []
+    count = 1 + len(others)
+    if hand is None and others:
+        grips = choices([str(each.get("grip")) for each in (meta, *others)])
+        raise RecordingError(
+            f"{path} is a run of {count} hands ({grips}), which 'hapticbridge audit' alone takes "
+            "together; in Python, read_recording(path, hand=0) reads one of them"
+        )
+    if hand is not None and not 0 <= hand < count:
+        raise RecordingError(f"{path} has no hand {hand}; its hands are 0 to {count - 1}")
+    return count
+
+
 def _read_parts(
-    path: Path, take: Callable[[NDArray[np.void]], None], *, keeps_events: bool = True
+    path: Path, take: Take, *, keeps_events: bool = True
 ) -> Iterator[tuple[Container, Contents]]:
     """Reads a file; yields its container and contents after every part."""
     with FileBytes(path) as data:

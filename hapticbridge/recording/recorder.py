@@ -444,6 +444,8 @@ class RecordStream:
             records.
         observer: Optional second reader of the ring, such as the live view. The loop never waits
             for it.
+        snapshot: Name of the shared memory with the scene's positions, for the observer.
+        hands: Number of hands; the ring has a record per hand of each tick, in order.
 
     Attributes:
         rows: The ring's records, ``TICK_DTYPE``.
@@ -465,10 +467,12 @@ class RecordStream:
         may_wait: bool,
         observer: RingObserver | None = None,
         snapshot: str = "",
+        hands: int = 1,
     ) -> None:
         self._path, self._is_live, self._may_wait = path, live, may_wait
         self._is_read = path is not None or live
-        capacity = min(round(RING_SECONDS / period), MAX_RECORDS)
+        self._hands = hands
+        capacity = min(hands * round(RING_SECONDS / period), MAX_RECORDS) // hands * hands
         self._observer, self._snapshot = observer, snapshot
         is_shared = self._is_read or observer is not None
         self._ring = Ring.shared(capacity) if is_shared else Ring.local(capacity)
@@ -559,8 +563,8 @@ class RecordStream:
             raise RecordingError(_ENDED)
 
     def latest(self, count: int) -> NDArray[np.void]:
-        """Returns copies of the newest records, oldest first."""
-        return self._ring.latest(count)
+        """Returns copies of the newest ``count`` ticks, oldest first, with a record per hand."""
+        return self._ring.latest(self._hands * count)
 
     def close(self, signer: Signer | None = None, *, is_discarded: bool = False) -> None:
         """Waits until the recorder has finished the file, and removes the shared memory.

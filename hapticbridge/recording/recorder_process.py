@@ -30,7 +30,7 @@ from rich.text import Text
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import remove_file
 from hapticbridge.record import TickFlag
-from hapticbridge.recording.format import Attachment
+from hapticbridge.recording.format import Attachment, further_hands
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import RecordingWriter
@@ -182,6 +182,8 @@ class _Session:
             # imported here, so that a run without a live line starts without it
 
             self._live = LiveLine(sys.stderr, is_held=_is_held(configuration["metadata"]))
+        self._hands = 1 + len(further_hands(configuration["metadata"]))
+        self._batch = BATCH // self._hands * self._hands
         self._last_time = 0
         self._last_tick = -1
         self._has_reported_full = False
@@ -198,7 +200,7 @@ class _Session:
             if end is None and os.getppid() != self._parent:
                 time.sleep(0.1)  # lets the rest of the pipe arrive
                 end = self._handle(inbox) or "died"
-            if end is None and count < BATCH:
+            if end is None and count < self._batch:
                 time.sleep(POLL)
         while self._drain_once():
             pass
@@ -213,12 +215,13 @@ class _Session:
             self._live.close()
 
     def _drain_once(self) -> int:
-        rows = self.ring.take(BATCH)
+        rows = self.ring.take(self._batch)  # the producer adds one record per hand at once
         if rows.size:
             self._last_time = int(rows["deadline_ns"][-1])
             self._last_tick = int(rows["tick"][-1])
             if self._writer is not None:
-                self._writer.write_ticks(rows)
+                for hand in range(self._hands):
+                    self._writer.write_ticks(rows[hand :: self._hands], hand)
         if self._live is not None:
             self._live.update(rows)
         return int(rows.size)

@@ -45,6 +45,8 @@ class Digest:
     3. ticks: all records in order, packed, without CDR headers or separators;
     4. events: each JSON payload in order.
 
+    Each further hand adds the SHA-256 of its records as in 3.
+
     In 1, 2 and 4 every piece (text as UTF-8) follows its length as 8 bytes, little-endian.
     Different contents therefore never give equal bytes.
     """
@@ -52,7 +54,7 @@ class Digest:
     def __init__(
         self, metadata: Mapping[str, str] | None = None, attachments: Iterable[Attachment] = ()
     ) -> None:
-        self._ticks = hashlib.sha256()
+        self._ticks = [hashlib.sha256()]
         self._events = hashlib.sha256()
         self.describe(metadata or {}, attachments)
 
@@ -68,9 +70,11 @@ class Digest:
             _add(self._attachments, attachment.media_type.encode())
             _add(self._attachments, attachment.data)
 
-    def add_ticks(self, rows: NDArray[np.void]) -> None:
-        """Adds records, shape (n,), ``TICK_DTYPE``."""
-        self._ticks.update(np.ascontiguousarray(rows).view(np.uint8).data)
+    def add_ticks(self, rows: NDArray[np.void], hand: int = 0) -> None:
+        """Adds records of a hand, shape (n,), ``TICK_DTYPE``."""
+        while len(self._ticks) <= hand:
+            self._ticks.append(hashlib.sha256())
+        self._ticks[hand].update(np.ascontiguousarray(rows).view(np.uint8).data)
 
     def add_event(self, payload: bytes) -> None:
         """Adds one event's JSON."""
@@ -79,7 +83,8 @@ class Digest:
     def hexdigest(self) -> str:
         """Returns the digest of the contents so far, as 64 hexadecimal digits."""
         whole = hashlib.sha256(b"hapticbridge digest 1\n")
-        for part in (self._metadata, self._attachments, self._ticks, self._events):
+        first, *others = self._ticks
+        for part in (self._metadata, self._attachments, first, self._events, *others):
             whole.update(part.digest())
         return whole.hexdigest()
 

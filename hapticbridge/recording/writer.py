@@ -267,7 +267,7 @@ class RecordingWriter:
         check_contents(meta, attachments)
         self._digest = seal.Digest(meta, attachments)
         self._messages = ros_messages.Messages(self._epoch, ros_messages.axes_of(meta))
-        self._sequence = 0
+        self._sequences = [0] * (1 + len(layout.further_hands(meta)))
         self._is_closed = False
         try:
             self._output = Output(self.path, is_new=exclusive)
@@ -301,9 +301,8 @@ class RecordingWriter:
         tick_schema = self._mcap.register_schema(
             layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema(self._record)
         )
-        self._ticks = self._mcap.register_channel(
-            layout.TICK_TOPIC, layout.TICK_ENCODING, tick_schema
-        )
+        first, *others = map(layout.tick_topic, range(len(self._sequences)))
+        self._ticks = [self._mcap.register_channel(first, layout.TICK_ENCODING, tick_schema)]
         self._events = self._mcap.register_channel(
             layout.EVENT_TOPIC, layout.EVENT_ENCODING, layout.NO_SCHEMA
         )
@@ -315,14 +314,20 @@ class RecordingWriter:
             topic: self._mcap.register_channel(topic, layout.TICK_ENCODING, schemas[name])
             for topic, (name, _) in ros_messages.TOPICS.items()
         }
+        self._ticks += [
+            self._mcap.register_channel(topic, layout.TICK_ENCODING, tick_schema)
+            for topic in others
+        ]
 
     @property
     def is_full(self) -> bool:
         """True if the disk is full; the rest goes into the reserve."""
         return self._output.is_full
 
-    def write_ticks(self, rows: NDArray[np.void]) -> None:
-        """Appends records, shape (n,), with the fields that the writer was given.
+    def write_ticks(self, rows: NDArray[np.void], hand: int = 0) -> None:
+        """Appends records of a hand, shape (n,), with the fields that the writer was given.
+
+        The messages for ROS 2 follow from the records of the first hand.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -333,22 +338,24 @@ class RecordingWriter:
         packed, size = payloads.tobytes(), payloads.itemsize
         # an impossible deadline (before 1970, after 2554) must not stop the recorder
         times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
-        self._digest.add_ticks(rows)
+        self._digest.add_ticks(rows, hand)
+        sequence = self._sequences[hand]
         try:
             for index, time in enumerate(times):
                 self._mcap.add_message(
-                    self._ticks,
+                    self._ticks[hand],
                     time,
                     packed[index * size : (index + 1) * size],
                     time,
-                    (self._sequence + index) & 0xFFFFFFFF,
+                    (sequence + index) & 0xFFFFFFFF,
                 )
-            for topic, messages in self._messages.of_ticks(rows).items():
+            derived = {} if hand else self._messages.of_ticks(rows)
+            for topic, messages in derived.items():
                 for time, payload in messages.tolist():
                     self._mcap.add_message(self._channels[topic], time, payload, time)
         except OSError as error:
             raise self._failed(error) from error
-        self._sequence += len(times)
+        self._sequences[hand] += len(times)
 
     def write_event(self, event: Mapping[str, object], time_ns: int) -> None:
         """Appends an event.

@@ -1,0 +1,443 @@
+"""Bridges with several hands: two devices, one scene, one balance; recorded and audited."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
+
+import hapticbridge as hb
+from hapticbridge.cli.main import main
+from hapticbridge.errors import DeviceLost, HapticBridgeError
+from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.recording.format import MAX_HANDS
+
+SHARED = ("tick", "deadline_ns", "read_ns", "kinetic", "potential")
+
+
+def clocked() -> hb.SimulatedClock:
+    return hb.SimulatedClock()
+
+
+def recorded(path: Path, scene: str = "bar", seconds: float = 1.0) -> hb.Summary:
+    """Records two simulated hands of different damping."""
+    hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3")]
+    loaded = two_handed(SCENES[scene])
+    with hb.Bridge(loaded, hands, clock=clocked(), recording=path) as bridge:
+        return bridge.run(seconds)
+
+
+class Scripted:
+    """Device that moves as told and keeps what it was sent."""
+
+    def __init__(self, name: str, speed: float, **sheet: Any) -> None:
+        usual = {"damping": 2.0, "rotational_damping": 2e-3, "delay": 0.0, "is_real": False}
+        axes = ("x", "y", "z", "rx", "ry", "rz")
+        self.info = hb.DeviceInfo(name=name, axes=axes, force_limit=10.0, **(usual | sheet))
+        self.speed, self.every, self.ticks, self.last_tick = speed, 1, 0, 1 << 30
+        self.sent: list[NDArray[np.float64]] = []
+        self.is_closed = False
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.period = period
+        sample = np.zeros(1, hb.SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if self.ticks >= self.last_tick:
+            raise DeviceLost(f"the device '{self.info.name}' is gone")
+        is_new = self.ticks % self.every == 0
+        shown = self.ticks - self.ticks % self.every
+        self.ticks += 1
+        sample["position"][0] = self.speed * self.period * shown, 0.0, 0.0
+        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+        sample["buttons"][0] = 0
+        return 0 if is_new else int(hb.TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.sent.append(wrench.copy())
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_run_of_two_hands_is_passive_and_repeats_to_the_bit(scene: str, tmp_path: Path) -> None:
+    summary = recorded(tmp_path / "run.mcap", scene)
+    assert [each.grip for each in summary.hands] == ["left", "right"]
+    assert (summary.verdict, summary.is_certified, summary.ticks) == ("passive", True, 1000)
+    report = hb.audit(tmp_path / "run.mcap", in_process=True)
+    assert (report.verdict, report.certified, report.hands) == ("passive", True, ("left", "right"))
+    assert report.resimulation == "bit for bit"
+    assert [text.partition(":")[0] for text in report.conditions] == ["left"] * 2 + ["right"] * 2
+    # the device with the least reserve counts: both kinds keep 15 %
+    assert report.damping_margin == pytest.approx(0.15)
+
+
+def test_each_hand_has_its_records_and_metadata(tmp_path: Path) -> None:
+    recorded(tmp_path / "run.mcap")
+    left, right = (hb.read_recording(tmp_path / "run.mcap", hand=hand) for hand in (0, 1))
+    for name in SHARED:
+        assert np.array_equal(left.ticks[name], right.ticks[name]), name
+    assert (left.meta["grip"], right.meta["grip"]) == ("left", "right")
+    assert [json.loads(each.meta["device"])["damping"] for each in (left, right)] == [2.0, 3.0]
+    assert right.meta["scene_sha256"] == left.meta["scene_sha256"]
+    work = left.ticks["coupling_work"] + right.ticks["coupling_work"]
+    stored = left.ticks["kinetic"] + left.ticks["potential"]
+    assert left.ticks["environment_energy"] == pytest.approx(stored - work, abs=1e-12)
+
+
+def test_a_bar_carries_the_force_from_one_device_to_the_other() -> None:
+    still, moving = Scripted("still", 0.0), Scripted("moving", 1e-2)
+    coupling = hb.Coupling(800.0, 0.5, 0.5, 1e-4)
+    hands = [
+        hb.Grasp("left", still, coupling=coupling),
+        hb.Grasp("right", moving, coupling=coupling),
+    ]
+    with hb.Bridge(two_handed(BAR), hands, clock=clocked(), rate=1000) as bridge:
+        bridge.run(1.0)
+    assert still.is_closed
+    assert moving.is_closed
+    # two springs of 800 N/m in series, 10 mm long; B on the speed of either end adds 5 mN
+    assert still.sent[-3][0] == pytest.approx(4.0, abs=0.02)
+    assert moving.sent[-3][0] == pytest.approx(-4.0, abs=0.02)
+    assert still.sent[-1].tolist() == moving.sent[-1].tolist() == [0.0] * 6
+
+
+def test_scales_and_limits_are_each_hands_own() -> None:
+    still, moving = Scripted("still", 0.0), Scripted("moving", 2e-2)
+    coupling = hb.Coupling(800.0, 0.5, 0.5, 1e-4)
+    scaled = hb.Workspace(scale=0.5)
+    hands = [
+        hb.Grasp("left", still, coupling=coupling, limits=hb.Limits(force=1.0, torque=0.1)),
+        hb.Grasp("right", moving, coupling=coupling, workspace=scaled),
+    ]
+    with hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge:
+        bridge.run(1.0)
+    assert max(abs(sent[0]) for sent in still.sent) <= 1.0 + 1e-9
+    # the bar rests under 1 N from the left, so the right holds 1 N, and its device half of it
+    assert moving.sent[-3][0] == pytest.approx(-0.5, abs=0.01)
+
+
+def test_a_device_without_news_is_flagged_alone(tmp_path: Path) -> None:
+    slow = Scripted("slow", 1e-3, rate=100.0)
+    slow.every = 10
+    hands = [hb.Grasp("left", Scripted("fast", 0.0)), hb.Grasp("right", slow)]
+    path = tmp_path / "run.mcap"
+    with hb.Bridge(two_handed(BAR), hands, clock=clocked(), recording=path) as bridge:
+        bridge.run(0.5)
+    shares = [
+        has_flag(hb.read_recording(path, hand=hand).ticks, TickFlag.STALE_SAMPLE).mean()
+        for hand in (0, 1)
+    ]
+    assert shares == pytest.approx([0.0, 0.9])
+    assert hb.audit(path, in_process=True).resimulation == "bit for bit"
+
+
+def test_either_device_stops_the_run_and_both_get_zero_force() -> None:
+    left, right = Scripted("left one", 0.0), Scripted("right one", 1e-2)
+    right.last_tick = 200
+    hands = [hb.Grasp("left", left), hb.Grasp("right", right)]
+    with (
+        pytest.raises(hb.SafetyTrip, match="tick 200: the device 'right one' is gone"),
+        hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge,
+    ):
+        bridge.run(1.0)
+    for device in (left, right):
+        assert device.is_closed
+        assert device.sent[-1].tolist() == [0.0] * 6
+        assert device.sent[-3][0] != 0.0 or device is left
+
+
+def test_a_tool_that_is_too_heavy_for_both_hands_is_carried() -> None:
+    heavy = BAR.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('"0.2"', '"3"')
+    with hb.Bridge(
+        two_handed(heavy), [hb.Grasp("left"), hb.Grasp("right")], clock=clocked()
+    ) as bridge:
+        assert bridge.scene.is_carried
+        summary = bridge.run(0.5)
+    assert summary.verdict == "passive"
+    assert max(each.peak_force for each in summary.hands) < 5.0
+
+
+def test_the_weight_of_a_bar_is_shared(tmp_path: Path) -> None:
+    light = BAR.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"')
+    path = tmp_path / "run.mcap"
+    hands = [hb.Grasp("left", Scripted("a", 0.0)), hb.Grasp("right", Scripted("b", 0.0))]
+    with hb.Bridge(two_handed(light), hands, clock=clocked(), recording=path) as bridge:
+        bridge.run(0.5)
+    for hand in (0, 1):
+        ticks = hb.read_recording(path, hand=hand).ticks
+        assert ticks["wrench_on_tool"][-1, 2] == pytest.approx(0.5 * 0.2 * 9.81, rel=1e-3)
+        assert np.abs(ticks["tool_position"] - ticks["tool_position"][0]).max() < 1e-5
+    assert hb.audit(path, in_process=True).verdict == "passive"
+
+
+TWO = (hb.Grasp("left"), hb.Grasp("right"))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: bridge_of(TWO, method="lossless"), "method 'lossless' has one hand; several need"),
+        (lambda: bridge_of(TWO, substeps=2), "several hands take one substep, not 2"),
+        (lambda: bridge_of(TWO, scene_rate=100.0), "the scene steps in every tick for several"),
+        (lambda: bridge_of(TWO, pipelined=True), "several hands have no pipelined tick"),
+        (lambda: bridge_of(TWO, clutch=0), "name clutch and dead_man in its Grasp"),
+        (lambda: bridge_of(TWO, live=True), "the live line shows one hand"),
+        (lambda: bridge_of(TWO, mark=1, recording="x"), "several hands have no mark button"),
+        (lambda: bridge_of(TWO[:1]), "there must be 2 to 8 different grips"),
+        (lambda: bridge_of((TWO[0], TWO[0])), "there must be 2 to 8 different grips"),
+        (lambda: bridge_of(TWO[::-1]), "load it with these, in this order"),
+        (lambda: bridge_of(("left", "right")), "several hands are named by a Grasp each"),
+        (lambda: bridge_of(TWO, {"damping": 1.0}), "has a coupling of its own"),
+        (lambda: bridge_of("simulated"), "was loaded with 2 grips, and one device holds one"),
+        (lambda: hb.Grasp(""), "grip is ''; it must name a site or a body"),
+        (lambda: bridge_of(twice(Scripted("one", 0.0))), "two hands have one device"),
+    ],
+)
+def test_what_several_hands_cannot_have_is_refused(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(HapticBridgeError, match=message):
+        call()
+
+
+def bridge_of(device: Any, *arguments: Any, **options: Any) -> hb.Bridge:
+    return hb.Bridge(two_handed(BAR), device, *arguments, clock=clocked(), **options)
+
+
+def twice(device: Scripted) -> tuple[hb.Grasp, hb.Grasp]:
+    return hb.Grasp("left", device), hb.Grasp("right", device)
+
+
+def test_commands_are_refused_but_for_the_end() -> None:
+    from hapticbridge.commands import Reset
+
+    with bridge_of(TWO) as bridge:
+        with pytest.raises(HapticBridgeError, match="takes no commands but to stop"):
+            bridge.command(Reset())
+        bridge.run(0.01, on_tick=lambda tick: bridge.stop() if tick == 5 else None)
+        assert bridge.summary().ticks < 10
+
+
+def test_a_run_of_two_hands_resumes_after_a_pause(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with bridge_of(TWO, recording=path) as bridge:
+        bridge.run(0.2)
+        summary = bridge.run(0.2)
+    assert summary.ticks == 400
+    assert hb.audit(path, in_process=True).resimulation == "bit for bit"
+
+
+def test_inputs_of_the_scene_are_repeated_by_the_audit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    def push(tick: int) -> None:
+        if tick == 100:
+            bridge.set_input(body_wrench={"bar": [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]})
+
+    with bridge_of(TWO, recording=path) as bridge:
+        bridge.run(0.4, on_tick=push)
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert report.energies["external_work"] > 1e-5
+
+
+# Recordings
+
+
+def test_readers_of_one_hand_refuse_a_recording_of_two(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    recorded(path, seconds=0.1)
+    table, plot = str(tmp_path / "x.csv"), str(tmp_path / "x.png")
+    for command in (
+        ["export", str(path), "--format", "csv", "--out", table],
+        ["audit", str(path), "--plot", plot],
+    ):
+        assert main(command) == 2, command
+    with pytest.raises(hb.RecordingError, match=r"is a run of 2 hands \('left', 'right'\)"):
+        hb.read_recording(path)
+    with pytest.raises(hb.RecordingError, match="has no hand 2; its hands are 0 to 1"):
+        hb.read_recording(path, hand=2)
+
+
+CHANGES: tuple[tuple[str, int, Any], ...] = (
+    ("wrench_on_tool", 0, 1e-3),
+    ("wrench_on_tool", 1, 1e-3),
+    ("coupling_work", 1, 1e-6),
+    ("device_position", 1, 1e-5),
+    ("wrench_on_device", 1, 1e-3),
+    ("kinetic", 1, 1e-6),
+    ("environment_energy", 1, 1e-6),
+    ("contact_tank", 1, 1e-6),
+)
+
+
+@pytest.mark.parametrize(("field", "hand", "change"), CHANGES)
+def test_a_changed_record_of_either_hand_is_noticed(
+    field: str, hand: int, change: float, tmp_path: Path
+) -> None:
+    path, forged = tmp_path / "run.mcap", tmp_path / "forged.mcap"
+    recorded(path, seconds=0.3)
+    rewrite(path, forged, lambda ticks: None)
+    assert hb.audit(forged, in_process=True).verdict == "passive"
+
+    def edit(ticks: list[NDArray[np.void]]) -> None:
+        value = ticks[hand][field]
+        value.reshape(len(value), -1)[150, 0] += change
+
+    rewrite(path, forged, edit)
+    report = hb.audit(forged, in_process=True)
+    assert report.verdict == "invalid"
+    assert report.tick is None or abs(report.tick - 150) <= 1
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("[3]", "metadata 'hands' are not texts by name"),
+        (json.dumps([{}] * MAX_HANDS), "metadata 'hands' are not texts by name"),
+        ("[]", "its hands have different numbers of records"),
+        ('[{"grip": "right"}, {"grip": "left"}]', "its hands have different numbers of records"),
+        ('[{"grip": "right", "period_s": "0.002"}]', "metadata 'period_s' differ between"),
+    ],
+)
+def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_path: Path) -> None:
+    path, forged = tmp_path / "run.mcap", tmp_path / "forged.mcap"
+    recorded(path, seconds=0.1)
+    rewrite(path, forged, lambda ticks: None, hands=value)
+    report = hb.audit(forged, in_process=True)
+    assert report.verdict == "invalid"
+    assert message in report.reason
+
+
+def rewrite(
+    path: Path, forged: Path, edit: Callable[[list[NDArray[np.void]]], None], **meta: str
+) -> None:
+    """Writes a recording of two hands again, with its seal made anew."""
+    from hapticbridge.recording import RecordingWriter
+    from hapticbridge.recording.format import Attachment
+    from hapticbridge.recording.reader import open_hands
+
+    first, second = open_hands(path)
+    ticks = [np.concatenate(list(each.blocks())) for each in (first, second)]
+    edit(ticks)
+    files = [Attachment(n, "application/octet-stream", d) for n, d in first.attachments.items()]
+    writer = RecordingWriter(forged, first.meta, files, int(first.meta["epoch_ns"]))
+    events = list(first.events)
+    writer.write_event(events[0], events[0]["time_ns"])
+    for hand, rows in enumerate(ticks):
+        writer.write_ticks(rows, hand)
+    for event in events[1:]:
+        writer.write_event(event, event["time_ns"])
+    writer.close()
+    if meta:
+        change_metadata(forged, first, files, ticks, meta)
+
+
+def change_metadata(
+    forged: Path,
+    first: Any,
+    files: list[Any],
+    ticks: list[NDArray[np.void]],
+    meta: dict[str, str],
+) -> None:
+    """Writes both hands' records under other metadata of the hands."""
+    from hapticbridge.recording import RecordingWriter
+    from hapticbridge.recording import format as layout
+
+    class Writer(RecordingWriter):
+        """Writer whose number of hands is two, whatever the metadata are."""
+
+    monkey = pytest.MonkeyPatch()
+    monkey.setattr(layout, "further_hands", lambda _: [{}])
+    with monkey.context():
+        writer = Writer(forged, first.meta | meta, files, int(first.meta["epoch_ns"]))
+    monkey.undo()
+    events = list(first.events)
+    writer.write_event(events[0], events[0]["time_ns"])
+    for hand, rows in enumerate(ticks):
+        writer.write_ticks(rows, hand)
+    for event in events[1:]:
+        writer.write_event(event, event["time_ns"])
+    writer.close()
+
+
+def test_a_cut_recording_of_two_hands_is_judged_up_to_the_cut(tmp_path: Path) -> None:
+    path, cut = tmp_path / "run.mcap", tmp_path / "cut.mcap"
+    recorded(path, seconds=2.0)
+    data = path.read_bytes()
+    cut.write_bytes(data[: len(data) // 2])
+    report = hb.audit(cut, in_process=True)
+    assert report.is_cut
+    assert 300 < report.ticks < 1900
+    assert report.verdict == "passive"
+
+
+# Command line
+
+
+def test_the_command_runs_records_and_audits_two_hands(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, path = tmp_path / "bar.xml", tmp_path / "run.mcap"
+    scene.write_text(PEG_AND_BLOCK)
+    hands = ["--hand", "left=simulated", "--hand", "right=simulated:damping=4"]
+    run = ["run", str(scene), *hands, "--fast", "--duration", "0.5", "--record", str(path)]
+    assert main(run) == 0
+    printed = capsys.readouterr()
+    assert "hand at 'left' on simulated:" in printed.out
+    assert "hand at 'right' on simulated:" in printed.out
+    assert "at 'right' on simulated, 1000 Hz, method implicit" in printed.err
+    assert main(["audit", str(path)]) == 0
+    assert "right: translation: device damping 4 >= 3.4 N s/m" in capsys.readouterr().out
+    assert main([*run, "--overwrite", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert [each["grip"] for each in values["hands"]] == ["left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--hand", "left=simulated"), "there must be 2 to 8 different grips"),
+        (("--hand", "left"), "--hand is 'left'; it must be GRIP=DEVICE"),
+        (("--hand", "a=simulated", "--device", "mouse"), "takes the place of --grip and --device"),
+        (("--hand", "a=simulated", "--view"), "--view, --port and the mouse exclude --hand"),
+        (("--hand", "a=simulated", "--hand", "b=mouse"), "the device 'mouse' moves in real time"),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--method", "lossless"),
+            "method 'lossless' has one hand",
+        ),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--dead-man", "0"),
+            "each of several hands has buttons of its own",
+        ),
+        (("--hand", "left=falcon", "--hand", "right=simulated"), "leave out --fast"),
+    ],
+)
+def test_the_command_refuses_in_one_sentence(
+    arguments: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene = tmp_path / "bar.xml"
+    scene.write_text(BAR)
+    assert main(["run", str(scene), "--fast", *arguments]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_simulated_hand_follows_the_path_of_its_grip(tmp_path: Path) -> None:
+    scene = tmp_path / "bar.xml"
+    scene.write_text(BAR)
+    (tmp_path / "bar_right.csv").write_text("t,x,y,z\n0,0,0,0\n0.5,0,0.02,0\n")
+    with hb.Bridge(scene, TWO, clock=clocked()) as bridge:
+        bridge.run(0.5)
+        ends = [bridge.scene.data.site(name).xpos[1] for name in ("left", "right")]
+    assert ends[1] - ends[0] > 5e-3
