@@ -60,7 +60,7 @@ class AuditReport:
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
         hands: Name of each hand's grip, if several hold the scene; else empty. The environment is
             judged over all of them, and each device by itself; ``certified`` is False if one lacks
-            damping. Conditions and couplings name their hand, ``energies`` are the first hand's.
+            damping. Conditions and couplings name their hand, ``energies`` are sums over all hands.
     """
 
     path: Path

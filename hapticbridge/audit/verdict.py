@@ -274,7 +274,7 @@ def verdict_on(
                     ]
                     timings = [TimingTally(hand.run.parameters) for hand in hands]
                     fault, facts["duration"] = _check_records(hands, energies, timings)
-                    facts["energies"] = energies[0].energies
+                    facts["energies"] = _energies_of_hands(energies)
                     for hand, own, timing in zip(hands, of_hands, timings, strict=True):
                         own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
                         fault = fault or first_contradiction(
@@ -329,6 +329,17 @@ def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFi
     worst = certified.index(found["certified"])
     if "timekeeping" in of_hands[worst]:
         found["timekeeping"] = of_hands[worst]["timekeeping"]
+    return found
+
+
+_OF_A_HAND = ("coupling_work", "device_energy")
+
+
+def _energies_of_hands(tallies: Sequence[PassivityTally]) -> dict[str, float]:
+    """Returns the energies at the end in J; what each hand has of its own is added up."""
+    found = dict(tallies[0].energies)
+    for name in _OF_A_HAND:
+        found[name] = sum(tally.energies[name] for tally in tallies)
     return found
 
 
