@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +47,15 @@ def test_session_prints_what_the_readme_shows(
                 assert float(word.lstrip("(")) == pytest.approx(float(number[1]), rel=0.02)
             else:
                 assert word == expected
+
+
+def test_table_of_merit_is_written_from_what_was_measured() -> None:
+    path = str(ROOT / "scripts" / "merit")
+    merit = SourceFileLoader("merit", path).load_module()
+    kept = json.loads(merit.FILE.read_text(encoding="utf-8"))
+    assert merit.written(README, kept) == README
+    assert set(kept) == set(merit.MEASURED)
+    assert all(each["commit"] and each["machine"] for each in kept.values())
 
 
 def test_python_block_runs(workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
