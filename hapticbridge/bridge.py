@@ -41,7 +41,7 @@ from hapticbridge.hands import (
     scene_of_grasps,
 )
 from hapticbridge.inputs import Write, input_writes
-from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, OK, RING_FULL
+from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
@@ -261,10 +261,10 @@ class Bridge:
                 elif code == HALF_DONE:
                     second_half(model, data)
                 else:
-                    return trip_reason(code, session.tick)
+                    return self._trip_reason(code, session.tick)
                 code = answer(state, row, substep)
             if code != OK:
-                return trip_reason(code, session.tick)
+                return self._trip_reason(code, session.tick)
             write_device(wrench)
             write = now()
             if mark is not None:
@@ -282,6 +282,15 @@ class Bridge:
                 return trip_reason(code, session.tick)
             session.tick += 1
         return ""
+
+    def _trip_reason(self, code: int, tick: int) -> str:
+        """Describes why the kernel refused a tick, and for which of several hands."""
+        hand, code = divmod(code, HAND_CODES)
+        reason = trip_reason(code, tick)
+        if not self._others:
+            return reason
+        head, _, text = reason.partition(": ")
+        return f"{head}: hand at '{self.setups[hand].scene.grip}': {text}"
 
     def stop(self, by: str = "caller") -> None:
         """Ends the run after the present tick; callable from ``on_tick`` and from any thread.

@@ -156,6 +156,24 @@ def test_either_device_stops_the_run_and_both_get_zero_force() -> None:
         assert device.sent[-3][0] != 0.0 or device is left
 
 
+def test_a_trip_names_the_hand() -> None:
+    left, right = Scripted("a", 0.0), Scripted("b", 0.0)
+    hands = [hb.Grasp("left", left), hb.Grasp("right", right)]
+
+    def jump(tick: int) -> None:
+        right.speed = 0.0 if tick < 100 else 2.0
+
+    with (
+        pytest.raises(hb.SafetyTrip, match="hand at 'right': the device's pose jumped") as caught,
+        hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge,
+    ):
+        bridge.run(1.0, on_tick=jump)
+    # the last second, a record per hand and tick, in order
+    records = caught.value.records
+    assert np.array_equal(records["tick"][::2], records["tick"][1::2])
+    assert left.sent[-1].tolist() == right.sent[-1].tolist() == [0.0] * 6
+
+
 def test_a_tool_that_is_too_heavy_for_both_hands_is_carried() -> None:
     heavy = BAR.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('"0.2"', '"3"')
     with hb.Bridge(

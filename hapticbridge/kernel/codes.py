@@ -146,6 +146,9 @@ JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 """Reasons of the guard to refuse a tick: the device's pose jumped; time ran backwards; the coupling
 is too long; it is turned too far; the device received too much energy."""
 
+HAND_CODES = 100
+"""Factor of a hand's number in the result of a tick that was refused for one of several hands."""
+
 FORCE_LIMITED = int(TickFlag.FORCE_LIMITED)
 RAMPING = int(TickFlag.RAMPING)
 CONTROLLER_ACTIVE = int(TickFlag.CONTROLLER_ACTIVE)

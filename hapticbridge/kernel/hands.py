@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
-from hapticbridge.kernel.codes import BAD_RESULT, OK, RING_FULL
+from hapticbridge.kernel.codes import BAD_RESULT, HAND_CODES, OK, RING_FULL
 from hapticbridge.kernel.force_level import (
     keep_state,
     settle_levels,
@@ -68,13 +68,13 @@ def before_hands(
         elapsed: Time since the previous samples in s.
 
     Returns:
-        As ``tick.before_step``, for the first hand that is refused. The run must end then: the
-        hands before it have moved.
+        As ``tick.before_step``, for the first hand that is refused, plus ``HAND_CODES`` times its
+        number. The run must end then: the hands before it have moved.
     """
     for i in range(states.size):
         code = take_sample(states[i], samples[i : i + 1], rows[i : i + 1], elapsed)
         if code != OK:
-            return code
+            return code + HAND_CODES * i
     for i in range(states.size):
         command_handle_velocity(states[i], place_handle(states[i], 0))
     if states[0].level.is_solved:
@@ -87,7 +87,8 @@ def answer_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
     """Computes the wrenches of the step that just ended, on all tools and devices.
 
     Returns:
-        As ``tick.answer_step``. Unless it is ``OK``, the wrench on every device is zero.
+        As ``tick.answer_step``, with the hand as ``before_hands`` has it. Unless it is ``OK``, the
+        wrench on every device is zero.
     """
     scene = states[0]
     spend_within_tank(scene)
@@ -104,7 +105,8 @@ def answer_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
     contacts, code = active_contacts(scene), OK
     for i in range(states.size):
         sent = send_wrench(states[i], rows[i : i + 1], contacts)
-        code = sent if code == OK else code
+        if code == OK and sent != OK:
+            code = sent + HAND_CODES * i
     if code != OK:
         for i in range(states.size):
             refuse_tick(states[i])
