@@ -387,7 +387,13 @@ def change_metadata(
     writer.close()
 
 
-def test_a_cut_recording_of_two_hands_is_judged_up_to_the_cut(tmp_path: Path) -> None:
+@pytest.mark.parametrize("most", [0, 1 << 17], ids=["from the file", "in memory"])
+def test_a_cut_recording_of_two_hands_is_judged_up_to_the_cut(
+    most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hapticbridge.recording import reader
+
+    monkeypatch.setattr(reader, "MAX_KEPT", most)
     path, cut = tmp_path / "run.mcap", tmp_path / "cut.mcap"
     recorded(path, seconds=2.0)
     data = path.read_bytes()

@@ -357,10 +357,12 @@ class RecordingFile:
 
         def take(run: NDArray[np.void], hand: int) -> None:
             nonlocal held
-            # a cut file may hold more records of one hand than of another
-            if hand == self.hand and found + held < self.count:
-                runs.append(run[: self.count - found - held])
-                held += runs[-1].size  # a sum over all runs in every part would be quadratic
+            if hand != self.hand:
+                return
+            if self.hands > 1 and self.is_cut:  # it may hold more records of one hand
+                run = run[: self.count - found - held]
+            runs.append(run)
+            held += run.size  # a sum over all runs in every part would be quadratic
 
         for _ in _read_parts(self.path, take, keeps_events=False):
             while held >= size:
