@@ -9,11 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import opened_rawhid
+from emulated.hid_seam import DrivingClock, HidSeam, Timed
+from emulated.spacemouse_model import SpaceMouse
 from numpy.typing import NDArray
 from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
+from hapticbridge.device.driver import ignore_message
+from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.record import TickFlag, has_flag
 from hapticbridge.recording.format import MAX_HANDS
@@ -465,3 +470,35 @@ def test_a_simulated_hand_follows_the_path_of_its_grip(tmp_path: Path) -> None:
         bridge.run(0.5)
         ends = [bridge.scene.data.site(name).xpos[1] for name in ("left", "right")]
     assert ends[1] - ends[0] > 5e-3
+
+
+# Emulated devices behind their drivers
+
+
+class Together:
+    """Several emulated buses at one time."""
+
+    def __init__(self, *buses: Timed) -> None:
+        self._buses, self.now = buses, max(bus.now for bus in buses)
+
+    def advance(self, now: float) -> None:
+        for bus in self._buses:
+            bus.advance(now)
+        self.now = max(self.now, now)
+
+
+def test_a_board_and_a_spacemouse_hold_one_scene(tmp_path: Path) -> None:
+    board, model, board_bus = opened_rawhid()
+    mouse_bus = HidSeam(SpaceMouse(lambda when: (0.3 if when < 0.5 else 0.0, *[0.0] * 5)))
+    mouse = open_spacemouse({}, ignore_message, mouse_bus)
+    clock = DrivingClock(Together(board_bus, mouse_bus))
+    hands, path = [hb.Grasp("left", board), hb.Grasp("right", mouse)], tmp_path / "run.mcap"
+    felt = []
+    with hb.Bridge(two_handed(BAR), hands, clock=clock, recording=path) as bridge:
+        summary = bridge.run(1.0, on_tick=lambda _: felt.append(np.abs(model.wrench).max()))
+    assert summary.verdict == "passive"
+    # the puck pulls the bar away from the hand that holds the board
+    assert max(felt) > 0.5
+    assert np.abs(model.wrench).max() == 0.0
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
