@@ -431,13 +431,32 @@ def test_the_command_runs_records_and_audits_two_hands(
     assert [each["grip"] for each in values["hands"]] == ["left", "right"]
 
 
+def test_one_hand_that_is_named_is_as_today(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "bar.xml"
+    scene.write_text(BAR)
+    said = []
+    for words in (("--hand", "left=simulated"), ("--grip", "left", "--device", "simulated")):
+        assert main(["run", str(scene), "--fast", "--duration", "0.2", *words]) == 0
+        said.append(capsys.readouterr())
+    assert said[0] == said[1]
+    assert "K = 2400 N/m" in said[0].out
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--hand", "left=simulated"), "there must be 2 to 8 different grips"),
+        (
+            ("--hand", "left=simulated", "--hand", "left=simulated"),
+            "there must be 2 to 8 different grips",
+        ),
         (("--hand", "left"), "--hand is 'left'; it must be GRIP=DEVICE"),
         (("--hand", "a=simulated", "--device", "mouse"), "takes the place of --grip and --device"),
-        (("--hand", "a=simulated", "--view"), "--view, --port and the mouse exclude --hand"),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--view"),
+            "--view, --port and the mouse exclude --hand",
+        ),
         (("--hand", "a=simulated", "--hand", "b=mouse"), "the device 'mouse' moves in real time"),
         (
             ("--hand", "left=simulated", "--hand", "right=simulated", "--method", "lossless"),

@@ -384,7 +384,10 @@ class Run:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
         if self.hand:
-            return self._run_hands(clock)
+            pairs = self._grips_and_devices()
+            if len(pairs) > 1:
+                return self._run_hands(pairs, clock)
+            return replace(self, hand=(), grip=pairs[0][0], device=pairs[0][1]).execute()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         is_viewed = self.view or self.device.partition(":")[0] == "mouse"
         if self.port is not None and not is_viewed:
@@ -407,16 +410,24 @@ class Run:
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
-    def _run_hands(self, clock: Clock) -> int:
-        """Runs several hands, each with its grip and device; returns the exit code."""
+    def _grips_and_devices(self) -> list[tuple[str, str]]:
+        """Returns grip and device of each --hand."""
         if self.grip != "grip" or self.device != "simulated":
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
-        pairs = [each.partition("=")[::2] for each in self.hand]
-        for each, (grip, device) in zip(self.hand, pairs, strict=True):
+        pairs = []
+        for each in self.hand:
+            grip, _, device = each.partition("=")
             if not grip or not device:
                 raise HapticBridgeError(f"--hand is {each!r}; it must be GRIP=DEVICE")
+            pairs.append((grip, device))
+        return pairs
+
+    def _run_hands(self, pairs: Sequence[tuple[str, str]], clock: Clock) -> int:
+        """Runs several hands, each with its grip and device; returns the exit code."""
+        for _, device in pairs:
             refuse_simulated_time(device, clock)
-        if self.view or self.port is not None or "mouse" in (device for _, device in pairs):
+        is_mouse = any(device.partition(":")[0] == "mouse" for _, device in pairs)
+        if self.view or self.port is not None or is_mouse:
             raise HapticBridgeError(
                 "the view shows one hand: --view, --port and the mouse exclude --hand"
             )
