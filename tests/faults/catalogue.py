@@ -303,10 +303,10 @@ from hapticbridge.recording.recorder_process import run
 from hapticbridge.recording.writer import RecordingWriter
 write = RecordingWriter.write_ticks
 
-def stalled(writer, rows):
+def stalled(writer, rows, hand):
     while rows["tick"][-1] > 1500 and not Path("GO").exists():
         time.sleep(1e-3)
-    write(writer, rows)
+    write(writer, rows, hand)
 
 RecordingWriter.write_ticks = stalled
 run()
