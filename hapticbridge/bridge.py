@@ -24,7 +24,7 @@ from hapticbridge.commands import Command, Repeat
 from hapticbridge.commands.command import Stop
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked_read
+from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import (
     CommandError,
     DeviceError,
@@ -237,7 +237,7 @@ class Bridge:
         """Runs the ticks until the end; returns the reason of a trip, or an empty text."""
         kernel, model, data = session.kernel, self.scene.model, self.scene.data
         wait, now, stops = self.clock.wait, self.clock.now, self._stop.waiting
-        read_device, write_device = checked_read(self.device), self.device.write
+        read_device, write_device = checked_read(self.device), checked_write(self.device)
         state, row, sample = kernel.state, kernel.row, kernel.sample
         before, answer, finish = kernel.before, kernel.answer, kernel.finish
         step, first_half, second_half = kernel.step, kernel.first_half, kernel.second_half

@@ -17,7 +17,7 @@ from hapticbridge.arguments import shown
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo
-from hapticbridge.device.base import checked_read
+from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.guard import Limits
 from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
@@ -199,6 +199,7 @@ class DeviceGroup:
         self.external_flags: NDArray[np.int64] = np.zeros(len(devices), np.int64)
         self._devices = tuple(devices)
         self._reads = tuple(checked_read(device) for device in devices)
+        self._writes = tuple(checked_write(device) for device in devices)
 
     def start(self, period: float) -> NDArray[np.void]:
         """Starts every device; returns their poses, (n,), ``SAMPLE_DTYPE``.
@@ -227,9 +228,9 @@ class DeviceGroup:
             DeviceLost: One of them is gone.
         """
         failed: DeviceError | None = None
-        for hand, device in enumerate(self._devices):
+        for hand, write in enumerate(self._writes):
             try:
-                device.write(wrench if wrench.ndim == 1 else wrench[hand])
+                write(wrench if wrench.ndim == 1 else wrench[hand])
             except DeviceError as error:
                 failed = failed or error
         if failed is not None:

@@ -23,6 +23,7 @@ from hapticbridge.clock import Clock, RealClock, slept_ns
 from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
+from hapticbridge.device.base import checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
 from hapticbridge.hands import DeviceGroup
@@ -593,7 +594,7 @@ class Session:
     def command_zero_force(self) -> str:
         """Commands zero force; returns the reason if that failed, or an empty text."""
         try:
-            self.device.write(_NO_FORCE)
+            checked_write(self.device)(_NO_FORCE)
         except DeviceError as error:
             return f"zero force could not be sent: {error}"
         return ""

@@ -102,6 +102,11 @@ def watch_sentence(flags: int) -> str:
     return ""
 
 
+MANY_KEPT = 0.95
+"""Share of deadlines kept below which a run with real-time priority is told what helps; no unit.
+A virtual machine is stopped by its host now and then, and nothing inside it helps."""
+
+
 @dataclass(frozen=True, slots=True)
 class Timekeeping:
     """Time that a run kept, and the device condition at this time.
@@ -246,8 +251,10 @@ class Timekeeping:
         """Sentence that suggests a remedy after missed deadlines or late steps of the scene."""
         if self.scene_speed < SLOW_MOTION:
             return "the scene runs in slow motion: a lower --scene-rate gives its steps more time"
-        if self.share == 1.0 or self.is_realtime or self.is_kept is False:
+        if self.share == 1.0 or self.is_kept is False:
             return ""
+        if self.is_realtime:
+            return f"deadlines were missed: try {self.remedy}" if self.share < MANY_KEPT else ""
         return "deadlines were missed: --realtime requests the processor for the loop"
 
     @property

@@ -289,6 +289,39 @@ def test_what_is_no_scene_device_or_clock_is_refused_in_a_sentence() -> None:
             load_scene(source)
 
 
+class Failing(ScriptedDevice):
+    """A device of a stranger, whose calls raise errors of their own."""
+
+    def __init__(self, call: str) -> None:
+        super().__init__(still)
+        self.call, self.count = call, 0
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.count += 1
+        if self.call == "read" and self.count > 5:
+            raise OSError("cable out")
+        return super().read(sample)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        if self.call == "write" and self.count > 5:
+            raise KeyError("motor")
+        super().write(wrench)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [("read", "read failed with OSError: cable out"), ("write", "write failed with KeyError")],
+)
+def test_any_error_of_a_strangers_device_is_a_trip(call: str, message: str) -> None:
+    device = Failing(call)
+    with (
+        Bridge("point_mass", device, COUPLING, clock=SimulatedClock()) as bridge,
+        pytest.raises(SafetyTrip, match=message),
+    ):
+        bridge.run(duration=0.1)
+    assert not np.any(device.writes[-1])
+
+
 def test_a_device_whose_read_answers_nothing_ends_the_run_with_zero_force() -> None:
     device = Silent(still)
     with (

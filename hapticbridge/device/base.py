@@ -411,18 +411,52 @@ class Device(Protocol):
         """Releases the device; may be called more than once."""
 
 
+def _is_ours(device: Device) -> bool:
+    return type(device).__module__.startswith("hapticbridge.")
+
+
+def _told(name: str, call: str, error: Exception) -> DeviceError:
+    """Returns the error itself if it is a ``DeviceError``, else one that names the failed call."""
+    if isinstance(error, DeviceError):
+        return error
+    return DeviceError(f"device '{name}': {call} failed with {type(error).__name__}: {error}")
+
+
+def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
+    """Returns the device's ``write``; for a device of another package, one whose errors are told.
+
+    Raises:
+        DeviceError: By the returned function, if the device raises anything.
+    """
+    if _is_ours(device):
+        return device.write
+    write, name = device.write, device.info.name
+
+    def checked(wrench: NDArray[np.float64]) -> None:
+        try:
+            write(wrench)
+        except Exception as error:
+            raise _told(name, "write", error) from error
+
+    return checked
+
+
 def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
     """Returns the device's ``read``; for a device of another package, one that checks its answers.
 
     Raises:
-        DeviceError: By the returned function, if the answer is not a whole number, such as None.
+        DeviceError: By the returned function, if the answer is not a whole number, such as None, or
+            the device raises anything.
     """
-    if type(device).__module__.startswith("hapticbridge."):
+    if _is_ours(device):
         return device.read
     read, name = device.read, device.info.name
 
     def checked(sample: NDArray[np.void]) -> int:
-        flags = read(sample)
+        try:
+            flags = read(sample)
+        except Exception as error:
+            raise _told(name, "read", error) from error
         if not isinstance(flags, int | np.integer):
             raise DeviceError(
                 f"device '{name}': read returned {shown(flags)}; it must be 0 for a new sample, or "
