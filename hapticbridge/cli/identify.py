@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -50,12 +51,13 @@ def safe_width(result: Identification) -> ZWidth | None:
     )
 
 
-def print_result(result: Identification, z: ZWidth | None) -> None:
+def print_result(result: Identification, z: ZWidth | None, device: str) -> None:
     """Prints what was measured, how surely, and the coupling to use.
 
     Args:
         result: What ``identify`` returned.
         z: What ``safe_width`` made of it.
+        device: The device as the user named it.
     """
     for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
         names = zip(("mass", "damping", "friction"), units, strict=True)
@@ -100,7 +102,8 @@ def print_result(result: Identification, z: ZWidth | None) -> None:
     (sentence,) = recommended_coupling(z).sentences()
     coupling = recommended(z)
     out.print(f"use {sentence}")
-    out.print(f"next: {plain(next_command(coupling.stiffness, coupling.damping, 1.0 / z.period))}")
+    command = next_command(coupling.stiffness, coupling.damping, 1.0 / z.period)
+    out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
 
 
 def why_none(result: Identification) -> str:
@@ -206,7 +209,7 @@ class Identify:
         if self.as_json:
             print_json(facts(result, z, path))
         else:
-            print_result(result, z)
+            print_result(result, z, self.device)
         if path is not None:
             _write(profile, path)
             notify(f"wrote {path}")
