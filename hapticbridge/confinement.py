@@ -43,13 +43,14 @@ from hapticbridge.errors import (
 if sys.platform != "win32":
     import resource
 
-MEMORY = 640 << 20
-"""Memory in bytes that foreign work may take beyond the present process. A scene with large meshes
-compiles in half of it; with more, a hostile scene could take a small machine's memory."""
+MEMORY = 1024 << 20
+"""Memory in bytes that foreign work may take beyond the present process. Robots with large meshes
+take more than 640 MB to compile; with more, a hostile scene could take a small machine's memory."""
 
-COMPILE_TIME = 2.5
-"""Processor time in s in which a foreign scene must compile. The shipped scenes take 0.1 s; with
-more, a hostile one would keep its user waiting for over 5 s."""
+COMPILE_TIME = 10.0
+"""Processor time in s in which a foreign scene must compile. The shipped scenes take 0.1 s, a robot
+with large meshes 2.5 s, and a slower machine several times that. With more, a hostile scene would
+keep its user waiting."""
 
 PATIENCE, SHARE = 10.0, 5.0
 """Time in s that a child may take beyond ``SHARE`` times its processor time. A child that waits

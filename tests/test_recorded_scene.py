@@ -427,7 +427,7 @@ def answer(data: bytes) -> Callable[[object], None]:
     ("work", "words"),
     [
         (crash, r"crashed MuJoCo \(SIGSEGV\)"),
-        (lambda _: np.ones(1 << 28).sum(), "needs more than 640 MB of memory"),
+        (lambda _: np.ones(1 << 28).sum(), "needs more than 1024 MB of memory"),
         (spin, "needs too much processor time"),
         (lambda _: time.sleep(1e3), "needs more than 1 s"),
         (lambda _: sys.exit(9), "made MuJoCo fail: SystemExit: 9"),
