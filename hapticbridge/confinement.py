@@ -379,7 +379,8 @@ def confine(
     Args:
         reads: Files and folders that it may read besides programs.
         writes: Folders in which it may also write.
-        memory: Memory in bytes that it may take beyond what it has.
+        memory: Address space in bytes that it may take beyond what it has. Of the latter it may
+            fill what is idle.
 
     Returns:
         The means beside the limits of resources, and if they work, by name.
