@@ -176,7 +176,8 @@ class Bridge:
                 self.clock,
                 is_recorded=self.output.path is not None,
             )
-        self.device, self._others = DeviceGroup(devices), tuple(others)
+        self.device = DeviceGroup(devices, [len(grasp.grips) for grasp in grasps])
+        self._others = tuple(others)
 
     def __enter__(self) -> Self:
         if self._session is not None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -13,16 +14,73 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import shown
+from hapticbridge.arguments import is_number, shown
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.guard import Limits
+from hapticbridge.guard import Limits, limits_for
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.recording.format import MAX_HANDS
 from hapticbridge.scene import Scene, load_scene
+
+
+@dataclass(frozen=True, slots=True)
+class GripAxis:
+    """Joint of the scene that a device's grip axis moves.
+
+        q = q_0 + scale · (x − x_0),    F = −scale · f
+
+    q is the joint's handle in m or rad, x how far the grip is closed in m, f the coupling's force
+    or torque on the joint, F the force on the fingers in N.
+
+    Attributes:
+        joint: Name of a hinge or slide of the scene.
+        scale: Joint motion per motion of the grip, in rad/m or without unit, not 0; below 0 a joint
+            that falls while the grip closes. None maps the grip's travel to the joint's range.
+        coupling: Gains of the coupling to the joint, or some of them by name, in N m/rad and
+            N m s/rad for a hinge; None selects the stiffest that is safe.
+
+    Raises:
+        HapticBridgeError: The joint is not a text, or the scale out of range.
+    """
+
+    joint: str
+    scale: float | None = None
+    coupling: Coupling | Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.joint, str) or not self.joint:
+            raise HapticBridgeError(f"joint is {shown(self.joint)}; it must name a joint")
+        scale = 1.0 if self.scale is None else self.scale
+        if not is_number(scale) or scale == 0.0 or not math.isfinite(scale):
+            raise HapticBridgeError(f"scale is {shown(scale)}; it must be finite and not 0")
+
+    def workspace(self, scene: Scene, info: DeviceInfo) -> Workspace:
+        """Returns the map from the grip to the joint.
+
+        Args:
+            scene: The scene as the grip axis holds it.
+            info: The axis' data sheet.
+
+        Raises:
+            SceneError: The scale is not named, and the travel or the joint's range is unknown.
+        """
+        scale = self.scale
+        if scale is None:
+            low, high = scene.model.jnt_range[scene.joint]
+            if info.reach is None or not scene.model.jnt_limited[scene.joint]:
+                raise SceneError(
+                    f"the travel of '{info.name}' or the range of joint '{self.joint}' is unknown; "
+                    "name the joint's motion per m of the grip (--grip-scale)"
+                )
+            scale = float(high - low) / info.reach
+        return Workspace(scale=abs(scale), axes=_SAME if scale > 0 else _REVERSED)
+
+
+_SAME, _REVERSED = np.eye(3), np.diag([-1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +90,7 @@ class _Choices:
     limits: Limits | None = None
     clutch: int | None = None
     dead_man: int | None = None
+    grip_axis: GripAxis | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +98,8 @@ class Grasp(_Choices):
     """A grip of the scene that one of several hands holds, with its own device.
 
     Attributes:
-        grip: Site, ``BODY`` or ``BODY@x,y,z``, as for ``load_scene``; different in every hand.
+        grip: Site, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``, as for ``load_scene``; different in
+            every hand, and no joint in the first.
         device: An open device, or a string for ``open_device``. A simulated one follows
             ``SCENE_GRIP.csv`` beside the scene, if there is such a file.
         coupling: As for ``Bridge``, for this hand.
@@ -47,6 +107,7 @@ class Grasp(_Choices):
         limits: Limits of this hand; None takes those of the options, or else the device's own.
         clutch: Number of this device's button, from 0, that lets it move without the handle.
         dead_man: Number of this device's button, from 0, that must be held for any force on it.
+        grip_axis: Joint that the device's grip axis moves; None leaves the axis without force.
 
     Raises:
         HapticBridgeError: The grip is not a text.
@@ -59,14 +120,20 @@ class Grasp(_Choices):
         if not isinstance(self.grip, str) or not self.grip:
             raise HapticBridgeError(f"grip is {shown(self.grip)}; it must name a site or a body")
 
+    @property
+    def grips(self) -> tuple[str, ...]:
+        """The grips of the device, one or, with a grip axis, two."""
+        axis = self.grip_axis
+        return (self.grip,) if axis is None else (self.grip, f"{JOINT}{axis.joint}")
+
 
 def check_grasps(grasps: Sequence[Grasp]) -> tuple[str, ...]:
-    """Returns the grips of the hands, in order.
+    """Returns the grips of the hands, in order; a grip axis is a hand of its own.
 
     Raises:
         SceneError: There are too few or too many, or two are equal.
     """
-    grips = tuple(grasp.grip for grasp in grasps)
+    grips = tuple(grip for grasp in grasps for grip in grasp.grips)
     if not 2 <= len(set(grips)) == len(grips) <= MAX_HANDS:
         raise SceneError(
             f"the hands hold {choices(grips)}; there must be 2 to {MAX_HANDS} different grips"
@@ -101,10 +168,12 @@ def devices_for_run(
         DeviceError: As there, or two hands have one device.
     """
     with ExitStack() as stack:
-        devices = tuple(
-            stack.enter_context(device_for_run(scene.of_hand(hand), grasp.device, clock))
-            for hand, grasp in enumerate(grasps)
-        )
+        devices: tuple[Device, ...] = ()
+        hand = 0
+        for grasp in grasps:
+            own, joint = scene.of_hand(hand), grasp.grip_axis.joint if grasp.grip_axis else ""
+            devices += (stack.enter_context(device_for_run(own, grasp.device, clock, joint)),)
+            hand += len(grasp.grips)
         if len({id(device) for device in devices}) < len(devices):
             raise DeviceError("two hands have one device; each needs a device of its own")
         yield devices
@@ -121,7 +190,7 @@ def resolve_hands(
 ) -> tuple[RunSetup, ...]:
     """Returns the setup of each hand; its own choices replace those of the options.
 
-    The method is ``implicit`` unless it is named.
+    A grip axis is a hand of its own. The method is ``implicit`` unless it is named.
 
     Raises:
         HapticBridgeError: As for ``RunSetup.resolve``, or a choice does not suit several hands.
@@ -130,23 +199,38 @@ def resolve_hands(
         options = replace(options, method="implicit")
     _refuse_unsuited(options)
     common = replace(options, scene_rate=options.rate, pipelined=False)
-    return tuple(
-        RunSetup.resolve(
-            scene.of_hand(hand),
-            info,
-            grasp.coupling,
-            replace(
-                common,
-                workspace=grasp.workspace or options.workspace,
-                limits=grasp.limits or options.limits,
-                clutch=grasp.clutch,
-                dead_man=grasp.dead_man,
-            ),
-            clock,
-            is_recorded=is_recorded,
+    setups: list[RunSetup] = []
+
+    def resolve(
+        info: DeviceInfo, coupling: Coupling | Mapping[str, float] | None, own: BridgeOptions
+    ) -> None:
+        held = scene.of_hand(len(setups))
+        setups.append(RunSetup.resolve(held, info, coupling, own, clock, is_recorded=is_recorded))
+
+    for grasp, info in zip(grasps, infos, strict=True):
+        own = replace(
+            common,
+            workspace=grasp.workspace or options.workspace,
+            limits=grasp.limits or options.limits,
+            clutch=grasp.clutch,
+            dead_man=grasp.dead_man,
         )
-        for hand, (grasp, info) in enumerate(zip(grasps, infos, strict=True))
-    )
+        resolve(info, grasp.coupling, own)
+        if grasp.grip_axis is None:
+            continue
+        if info.grip_axis is None:
+            raise DeviceError(
+                f"the device '{info.name}' has no grip axis for joint '{grasp.grip_axis.joint}'; "
+                "leave it out"
+            )
+        # a hand that closes the grip to its stop must not lose the joint there
+        axis, of_axis = info.grip_axis, limits_for(info.grip_axis, None)
+        limits = replace(of_axis if own.limits is None else own.limits, reach=math.inf)
+        limits = replace(limits, force=of_axis.force, torque=of_axis.torque)
+        workspace = grasp.grip_axis.workspace(scene.of_hand(len(setups)), axis)
+        own = replace(own, workspace=workspace, limits=limits)
+        resolve(axis, grasp.grip_axis.coupling, own)
+    return tuple(setups)
 
 
 def _refuse_unsuited(options: BridgeOptions) -> None:
@@ -177,7 +261,8 @@ class DeviceGroup:
     """Devices of several hands, read and written together like one.
 
     Args:
-        devices: One per hand, in order.
+        devices: The devices, in the order of their hands.
+        counts: Number of hands of each device: 1, or 2 with its grip axis.
 
     Attributes:
         info: Data sheet for the loop alone: real if any device is, prescribed if all are, and as
@@ -185,7 +270,7 @@ class DeviceGroup:
         external_flags: Receives each device's flags, (n,); the kernel's, once it is bound.
     """
 
-    def __init__(self, devices: Sequence[Device]) -> None:
+    def __init__(self, devices: Sequence[Device], counts: Sequence[int]) -> None:
         infos = [device.info for device in devices]
         durations = [info.duration for info in infos]
         known = [duration for duration in durations if duration is not None]
@@ -196,10 +281,15 @@ class DeviceGroup:
             is_prescribed=all(info.is_prescribed for info in infos),
             duration=max(known) if len(known) == len(durations) else None,
         )
-        self.external_flags: NDArray[np.int64] = np.zeros(len(devices), np.int64)
+        self.external_flags: NDArray[np.int64] = np.zeros(sum(counts), np.int64)
         self._devices = tuple(devices)
-        self._reads = tuple(checked_read(device) for device in devices)
-        self._writes = tuple(checked_write(device) for device in devices)
+        ends = np.cumsum(counts).tolist()
+        parts = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        self._counts = tuple(counts)
+        self._reads = tuple(zip(parts, map(checked_read, devices), strict=True))
+        # a device with one hand gets its wrench, (6,)
+        own = [part if count > 1 else part.start for part, count in zip(parts, counts, strict=True)]
+        self._writes = tuple(zip(own, map(checked_write, devices), strict=True))
 
     def start(self, period: float) -> NDArray[np.void]:
         """Starts every device; returns their poses, (n,), ``SAMPLE_DTYPE``.
@@ -207,7 +297,8 @@ class DeviceGroup:
         Raises:
             DeviceError: One of them cannot run at this period.
         """
-        return np.concatenate([device.start(period) for device in self._devices])
+        starts = zip(self._devices, self._counts, strict=True)
+        return np.concatenate([device.start(period)[:count] for device, count in starts])
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads every device's newest sample; returns 0, since each hand has flags of its own.
@@ -215,8 +306,9 @@ class DeviceGroup:
         Raises:
             DeviceLost: One of them is gone, or silent for too long.
         """
-        for hand, read in enumerate(self._reads):
-            self.external_flags[hand] = read(sample[hand : hand + 1])
+        for part, read in self._reads:
+            self.external_flags[part] = read(sample[part])
+            sample["buttons"][part] = sample["buttons"][part.start]
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -228,9 +320,9 @@ class DeviceGroup:
             DeviceLost: One of them is gone.
         """
         failed: DeviceError | None = None
-        for hand, write in enumerate(self._writes):
+        for part, write in self._writes:
             try:
-                write(wrench if wrench.ndim == 1 else wrench[hand])
+                write(wrench if wrench.ndim == 1 else wrench[part])
             except DeviceError as error:
                 failed = failed or error
         if failed is not None:

@@ -318,8 +318,10 @@ PRESCRIBED_MOTION = DeviceInfo(
 
 
 @contextmanager
-def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator[Device]:
-    """Yields a device, opened if it is named by a string.
+def device_for_run(
+    scene: Scene, device: Device | str, clock: Clock, grip_axis: str = ""
+) -> Iterator[Device]:
+    """Yields a device, opened if it is named by a string; ``grip_axis`` as for ``device_for``.
 
     A device that was opened here is closed if the body raises. One that the caller opened is not.
 
@@ -336,7 +338,7 @@ def device_for_run(scene: Scene, device: Device | str, clock: Clock) -> Iterator
         yield device
         return
     refuse_simulated_time(device, clock)
-    opened = device_for(scene, device)
+    opened = device_for(scene, device, grip_axis=grip_axis)
     with calling_on_error(opened.close):
         yield opened
 

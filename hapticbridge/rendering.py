@@ -18,13 +18,14 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
-    HANDLE,
+    JOINT,
     WELD_NAME,
     Scheme,
     added_actuators,
     added_id,
     coupling_ids,
-    name_of_hand,
+    handle_ids,
+    held_body,
 )
 from hapticbridge.kernel.law import GainRule, implicit_gains
 from hapticbridge.kernel.lossless import REACH, tree_of_tool
@@ -269,6 +270,23 @@ class RunCoupling:
             ),
         )
         return cls(requested, law, effective, remark)
+
+    def felt_at(self, grip: str, scale: float, force_scale: float) -> RunCoupling:
+        """Returns the coupling as a hand feels it: for a joint, at the fingers in N/m and N s/m.
+
+            K_fingers = scale · force_scale · K
+
+        Any other grip's coupling stays as it is.
+        """
+        if not grip.startswith(JOINT):
+            return self
+        ratio = scale * force_scale
+
+        def at_fingers(own: Coupling | None) -> Coupling | None:
+            return own and Coupling(ratio * own.stiffness, ratio * own.damping, 0.0, 0.0)
+
+        requested, law, effective = map(at_fingers, (self.requested, self.law, self.effective))
+        return RunCoupling(requested, law, effective, "at the fingers")
 
     def sentences(self) -> tuple[str, ...]:
         """Returns a sentence on translation, and one on rotation if it has a spring.
@@ -591,10 +609,11 @@ class Rehearsal:
         self.model, self.data = scene.model, mujoco.MjData(scene.model)
         mujoco.mj_copyData(self.data, scene.model, scene.data)
         self._parameters = replace(parameters, scheme=Scheme.IMPLICIT, substeps=1)
-        self._place = Place(scene.hand)
-        first = self.model.actuator_outadr[coupling_ids(self.model, scene.hand)[0]]
-        self._outputs = slice(first, first + 6)
-        self._handle = self.model.body_mocapid[self.model.body(name_of_hand(HANDLE, scene.hand)).id]
+        self._place, self._joint = Place(scene.hand), scene.joint
+        own = coupling_ids(self.model, scene.hand)
+        self._actuator, first = own[0], self.model.actuator_outadr[own[0]]
+        self._outputs = slice(first, first + len(own))
+        self._handle = handle_ids(self.model).get(scene.hand, -1)
 
     def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
         """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
@@ -605,8 +624,12 @@ class Rehearsal:
             handle: Pose of the handle.
             count: Largest number of steps.
         """
-        data = self.data
-        data.mocap_pos[self._handle], data.mocap_quat[self._handle] = handle[:3], handle[3:]
+        data, bias = self.data, self.model.actuator_biasprm[self._actuator].copy()
+        if self._joint < 0:
+            mocap = self.model.body_mocapid[self._handle]
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = handle[:3], handle[3:]
+        else:
+            self.model.actuator_biasprm[self._actuator, 0] = -bias[1] * handle[0]
         bound = BoundKernel(self.model, data, self._parameters, place=self._place)
         record, step = bound.state[0], bound.step
         finish, work = direct(finish_contacts, record), 0
@@ -618,9 +641,12 @@ class Rehearsal:
                 is_long = work > MAX_WORK and done >= LEAST_STEPS
                 if is_long or not np.isfinite(data.qvel).all():
                     return
-                yield data.actuator_force[self._outputs].copy()
+                wrench, forces = np.zeros(6), data.actuator_force[self._outputs]
+                wrench[: len(forces)] = forces
+                yield wrench
         finally:
             bound.release()
+            self.model.actuator_biasprm[self._actuator] = bias
 
 
 def static_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
@@ -637,7 +663,7 @@ def static_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
     """
     rehearsal, grip = Rehearsal(scene, parameters), scene.grip_pose()
     model, data = rehearsal.model, rehearsal.data
-    dofs = tree_of_tool(model, int(model.site_bodyid[model.site(scene.grip).id])).dofs
+    dofs = tree_of_tool(model, held_body(model, scene.grip)).dofs
     momentum, last, load = np.zeros(model.nv), 0.0, np.zeros(6)
     with closing(rehearsal.steps(grip, SETTLING_STEPS)) as steps:
         for count, wrench in enumerate(steps):
@@ -749,12 +775,14 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
 
     has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. The
     handle then holds the grip at ``TIPPED`` along the fastest mode φ. Zero if it does not topple,
-    or the mode does not move the grip.
+    or the mode does not move the grip, or a joint is held.
 
     Args:
         scene: The prepared scene, at its start; it is not changed.
         parameters: Parameters of the run.
     """
+    if scene.joint >= 0:
+        return 0.0
     rehearsal, site = Rehearsal(scene, parameters), scene.model.site(scene.grip).id
     model, data = rehearsal.model, rehearsal.data
     dofs = np.flatnonzero(tree_of_tool(model, int(model.site_bodyid[site])).dofs)

@@ -336,7 +336,7 @@ class Session:
         resources.callback(self._close_scene)
         # before the recorder and the scene are waited for, which may stand still
         resources.callback(self.device.close)
-        sample[:] = self.device.start(setup.period)
+        sample[:] = self.device.start(setup.period)[: sample.size]
         for each, own in zip(self._setups, self._samples(), strict=True):
             refuse_implausible_pose(each.info, own)
         self.hand_parameters = self._parameters(effective)

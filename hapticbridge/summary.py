@@ -21,7 +21,7 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.kernel.codes import Scheme, coupling_ids
+from hapticbridge.kernel.codes import JOINT, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
@@ -38,14 +38,14 @@ def is_always_implicit(model: mujoco.MjModel, grip: str) -> bool:
     References:
         ``kernel.lossless.ToolTree.is_never_free`` lists the causes.
     """
-    return tree_of_tool(model, int(model.site(grip).bodyid[0]), coupling_ids(model)).is_never_free
+    return tree_of_tool(model, held_body(model, grip), coupling_ids(model)).is_never_free
 
 
 def coarse_spring(model: mujoco.MjModel, grip: str, method: Method) -> str:
     """Returns the spring that makes a lossless coupling first order; empty if none does."""
     if method.scheme != Scheme.MIDPOINT:
         return ""
-    tree = tree_of_tool(model, int(model.site(grip).bodyid[0]), coupling_ids(model))
+    tree = tree_of_tool(model, held_body(model, grip), coupling_ids(model))
     return "" if tree.is_never_free else spring_at_the_end(model, tree)
 
 
@@ -329,7 +329,10 @@ class Summary:
         tool = self.peak_tool_force, self.peak_tool_torque
         reached = " and ".join(f"{name} limit" for name in self.limits_reached)
         reached = f" ({reached} reached)" if reached else ""
-        yield "peak", format_wrenches(hand if self.has_hand else None, tool) + reached
+        peak = format_wrenches(hand if self.has_hand else None, tool)
+        if self.grip.startswith(JOINT):
+            peak = f"{format_si(self.peak_force, 'N')} on the fingers"
+        yield "peak", peak + reached
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
         for name, joules in self.energies.items():
@@ -414,7 +417,7 @@ class Summary:
                 is_always_implicit=outcome.ticks > 0
                 and not parameters.scene_ticks
                 and not state["lossless"]["ticks"][0],
-            ),
+            ).felt_at(parameters.grip, parameters.scale, parameters.force_scale),
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
             is_certified=timekeeping.certified(is_run_certified(conditions, method)),

@@ -60,7 +60,33 @@ PEG_AND_BLOCK = """
 equal moments of inertia: a thin peg that a single hand spins at 100 rad/s creates energy in
 MuJoCo's explicit rotation, and that is not what is tested here."""
 
-SCENES = {"bar": BAR, "peg_and_block": PEG_AND_BLOCK}
+TONGS = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="half">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="0.2" diaginertia="2e-4 2e-4 2e-4"/>
+      <geom type="box" size="0.05 0.005 0.005"/>
+      <site name="left"/>
+      <body name="jaw" pos="0 0.012 0">
+        <joint name="hinge" axis="0 0 -1" range="-0.2 0.3" limited="true" stiffness="0.05"
+          springref="-0.1"/>
+        <inertial pos="0 0 0" mass="0.03" diaginertia="2e-5 2e-5 2e-5"/>
+        <geom type="box" size="0.05 0.004 0.004" pos="0.01 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Tongs with a spring: a hand holds one half, and a grip axis moves the hinge. Both halves have
+equal moments of inertia, as the peg."""
+
+SCENES = {"bar": BAR, "peg_and_block": PEG_AND_BLOCK, "tongs": TONGS}
+GRIPS = {"tongs": ("left", "joint:hinge")}
+LEVER = 10.0
+"""Motion of the hinge of the tongs per motion of the grip axis in rad/m."""
 
 START = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -71,9 +97,9 @@ UNPAID = 1e-6
 """Largest energy in J that both hands may have beyond what they put in; rounding leaves less."""
 
 
-def two_handed(xml: str) -> Scene:
-    """Loads a scene whose sites ``left`` and ``right`` are held."""
-    return load_scene(mujoco.MjSpec.from_string(xml), ("left", "right"))
+def two_handed(xml: str, grips: tuple[str, str] = ("left", "right")) -> Scene:
+    """Loads a scene whose sites ``left`` and ``right``, or others, are held."""
+    return load_scene(mujoco.MjSpec.from_string(xml), grips)
 
 
 def bound_hands(
@@ -98,15 +124,18 @@ def bound_hands(
         "scheme": method.scheme,
         "is_rigid": method.is_rigid,
     }
-    parameters = [
-        RunParameters(
-            grip=scene.of_hand(hand).grip,
-            coupling=laws[hand],
-            handle_origin=scene.of_hand(hand).grip_pose(),
-            **(basis | changes),  # type: ignore[arg-type] # a mapping of fields
+    parameters = []
+    for hand in range(2):
+        held = scene.of_hand(hand)
+        levers = dict.fromkeys(("scale", "force_scale"), LEVER if held.joint >= 0 else 1.0)
+        parameters.append(
+            RunParameters(
+                grip=held.grip,
+                coupling=laws[hand],
+                handle_origin=held.grip_pose(),
+                **(basis | levers | changes),  # type: ignore[arg-type] # a mapping of fields
+            )
         )
-        for hand in range(2)
-    ]
     return BoundHands(scene.model, scene.data, parameters)
 
 
@@ -242,8 +271,12 @@ def attacked(seed: int, scene: str, ticks: int = TICKS, *, is_joint: bool = True
                 damping_r,
             )
         )
+    grips = GRIPS.get(scene, ("left", "right"))
+    if has_axis := scene in GRIPS:
+        own = couplings[1]
+        couplings[1] = Coupling(own.stiffness / LEVER**2, own.damping / LEVER**2, 0.0, 0.0)
     bound = bound_hands(
-        two_handed(SCENES[scene]),
+        two_handed(SCENES[scene], grips),
         (couplings[0], couplings[1]),
         period,
         method,
@@ -256,6 +289,8 @@ def attacked(seed: int, scene: str, ticks: int = TICKS, *, is_joint: bool = True
     speed = 10 ** rng.uniform(-1.0, 0.3)
     noise = rng.standard_normal((ticks // 20 + 1, 2, 6)).repeat(20, axis=0)[:ticks]
     moves = noise * np.array([speed] * 3 + [3.0 * speed] * 3)
+    if has_axis:
+        moves[:, 1, 1:] = 0.0
     pace, lengths = rng.uniform(0.05, 0.6), rng.integers(5, 150, 2)
     habits = np.array([b, b_r, pace, *lengths, not is_joint], dtype=float)
     most, created, done = attack(bound.states, unmoved(), bound.rows, moves, habits)

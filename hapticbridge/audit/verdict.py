@@ -389,8 +389,8 @@ def _check_records(
 ) -> tuple[Fault | None, float]:
     """Compares all records with their second computation; collects energies and times per hand.
 
-    All hands share the scene's slack. What each did to the scene is its recorded ``coupling_work``,
-    which the second computation of its own records confirms.
+    All hands share the scene's slack, and the tank of the first one. What each did to the scene is
+    its recorded ``coupling_work``, which the second computation of its own records confirms.
 
     Returns:
         The earliest fault or None, and the due time of the last record in s.
@@ -412,7 +412,8 @@ def _check_records(
         faults = []
         for hand, (block, own) in enumerate(parts):
             run = hands[hand].run
-            balance = replace(own, slack=slack, throughput=throughput)
+            tank = parts[0][1].contact_tank
+            balance = replace(own, slack=slack, throughput=throughput, contact_tank=tank)
             energies[hand].add(block.ticks, balance)
             timings[hand].add(block, run.events)
             duration = 1e-9 * float(block.ticks["deadline_ns"][-1])
@@ -470,7 +471,7 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
             measured=parameters.effective,
             is_always_implicit=not parameters.scene_ticks
             and was_never_lossless(recording.count, recording.flags),
-        )
+        ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
         conditions = run_conditions(info, worst, method)
         return {
             "certified": is_run_certified(conditions, method),

@@ -35,7 +35,8 @@ from hapticbridge.guard import (
     Limits,
     refuse_simulated_time,
 )
-from hapticbridge.hands import Grasp, check_grasps
+from hapticbridge.hands import Grasp, GripAxis, check_grasps
+from hapticbridge.kernel.codes import held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import (
     AUTO,
@@ -49,6 +50,7 @@ from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
+from hapticbridge.scene.compile import custom_text
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.summary import WELD, coarse_spring, is_always_implicit
 from hapticbridge.units import format_si
@@ -71,7 +73,8 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     )
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.timestep, coupling, is_always_implicit=held)
-    for sentence in rendered.sentences():
+    scales = setup.workspace.scales
+    for sentence in rendered.felt_at(setup.scene.grip, *scales).sentences():
         err.print(f"  {sentence}")
     coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
     if coarse:
@@ -109,7 +112,6 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         )
     if not method.has_law:
         return  # printed once the weld is measured: ``announce_measured``
-    scales = setup.workspace.scales
     conditions = device_conditions(
         setup.info, setup.law, setup.period, *scales, setup.law_evaluations, method
     )
@@ -133,6 +135,8 @@ def _announce_slow(setup: RunSetup) -> None:
 
 def _without_motor(setup: RunSetup) -> Iterator[str]:
     """Yields a sentence for translation and for rotation if the device lacks axes of the kind."""
+    if setup.scene.joint >= 0:
+        return
     for kind, part, limit in (
         ("place", AXES[:3], format_si(setup.limits.hold_force, "N")),
         ("orientation", AXES[3:], f"{format_si(setup.limits.hold_torque, 'N m')} (--hold-torque)"),
@@ -194,7 +198,9 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
     """Yields a sentence on the load of the tool at rest, if it is a heavy one."""
     load = parameters.guarding.idle_force - setup.guard.idle_force
     in_hand = setup.workspace.scales[1] * load
-    if not (setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf):
+    if setup.scene.joint >= 0 or not (
+        setup.method.has_law and HEAVY * setup.limits.force < in_hand < math.inf
+    ):
         return
     sag = format_si(load / parameters.coupling.stiffness, "m")
     if load > OTHER_LOAD * _weight_of_tool(setup.scene):
@@ -217,7 +223,7 @@ def _weight_of_tool(scene: Scene) -> float:
     """Returns the weight in N of all that moves with the tool; gravcomp does not count."""
     model = scene.model
     trees = model.body_treeid
-    mass = model.body_mass[trees == trees[model.site(scene.grip).bodyid[0]]]
+    mass = model.body_mass[trees == trees[held_body(model, scene.grip)]]
     return float(mass.sum() * np.linalg.norm(model.opt.gravity))
 
 
@@ -261,6 +267,12 @@ class Run:
     """Refuse a scene that must be changed to be felt: options that exclude the coupling (solver
     PGS, noslip_iterations, sleep), force limits of joints, a tool inside something or too heavy.
     By default it is changed, with a line for each change."""
+    grip_axis: Annotated[str | None, tyro.conf.arg(metavar="JOINT")] = None
+    """Hinge or slide of the scene that the device's grip axis moves, as the jaw of pliers. By
+    default the one that the scene names in its custom text 'grip_axis'; 'none' leaves it free."""
+    grip_scale: float | None = None
+    """Motion of that joint per motion of the grip, in rad/m or without unit; below 0 for a joint
+    that falls while the grip closes. By default the joint's range over the grip's travel."""
     device: str = "simulated"
     """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
     (CSV or recording), 'mouse' (drag the handle in the view, which it shows by itself), or a device
@@ -269,8 +281,9 @@ class Run:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="GRIP=DEVICE")
     ] = ()
     """Hold a grip with a device, in place of --grip and --device, once per hand: --hand
-    wrench=falcon --hand bolt=spacemouse. Both are named as for those two. Scale, axes, limits and
-    gains apply to every hand. The method is 'implicit' or 'compensated'."""
+    wrench=falcon --hand bolt=spacemouse. Both are named as for those two; GRIP+JOINT names what the
+    device's grip axis moves. Scale, axes, limits and gains apply to every hand. The method is
+    'implicit' or 'compensated'."""
     duration: float | None = None
     """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
     default the run ends with the device's motion; without an end of it with Ctrl-C, or after 5 s of
@@ -384,10 +397,12 @@ class Run:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
         if self.hand:
-            pairs = self._grips_and_devices()
-            if len(pairs) > 1:
-                return self._run_hands(pairs, clock)
-            return replace(self, hand=(), grip=pairs[0][0], device=pairs[0][1]).execute()
+            held = self._held()
+            if len(held) > 1:
+                return self._run_hands(held, clock)
+            grip, axis, name = held[0]
+            alone = replace(self, hand=(), grip=grip, device=name, grip_axis=axis or self.grip_axis)
+            return alone.execute()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         is_viewed = self.view or self.device.partition(":")[0] == "mouse"
         if self.port is not None and not is_viewed:
@@ -406,27 +421,48 @@ class Run:
                     if self.substeps is not None
                     else replace(self, substeps=self._own_substeps(source, scene))
                 )
-            device = device_for(scene, self.device, notify)
+            joint = self._own_grip_axis(scene)
+            device = device_for(scene, self.device, notify, joint)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
+            if joint and self.grip_axis is None and device.info.grip_axis is None:
+                notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
+            elif joint:
+                grasp = self._grasp(self.grip, joint, device)
+                grasp = replace(grasp, clutch=self.clutch, dead_man=self.dead_man)
+                scene = compile_scene(source, grasp.grips, as_is=self.as_is, warns=False)
+                one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
+                return one._feel(scene, [grasp], clock, stack, window, interrupts)
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
-    def _grips_and_devices(self) -> list[tuple[str, str]]:
-        """Returns grip and device of each --hand."""
+    def _own_grip_axis(self, scene: Scene) -> str:
+        """Returns the joint that a grip axis moves, the user's or the scene's; empty for none."""
+        own = custom_text(scene.model, "grip_axis") if self.grip_axis is None else self.grip_axis
+        return "" if own == "none" else own
+
+    def _grasp(self, grip: str, joint: str, device: Device) -> Grasp:
+        """Returns what a hand holds, with the joint of its grip axis if that is not empty."""
+        axis = GripAxis(joint, self.grip_scale) if joint else None
+        limits = self._options(device.info).limits
+        return Grasp(grip, device, coupling=self._gains(), limits=limits, grip_axis=axis)
+
+    def _held(self) -> list[tuple[str, str, str]]:
+        """Returns grip, joint of the grip axis (may be empty) and device of each --hand."""
         if self.grip != "grip" or self.device != "simulated":
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
-        pairs = []
+        held = []
         for each in self.hand:
             grip, _, device = each.partition("=")
+            grip, _, joint = grip.partition("+")
             if not grip or not device:
                 raise HapticBridgeError(f"--hand is {each!r}; it must be GRIP=DEVICE")
-            pairs.append((grip, device))
-        return pairs
+            held.append((grip, joint, device))
+        return held
 
-    def _run_hands(self, pairs: Sequence[tuple[str, str]], clock: Clock) -> int:
-        """Runs several hands, each with its grip and device; returns the exit code."""
-        for _, device in pairs:
+    def _run_hands(self, held: Sequence[tuple[str, str, str]], clock: Clock) -> int:
+        """Runs several hands, each with its grip, grip axis and device; returns the exit code."""
+        for _, _, device in held:
             refuse_simulated_time(device, clock)
-        is_mouse = any(device.partition(":")[0] == "mouse" for _, device in pairs)
+        is_mouse = any(device.partition(":")[0] == "mouse" for _, _, device in held)
         if self.view or self.port is not None or is_mouse:
             raise HapticBridgeError(
                 "the view shows one hand: --view, --port and the mouse exclude --hand"
@@ -434,17 +470,16 @@ class Run:
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading and trying the scene …"), compiling(self.scene):
-                grasps = [Grasp(grip) for grip, _ in pairs]
-                check_grasps(grasps)
+                axes = {grip: GripAxis(joint) for grip, joint, _ in held if joint}
+                grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
                 source = read_scene(self.scene, **settings_from(self.settings))
-                grips = tuple(grip for grip, _ in pairs)
                 scene = compile_scene(source, grips, as_is=self.as_is)
             grasps = []
-            for hand, (grip, name) in enumerate(pairs):
-                opened = device_for(scene.of_hand(hand), name, notify)
+            for grip, joint, name in held:
+                own = scene.of_hand(grips.index(grip))
+                opened = device_for(own, name, notify, joint)
                 stack.callback(opened.close)
-                limits = self._options(opened.info).limits
-                grasps.append(Grasp(grip, opened, coupling=self._gains(), limits=limits))
+                grasps.append(self._grasp(grip, joint, opened))
             return self._feel(scene, grasps, clock, stack, None, interrupts)
 
     def _gains(self) -> dict[str, float]:

@@ -13,6 +13,7 @@ from hapticbridge.device.base import Device as Device
 from hapticbridge.device.base import DeviceInfo as DeviceInfo
 from hapticbridge.device.registry import device_for as device_for
 from hapticbridge.device.registry import open_device as open_device
+from hapticbridge.device.simulated.device import GrippingDevice as GrippingDevice
 from hapticbridge.device.simulated.device import SimulatedDevice as SimulatedDevice
 from hapticbridge.device.simulated.device import scene_hand as scene_hand
 from hapticbridge.device.simulated.hand import DEFAULT_HAND as DEFAULT_HAND

@@ -123,7 +123,7 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
-_LATER = {"serial", "reach", "buttons", "sensed"}
+_LATER = {"serial", "reach", "buttons", "sensed", "grip_axis"}
 """Fields that the first recordings lack."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
@@ -187,6 +187,8 @@ class DeviceInfo:
             the stops. None if unknown.
         sensed: Further axes that it senses without a motor, such as those of a wrist; by default
             none. The hand does not feel what its motion about them does.
+        grip_axis: Data sheet of the grip between the fingers, with the one axis ``x``: how far it
+            is closed in m. Its ``reach`` is its travel. None without one.
 
     Raises:
         DeviceError: A value is of the wrong type, not finite, or out of range.
@@ -212,6 +214,7 @@ class DeviceInfo:
     reach: float | None = None
     buttons: int | None = None
     sensed: tuple[str, ...] = ()
+    grip_axis: DeviceInfo | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -234,6 +237,9 @@ class DeviceInfo:
                 "order, and none of axes"
             )
         object.__setattr__(self, "sensed", tuple(self.sensed))
+        axis = self.grip_axis
+        if axis is not None and (not isinstance(axis, DeviceInfo) or axis.axes != AXES[:1]):
+            raise DeviceError(f"grip_axis = {shown(axis)}: must be a DeviceInfo with the axis x")
         for name in ("is_prescribed", "is_real"):
             if not isinstance(getattr(self, name), bool):
                 raise DeviceError(f"{name} = {shown(getattr(self, name))}: must be true or false")
@@ -310,6 +316,9 @@ class DeviceInfo:
             )
         if missing := names - _LATER - values.keys():
             raise DeviceError(f"device data lacks the keys {choices(missing)}")
+        axis = values.get("grip_axis")
+        if isinstance(axis, dict) and axis.get("grip_axis") is None:
+            values["grip_axis"] = cls.from_json(json.dumps(axis))
         return cls(**values)
 
 
@@ -321,6 +330,9 @@ class Device(Protocol):
     ``read`` returns the pose of ``start`` if the device has not moved. A wrench written in tick k
     acts until the next write. No call may block the loop for longer than a fraction of the period:
     a slow transport reads in a thread of its own, and ``read`` returns its newest sample.
+
+    A device with a grip axis returns two samples, the second that of the grip axis along x. If that
+    axis is coupled, ``read`` gets two samples and ``write`` two wrenches, (2, 6); else one of each.
 
     An object with these calls can be given to a ``Bridge``. A package of its own selects it by a
     name (``guide/device_package.md``); ``testing.device_contract`` tests it.
@@ -376,7 +388,7 @@ class Device(Protocol):
             period: The loop's period in s, finite and > 0.
 
         Returns:
-            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``.
+            The pose before the first tick, shape (1,), ``SAMPLE_DTYPE``; (2,) with a grip axis.
 
         Raises:
             DeviceError: The device cannot run at this period.

@@ -14,10 +14,11 @@ from typing import Any
 from hapticbridge.device.base import Device, calling_on_error
 from hapticbridge.device.driver import Driver, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
-from hapticbridge.device.simulated.device import SimulatedDevice, scene_hand
+from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.scene import Scene
 
 # Table of the hardware drivers; a driver is imported when one of its devices is opened
@@ -230,12 +231,15 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
     return _OPENERS[name](rest, options)
 
 
-def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Device:
+def device_for(
+    scene: Scene, spec: str, notify: Notify = ignore_message, grip_axis: str = ""
+) -> Device:
     """Opens a device for a scene; a simulated device takes its hand and its path from the scene.
 
     The hand is the scene's (``scene_hand``) and follows ``NAME.csv`` beside the scene, if present;
-    one of several hands follows ``NAME_GRIP.csv``.
-    Every option in the specification takes precedence over the scene.
+    one of several hands follows ``NAME_GRIP.csv``. Every option in the specification takes
+    precedence over the scene. If its grip axis moves a joint, ``grip_axis``, a simulated device has
+    one, whose fingers follow ``NAME_JOINT.csv``.
 
     Raises:
         DeviceError: As for ``open_device``.
@@ -248,11 +252,29 @@ def device_for(scene: Scene, spec: str, notify: Notify = ignore_message) -> Devi
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
-    own = f"{scene.name}_{scene.grip}" if scene.other_grips else scene.name
-    path = scene.path.with_name(f"{own}.csv")
+    others = [each for each in scene.other_grips if each != f"{JOINT}{grip_axis}"]
+    grip = scene.grip.removeprefix(JOINT)
+    path = scene.path.with_name(f"{scene.name}_{grip}.csv" if others else f"{scene.name}.csv")
     if path.is_file():
         options["path"] = path
-    return open_device(spec, notify=notify, **options)
+    device = open_device(spec, notify=notify, **options)
+    if not grip_axis:
+        return device
+    path = scene.path.with_name(f"{scene.name}_{grip_axis}.csv")
+    fingers = SimulatedDevice(
+        mass=FINGERS[0],
+        damping=FINGERS[1],
+        hand=Hand(mass=FINGERS[2], stiffness=FINGERS[3], damping=FINGERS[4]),
+        path=path if path.is_file() else None,
+        force_limit=FINGERS[5],
+        dof=3,
+    )
+    return GrippingDevice(device, fingers, FINGERS[6])
+
+
+FINGERS = 0.05, 2.0, 0.02, 1500.0, 8.0, 8.0, 0.03
+"""Grip axis of a simulated device: inertia in kg and damping in N s/m; mass, stiffness and damping
+of the fingers in kg, N/m and N s/m; its largest force in N and travel in m, those of a sigma.7."""
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

@@ -42,25 +42,54 @@ def added_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     return int(mujoco.mj_name2id(model, kind, name))
 
 
+JOINT = "joint:"
+"""Start of a grip that is a joint, as in ``joint:hinge``: a hand moves it along its one axis."""
+
+
+def held_joint(model: mujoco.MjModel, grip: str) -> int:
+    """Returns the id of the joint that a grip names, or -1 if it names a site."""
+    name = grip.removeprefix(JOINT)
+    if name == grip or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, grip) >= 0:
+        return -1
+    return int(model.joint(name).id)
+
+
+def held_body(model: mujoco.MjModel, grip: str) -> int:
+    """Returns the id of the body that a grip moves, that of its site or of its joint."""
+    joint = held_joint(model, grip)
+    return int(model.site_bodyid[model.site(grip).id] if joint < 0 else model.jnt_bodyid[joint])
+
+
 def name_of_hand(name: str, hand: int) -> str:
     """Returns the name that a hand has, from hand 0: the name itself, then ``…_2``, ``…_3``."""
     return name if hand == 0 else f"{name}_{hand + 1}"
 
 
 def coupling_ids(model: mujoco.MjModel, hand: int = 0) -> tuple[int, ...]:
-    """Returns the ids of the six actuators of a hand's coupling, in the order of a wrench."""
+    """Returns the ids of the six actuators of a hand's coupling, in the order of a wrench.
+
+    The coupling to a joint has the first one alone.
+    """
     kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-    return tuple(added_id(model, kind, name_of_hand(name, hand)) for name in COUPLING_ACTUATORS)
+    found = (added_id(model, kind, name_of_hand(name, hand)) for name in COUPLING_ACTUATORS)
+    return tuple(each for each in found if each >= 0)
 
 
 def hand_count(model: mujoco.MjModel) -> int:
-    """Returns the number of hands that a scene has handles for; 0 without a handle."""
-    kind, count = mujoco.mjtObj.mjOBJ_BODY, 1
-    if added_id(model, kind, HANDLE) < 0:
+    """Returns the number of hands that a scene has couplings for; 0 without a handle."""
+    if added_id(model, mujoco.mjtObj.mjOBJ_BODY, HANDLE) < 0:
         return 0
-    while mujoco.mj_name2id(model, kind, name_of_hand(HANDLE, count)) >= 0:
+    count = 1
+    while coupling_ids(model, count):
         count += 1
     return count
+
+
+def handle_ids(model: mujoco.MjModel) -> dict[int, int]:
+    """Returns the body id of each hand's handle; a hand that holds a joint has none."""
+    kind, hands = mujoco.mjtObj.mjOBJ_BODY, range(hand_count(model))
+    found = {hand: added_id(model, kind, name_of_hand(HANDLE, hand)) for hand in hands}
+    return {hand: body for hand, body in found.items() if body >= 0}
 
 
 def added_actuators(model: mujoco.MjModel) -> tuple[int, ...]:

@@ -46,6 +46,10 @@ POSE_DTYPE = np.dtype(
 ``handle_step`` in m and ``handle_turn`` in rad are the handle's motion in the present tick."""
 
 
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+"""Quaternion without a rotation."""
+
+
 @compiled
 def scene_from_device(axes: NDArray[np.float64], v: Vector) -> Vector:
     """Returns A v, with A row by row."""
@@ -195,8 +199,10 @@ def note_tool(pose: Part, position: Vector, quaternion: Quaternion) -> None:
 
 @compiled
 def grip_pose(mj: Part) -> tuple[Vector, Quaternion]:
-    """Returns the grip's pose as MuJoCo's kinematics left it."""
+    """Returns the grip's pose as MuJoCo's kinematics left it; (q, 0, 0) for a joint at q."""
     grip = mj.grip_site_id
+    if mj.held_qpos != 0:
+        return (floats(mj.held_qpos, 1)[0], 0.0, 0.0), UPRIGHT
     position = vector_of(floats(mj.site_xpos + 24 * grip, 3))
     return position, canonical(quaternion_of(floats(mj.site_xquat + 32 * grip, 4)))
 
@@ -224,12 +230,15 @@ def tool_after_step(s: State) -> tuple[Vector, Quaternion, Vector, Vector]:
 def place_handle(s: State, substep: int) -> Quaternion:
     """Puts the handle's mocap body to its pose in this substep; returns its orientation.
 
-    The handle moves uniformly within a tick and reaches its new pose in the last substep.
+    The handle moves uniformly within a tick and reaches its new pose in the last substep. That of a
+    joint has no body.
     """
     mj = s.mj
     pose = s.pose
     position = vector_of(pose.handle_position)
     orientation = quaternion_of(pose.handle_quaternion)
+    if mj.held_qpos != 0:
+        return orientation
     remaining = (s.run.substeps - 1 - substep) / s.run.substeps
     if remaining > 0.0:
         position = subtract(position, scaled(remaining, vector_of(pose.handle_step)))

@@ -201,8 +201,12 @@ def law_wrench(
 def command_handle_velocity(s: State, orientation: Quaternion) -> None:
     """Writes the handle's velocity in its own axes, R_hᵀ δh/T and R_hᵀ δφ_h/T, as control.
 
-    The actuators need it because a mocap body has no velocity of its own.
+    The actuators need it because a mocap body has no velocity of its own. The actuator of a joint
+    gets the handle's position too, as its bias (``set_gains``).
     """
+    if s.mj.held_qpos != 0:
+        set_gains(s, 1.0)
+        return
     to_handle = conjugate(orientation)
     ctrl = floats(s.mj.ctrl + 8 * s.mj.coupling_ctrl_adr, 6)
     rate = 1.0 / s.run.period
@@ -219,8 +223,19 @@ def spring_energy(stiffness: float, length: float, limit: float) -> float:
 
 @compiled
 def set_gains(s: State, share: float) -> None:
-    """Gives the coupling's actuators a share of their gains."""
+    """Gives the coupling's actuators a share of their gains.
+
+    The actuator of a joint has no handle to refer to; its bias is c (K h + B' δh/T) instead.
+    """
     mj = s.mj
+    if mj.held_qpos != 0:
+        part = share * s.level.share[0]
+        bias = floats(mj.biasprm + 8 * _GAINS * mj.coupling_actuator_id, 3)
+        stiffness, damping = s.coupling.gains[1], s.coupling.gains[2]
+        speed = s.pose.handle_step[0] / s.run.period
+        bias[0] = part * (stiffness * s.pose.handle_position[0] + damping * speed)
+        bias[1], bias[2] = -part * stiffness, -part * damping
+        return
     for axis in range(6):
         first = 0 if axis < 3 else 3
         part = share * s.level.share[0 if axis < 3 else 1]
@@ -242,6 +257,8 @@ def applied_wrench(s: State, share: float) -> tuple[Vector, Vector]:
         s: The bound state after a step of the integrator ``discrete``.
         share: Share of the gains, as given to ``set_gains``.
     """
+    if s.mj.held_qpos != 0:
+        return (_applied(s, 0, share), 0.0, 0.0), (0.0, 0.0, 0.0)
     force = (_applied(s, 0, share), _applied(s, 1, share), _applied(s, 2, share))
     torque = (_applied(s, 3, share), _applied(s, 4, share), _applied(s, 5, share))
     return force, torque

@@ -123,7 +123,7 @@ def note_moved_mocap_bodies(s: State) -> None:
     previous = floats(mj.mocap_previous, 7 * mj.nmocap)
     shift = floats(mj.mocap_shift, 6 * mj.nmocap)
     for m in range(mj.nmocap):
-        if mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.coupling_count:
+        if mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.handle_count:
             continue
         has_moved = False
         for i in range(3):
@@ -258,7 +258,7 @@ def opened_by_mocap(s: State, contact: int) -> float:
     change = 0.0
     for side in range(2):
         m = mocap_of[body_of[geoms[side]]]
-        if m < 0 or mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.coupling_count:
+        if m < 0 or mj.handle_mocap_id <= m < mj.handle_mocap_id + mj.handle_count:
             continue
         p, d = 3 * m, 6 * m
         arm = subtract(vector_of(point), vector_of(positions[p:]))
@@ -308,7 +308,7 @@ def _actuator_work(s: State) -> float:
     power = 0.0
     for i in range(mj.nv):
         power += force[i] * qvel[i]
-    first, own = mj.coupling_output_adr, 6 * mj.coupling_count
+    first, own = mj.coupling_output_adr, mj.coupling_outputs
     forces = floats(mj.actuator_force, first + own)
     for output in range(first, first + own):
         power -= forces[output] * moment_dot(s, output, mj.qvel)

@@ -316,7 +316,9 @@ _IDS = (
     "coupling_actuator_id",
     "coupling_output_adr",
     "coupling_ctrl_adr",
-    "coupling_count",
+    "coupling_outputs",
+    "handle_count",
+    "held_qpos",
     "metered_mocaps",
 )
 _FACTS = (

@@ -36,14 +36,16 @@ from numpy.typing import NDArray
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
-    COUPLING_ACTUATORS,
     HANDLE,
     WELD_NAME,
     Scheme,
     State,
+    added_actuators,
     added_id,
     coupling_ids,
-    hand_count,
+    handle_ids,
+    held_body,
+    held_joint,
     name_of_hand,
 )
 from hapticbridge.kernel.colliders import bind_colliders
@@ -215,6 +217,7 @@ class BoundKernel:
         self._hand, self._meters_scene = place.hand, place.hand == 0 or place.state is None
         # the addresses in the state point into them
         self._model, self._data, self._loop = model, data, loop
+        self._grip = parameters.grip
         self._owned: dict[str, NDArray[np.generic]] = {}
         self._restore_springs: Callable[[State], None] | None = None
         self._bind_model(parameters)
@@ -321,26 +324,27 @@ class BoundKernel:
             mj[name] = value
         self._own(owned)
         first, *_ = coupling_ids(model, self._hand)
-        handle = name_of_hand(HANDLE, self._hand)
-        mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, handle)
-        handle_id = added_id(model, mujoco.mjtObj.mjOBJ_BODY, handle)
-        hands = hand_count(model)
-        mj["coupling_count"] = hands
-        mj["metered_mocaps"] = model.nmocap - hands if self._meters_scene else 0
-        mj["handle_mocap_id"] = model.body_mocapid[handle_id]
-        grip = mj["grip_site_id"] = model.site(parameters.grip).id
-        mj["grip_body_id"] = model.site_bodyid[grip]
+        handles, own = handle_ids(model), len(added_actuators(model))
+        mj["coupling_outputs"], mj["handle_count"] = own, len(handles)
+        mj["metered_mocaps"] = model.nmocap - len(handles) if self._meters_scene else 0
+        mj["grip_body_id"] = held_body(model, self._grip)
+        joint, grip = held_joint(model, self._grip), -1
+        if joint >= 0:
+            mj["held_qpos"] = data.qpos[model.jnt_qposadr[joint] :].ctypes.data
+        else:
+            handle = name_of_hand(HANDLE, self._hand)
+            mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, handle)
+            mj["handle_mocap_id"] = model.body_mocapid[handles[self._hand]]
+            grip = mj["grip_site_id"] = model.site(self._grip).id
         mj["weld_id"] = added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
-        mj["has_actuators"] = model.nactuator > hands * len(COUPLING_ACTUATORS) or bool(
-            np.any(model.jnt_actgravcomp)
-        )
+        mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
             mj["tool_map_size"] = self._owned["tool_map"].size
-        else:
+        elif joint < 0:
             self._own({"geom_is_tool": tool_geoms(model, grip)})
         if parameters.scheme == Scheme.MIDPOINT and not parameters.scene_ticks:
             body = int(model.site_bodyid[grip])
@@ -412,8 +416,12 @@ class BoundKernel:
         """Takes the present poses of the tool and of the scene's mocap bodies."""
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
-        grip = int(self._record["mj"]["grip_site_id"])
-        set_tool(self._record["pose"], data.site_xpos[grip], data.site_xquat[grip])
+        if self._record["mj"]["held_qpos"]:
+            joint = model.jnt_qposadr[held_joint(model, self._grip)]
+            set_tool(self._record["pose"], np.array([data.qpos[joint], 0.0, 0.0]), np.eye(4)[0])
+        else:
+            grip = int(self._record["mj"]["grip_site_id"])
+            set_tool(self._record["pose"], data.site_xpos[grip], data.site_xquat[grip])
         mocap_previous = self._owned["mocap_previous"]
         mocap_previous[: model.nmocap, :3] = data.mocap_pos
         mocap_previous[: model.nmocap, 3:] = data.mocap_quat
@@ -479,8 +487,7 @@ def _whole_gains(model: mujoco.MjModel, parameters: RunParameters, hand: int) ->
         forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
         return (*forces, *torques)
     gains: list[float] = []
-    first, *_ = coupling_ids(model, hand)
-    for actuator in (first, first + 3):
+    for actuator in coupling_ids(model, hand)[::3]:
         bias = model.actuator_biasprm[actuator]
         gains += [float(model.actuator_gainprm[actuator, 0]), -float(bias[1]), -float(bias[2])]
-    return tuple(gains)
+    return (*gains, 0.0, 0.0, 0.0)[:6]

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body
 from hapticbridge.scene.source import SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
@@ -199,7 +199,7 @@ def check_model(model: mujoco.MjModel, grip: str) -> list[str]:
                 f"{_body_name(model, body_id)} has mass {mass:g} kg and inertia "
                 f"{inertia.tolist()} kg m²; all must be finite"
             )
-    chain = ancestors(model, int(model.site(grip).bodyid[0]))
+    chain = ancestors(model, held_body(model, grip))
     if not any(model.body_dofnum[body_id] for body_id in chain):
         raise SceneError(
             f"grip '{grip}' sits on {_body_name(model, chain[0])}, which cannot move; put it on a "

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from hapticbridge.kernel.codes import HANDLE, coupling_ids, hand_count, name_of_hand
+from hapticbridge.kernel.codes import coupling_ids, handle_ids
 from hapticbridge.scene.source import SourceFile
 
 # Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
@@ -17,7 +17,8 @@ from hapticbridge.scene.source import SourceFile
 def custom_text(model: mujoco.MjModel, name: str) -> str:
     """Returns the custom text of a name; empty if the scene has none.
 
-    The bridge uses the text ``about``, a sentence that describes the scene.
+    The bridge uses the text ``about``, a sentence that describes the scene, and ``grip_axis``, the
+    joint that a device's grip axis moves.
     """
     text_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
     if text_id < 0:
@@ -47,10 +48,10 @@ START_KEYFRAME = "home"
 
 def handles(model: mujoco.MjModel, grip: str) -> tuple[tuple[int, int], ...]:
     """Returns the ids of body and grip's site of every handle; ``grip`` is that of the first."""
-    found = [(int(model.body(HANDLE).id), int(model.site(grip).id))]
-    for hand in range(1, hand_count(model)):
-        site_id = int(model.actuator_trnid[coupling_ids(model, hand)[0], 0])
-        found.append((int(model.body(name_of_hand(HANDLE, hand)).id), site_id))
+    first, *others = handle_ids(model).items()
+    found = [(first[1], int(model.site(grip).id))]
+    for hand, body_id in others:
+        found.append((body_id, int(model.actuator_trnid[coupling_ids(model, hand)[0], 0])))
     return tuple(found)
 
 

@@ -4,6 +4,8 @@ A grip is the name of a site, the name of a body, or ``BODY@x,y,z`` with a point
 frame. A body alone is held at its centre of mass, and a body without a name goes by its number. For
 a body, a site is added whose name is the grip as written, so a recording and a what-if find it by
 that name. If a site and a body share a name, the site is the grip.
+
+``joint:NAME`` is a hinge or slide, which a hand moves along its one axis, as a grip axis does.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.errors import SceneError
+from hapticbridge.errors import SceneError, choices
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.scene.compile import START_KEYFRAME, compiled
 from hapticbridge.scene.source import SourceFile
 
@@ -118,14 +121,17 @@ def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) ->
 
     Args:
         spec: The user's scene; unchanged if the grip is one of its sites.
-        grip: Name of a site, ``BODY`` or ``BODY@x,y,z``.
+        grip: Name of a site, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``.
         sources: Files of the scene.
 
     Raises:
-        SceneError: The scene has no such site and no such body; the message offers others. Or the
+        SceneError: The scene has no such site, body or joint; the message offers others. Or the
             point is not three finite numbers.
     """
     bodies = {body.name: body for body in spec.bodies if body.name}
+    if grip.startswith(JOINT) and all(site.name != grip for site in spec.sites):
+        _check_joint(spec, grip.removeprefix(JOINT))
+        return []
     if grip and any(site.name == grip for site in spec.sites):
         if grip not in bodies:
             return []
@@ -147,6 +153,14 @@ def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) ->
     site.pos, site.quat, site.fromto = point, (1.0, 0.0, 0.0, 0.0), np.full(6, np.nan)
     site.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     return []
+
+
+def _check_joint(spec: mujoco.MjSpec, name: str) -> None:
+    kinds = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
+    held = [joint.name for joint in spec.joints if joint.type in kinds and joint.name]
+    if name not in held:
+        offered = f"its hinges and slides are {choices(held)}" if held else "it has none"
+        raise SceneError(f"the scene has no hinge or slide '{name}' to hold; {offered}")
 
 
 def _point_of(grip: str, text: str) -> list[float]:

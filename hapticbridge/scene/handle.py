@@ -22,9 +22,11 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
     HANDLE,
+    JOINT,
     PREFIX,
     WELD_NAME,
     added_actuators,
+    held_body,
     name_of_hand,
 )
 from hapticbridge.scene.checks import (
@@ -193,12 +195,15 @@ def _static_force(model: mujoco.MjModel, data: mujoco.MjData, axis: int) -> floa
 def attach_handles(spec: mujoco.MjSpec, grips: Sequence[str]) -> None:
     """Adds a mocap body, the handle, with its site, and six coupling actuators for every hand.
 
+    A hand that holds a joint has no handle in the scene, and one actuator.
+
     Args:
         spec: The user's scene; changed in place.
-        grips: Name of the site that each hand holds; two hands may hold one tool.
+        grips: Site or joint that each hand holds; two hands may hold one tool.
 
     Raises:
-        SceneError: The scene has a name that starts with ``PREFIX``.
+        SceneError: The scene has a name that starts with ``PREFIX``, or the first hand holds a
+            joint.
     """
     elements = (*spec.bodies, *spec.sites, *spec.actuators, *spec.equalities)
     if taken := [each.name for each in elements if each.name.startswith(PREFIX)]:
@@ -206,11 +211,22 @@ def attach_handles(spec: mujoco.MjSpec, grips: Sequence[str]) -> None:
             f"the scene has the name '{taken[0]}', and names that start with '{PREFIX}' are those "
             "that the bridge adds; rename it"
         )
+    sites = {site.name for site in spec.sites}
     for hand, grip in enumerate(grips):
+        if grip.startswith(JOINT) and grip not in sites:
+            if hand == 0:
+                raise SceneError(
+                    f"'{grip}' can only be held beside a site or a body; name that grip first"
+                )
+            actuator = _bare_actuator(spec, name_of_hand(COUPLING_ACTUATORS[0], hand), 0)
+            actuator.trntype, actuator.target = mujoco.mjtTrn.mjTRN_JOINT, grip.removeprefix(JOINT)
+            actuator.refsite = actuator.slidersite = ""
+            continue
         _attach_handle(spec, name_of_hand(HANDLE, hand))
         for axis, name in enumerate(COUPLING_ACTUATORS):
-            actuator = name_of_hand(name, hand)
-            _add_coupling_actuator(spec, actuator, axis, (grip, name_of_hand(HANDLE, hand)))
+            actuator = _bare_actuator(spec, name_of_hand(name, hand), axis)
+            actuator.trntype, actuator.slidersite = mujoco.mjtTrn.mjTRN_SITE, ""
+            actuator.target, actuator.refsite = grip, name_of_hand(HANDLE, hand)
 
 
 def _attach_handle(spec: mujoco.MjSpec, name: str) -> None:
@@ -223,19 +239,13 @@ def _attach_handle(spec: mujoco.MjSpec, name: str) -> None:
     body.name = body.sites[0].name = name
 
 
-def _add_coupling_actuator(
-    spec: mujoco.MjSpec, name: str, axis: int, sites: tuple[str, str]
-) -> None:
+def _bare_actuator(spec: mujoco.MjSpec, name: str, axis: int) -> mujoco.MjsActuator:
     """Adds an actuator with every field set, so that no <default> of the scene applies.
 
-    ``sites`` are grip and handle.
+    Its transmission is left to the caller.
     """
     actuator = spec.add_actuator(name=name)
-    gear = np.zeros(6)
-    gear[axis] = 1.0
-    actuator.trntype = mujoco.mjtTrn.mjTRN_SITE
-    actuator.target, actuator.refsite, actuator.slidersite = *sites, ""
-    actuator.gear = gear
+    actuator.gear = np.eye(6)[axis]
     actuator.gaintype, actuator.gainprm = mujoco.mjtGain.mjGAIN_FIXED, np.zeros(10)
     actuator.biastype, actuator.biasprm = mujoco.mjtBias.mjBIAS_AFFINE, np.zeros(10)
     actuator.dyntype, actuator.dynprm = mujoco.mjtDyn.mjDYN_NONE, np.eye(10)[0]
@@ -249,6 +259,7 @@ def _add_coupling_actuator(
     for field in ("nsample", "interp", "group", "ctrlspec"):
         setattr(actuator, field, 0)
     actuator.damping = np.zeros(3)
+    return actuator
 
 
 _INTEGRATORS = "Euler", "RK4", "implicit", "implicitfast", "discrete"
@@ -344,7 +355,7 @@ def limit_motors_alone(
     Raises:
         SceneError: A change is needed that ``as_is`` forbids.
     """
-    chain = np.isin(model.jnt_bodyid, ancestors(model, int(model.site(grip).bodyid[0])))
+    chain = np.isin(model.jnt_bodyid, ancestors(model, held_body(model, grip)))
     joints = np.flatnonzero(chain & (model.jnt_actfrclimited != 0)).tolist()
     if not joints:
         return ()

@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids
+from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids, held_body, held_joint
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
 from hapticbridge.scene.compile import compiled, go_to_start
@@ -19,6 +19,7 @@ from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
 
+_UPRIGHT = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
 _LIMIT_MARGINS = ("jnt_margin", "tendon_margin")
 _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_tolerance": 0.01}
@@ -113,6 +114,11 @@ class Scene:
         """
         return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1], hand=hand)
 
+    @property
+    def joint(self) -> int:
+        """Id of the joint that the hand holds; -1 if it holds a site."""
+        return held_joint(self.model, self.grip)
+
     def release(self) -> None:
         """Releases the scene for another bridge."""
         self._is_claimed = False
@@ -127,7 +133,12 @@ class Scene:
         go_to_start(self.model, self.data, self.grip)
 
     def grip_pose(self) -> tuple[float, ...]:
-        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m."""
+        """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m.
+
+        A joint at q, in m or rad, has the pose (q, 0, 0, 1, 0, 0, 0).
+        """
+        if self.joint >= 0:
+            return (float(self.data.qpos[self.model.jnt_qposadr[self.joint]]), *_UPRIGHT)
         site_id = self.model.site(self.grip).id
         position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
         sign = 1.0 if quaternion[0] >= 0 else -1.0
@@ -217,6 +228,9 @@ class Scene:
             self.model.actuator_gainprm[actuator_id, 0] = gain
             self.model.actuator_biasprm[actuator_id, 1] = -stiffness
             self.model.actuator_biasprm[actuator_id, 2] = -damping
+            if self.joint >= 0:  # held where it is, until the kernel moves its handle
+                self.model.actuator_gainprm[actuator_id, 0] = 0.0
+                self.model.actuator_biasprm[actuator_id, 0] = stiffness * self.grip_pose()[0]
 
     def carry_tool(self, reason: str) -> None:
         """Compensates the weight of all that moves with the grip (MuJoCo's ``gravcomp``).
@@ -234,7 +248,7 @@ class Scene:
         self._recompile(self._spec)
         model = self.model
         for grip in (self.grip, *self.other_grips):
-            body_id = model.site_bodyid[model.site(grip).id]
+            body_id = held_body(model, grip)
             model.body_gravcomp[model.body_treeid == model.body_treeid[body_id]] = 1.0
         self.is_carried = True
         self.changes += (f"weight of the tool: felt → carried ({reason})",)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,9 +19,12 @@ from hapticbridge.device.base import (
     USUAL_FORCE_LIMIT,
     USUAL_SPEED_LIMIT,
     USUAL_TORQUE_LIMIT,
+    Device,
     DeviceInfo,
     checked_number,
     checked_period,
+    checked_read,
+    checked_write,
 )
 from hapticbridge.device.simulated.dynamics import (
     FREE,
@@ -35,7 +39,7 @@ from hapticbridge.device.simulated.hand import DEFAULT_HAND, NO_HAND, Hand
 from hapticbridge.device.trajectory import Motion, read_motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.jit import direct
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.scene import custom_numbers
 from hapticbridge.theory.sampled_loop import WorstHand
 
@@ -319,3 +323,59 @@ class SimulatedDevice:
         """Velocity in m/s and angular velocity in rad/s at the newest sample, shape (6,)."""
         state = self._states[0]
         return np.concatenate([state["velocity"], state["angular_velocity"]])
+
+
+class GrippingDevice:
+    """A device with another one, which has one axis, as its grip axis.
+
+    Args:
+        device: What the hand holds.
+        grip: What the fingers close; its first axis is the grip axis, in m, and rises as it closes.
+        travel: How far it closes in m; None if unknown.
+
+    Attributes:
+        info: The sheet of the first, with that of the second as ``grip_axis``.
+    """
+
+    def __init__(self, device: Device, grip: Device, travel: float | None = None) -> None:
+        self._device, self._grip = device, grip
+        self._reads = checked_read(device), checked_read(grip)
+        self._writes = checked_write(device), checked_write(grip)
+        sheet = replace(grip.info, name=f"grip of {device.info.name}", axes=("x",), reach=travel)
+        self.info = replace(device.info, grip_axis=sheet)
+
+    def start(self, period: float) -> NDArray[np.void]:
+        """Starts both; returns the pose and the grip's, (2,).
+
+        Raises:
+            DeviceError: One of them cannot run at this period.
+        """
+        return np.concatenate([self._device.start(period), self._grip.start(period)])
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        """Reads the pose, and into a second sample the grip.
+
+        Raises:
+            DeviceLost: One of them is gone, or silent for too long.
+        """
+        flags = self._reads[0](sample[:1])
+        if sample.size > 1:
+            flags |= self._reads[1](sample[1:2])
+        return flags & int(TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        """Commands the wrench, (6,), or with that of the grip axis, (2, 6).
+
+        Raises:
+            DeviceLost: One of them is gone.
+        """
+        both = np.zeros((2, 6)) if wrench.ndim == 1 else wrench
+        with ExitStack() as stack:  # if the first fails, the second still gets its own
+            stack.callback(self._writes[1], both[1])
+            self._writes[0](wrench if wrench.ndim == 1 else both[0])
+
+    def close(self) -> None:
+        """Closes both."""
+        with ExitStack() as stack:
+            stack.callback(self._grip.close)
+            self._device.close()

@@ -1,0 +1,208 @@
+"""Grip axis: the seventh axis of a device, coupled to a joint of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from two_hands import TONGS
+
+import hapticbridge as hb
+from hapticbridge.cli.main import main
+from hapticbridge.device import GrippingDevice, SimulatedDevice
+from hapticbridge.errors import DeviceError, HapticBridgeError
+from hapticbridge.hands import GripAxis
+from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.testing.device_contract import CONTRACT
+
+JOINT = "joint:hinge"
+
+
+class Fingers:
+    """Device with a grip axis that moves as told and keeps what it was sent."""
+
+    def __init__(self, speed: float = 0.0, travel: float | None = 0.03, **sheet: Any) -> None:
+        axes = ("x", "y", "z", "rx", "ry", "rz")
+        usual: dict[str, Any] = {
+            "damping": 2.0,
+            "rotational_damping": 2e-3,
+            "delay": 0.0,
+            "is_real": False,
+        }
+        own = usual | {"axes": ("x",)} | sheet
+        grip = hb.DeviceInfo(name="grip", force_limit=8.0, reach=travel, **own)
+        self.info = hb.DeviceInfo(name="hand", axes=axes, force_limit=10.0, grip_axis=grip, **usual)
+        self.speed, self.closed, self.buttons, self.period = speed, 0.0, 0, 0.0
+        self.sent: list[NDArray[np.float64]] = []
+
+    @property
+    def felt(self) -> NDArray[np.float64]:
+        """Forces on the fingers so far in N."""
+        return np.array([each[1, 0] for each in self.sent if each.ndim == 2])
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.period = period
+        samples = np.zeros(2, SAMPLE_DTYPE)
+        samples["quaternion"][:, 0] = 1.0
+        return samples
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if self.sent:
+            self.closed += self.speed * self.period
+        sample["position"], sample["quaternion"] = 0.0, (1.0, 0.0, 0.0, 0.0)
+        sample["buttons"] = self.buttons
+        sample["position"][-1, 0] = self.closed if sample.size > 1 else 0.0
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.sent.append(np.array(wrench))
+
+    def close(self) -> None:
+        pass
+
+
+def tongs() -> hb.Scene:
+    return hb.load_scene(mujoco.MjSpec.from_string(TONGS), ("left", JOINT))
+
+
+def bridge_of(device: Any, axis: GripAxis, **options: Any) -> hb.Bridge:
+    grasp = hb.Grasp("left", device, grip_axis=axis)
+    return hb.Bridge(tongs(), [grasp], clock=hb.SimulatedClock(), **options)
+
+
+@pytest.mark.parametrize("scale", [None, 10.0, -5.0])
+def test_the_fingers_feel_the_spring_through_the_lever(scale: float | None) -> None:
+    device = Fingers()
+    with bridge_of(device, GripAxis("hinge", scale)) as bridge:
+        device.speed = 0.01
+        bridge.run(0.8)
+        device.speed = 0.0
+        bridge.run(1.0)
+        angle = float(bridge.scene.data.joint("hinge").qpos[0])
+    lever = 0.5 / 0.03 if scale is None else scale
+    # K of the coupling, at the device's damping of 2 N s/m: 2400 N/m at the fingers
+    stiffness, spring = 2400.0 / lever**2, 0.05
+    target = lever * device.closed + spring * 0.1 / stiffness
+    expected = (stiffness * target - spring * 0.1) / (stiffness + spring)
+    assert angle == pytest.approx(expected, abs=2e-5)
+    force = -lever * spring * (angle + 0.1)
+    assert device.felt[-1] == pytest.approx(force, rel=1e-3)
+    assert device.sent[-1].tolist() == [0.0] * 6  # at the end
+
+
+def test_a_run_is_passive_repeats_to_the_bit_and_notices_a_change(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    device = GrippingDevice(SimulatedDevice(), SimulatedDevice(dof=3), travel=0.05)
+    with bridge_of(device, GripAxis("hinge"), recording=path) as bridge:
+        summary = bridge.run(1.5)
+    assert [each.grip for each in summary.hands] == ["left", JOINT]
+    assert summary.verdict == "passive"
+    assert summary.hands[1].peak_force > 0.01
+    assert "at the fingers" in str(summary)
+    assert "on the fingers" in str(summary)
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+    assert report.certified
+    ticks = hb.read_recording(path, hand=1).ticks
+    assert np.ptp(ticks["tool_position"][:, 0]) > 0.01
+    assert not ticks["tool_position"][:, 1:].any()
+
+
+def test_two_devices_may_hold_a_tool_and_its_joint() -> None:
+    hands = [hb.Grasp("left"), hb.Grasp(JOINT, workspace=hb.Workspace(scale=10.0))]
+    with hb.Bridge(tongs(), hands, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(0.5)
+    assert summary.verdict == "passive"
+
+
+def test_the_force_of_the_fingers_stops_at_their_limit() -> None:
+    device = Fingers(speed=0.05)
+    with bridge_of(device, GripAxis("hinge", 10.0)) as bridge:
+        bridge.run(1.0)
+        summary = bridge.summary()
+    # the hinge stops at 0.3 rad, and the fingers go on
+    assert np.abs(device.felt).max() == pytest.approx(8.0, rel=1e-6)
+    assert summary.hands[1].limits_reached == ("force",)
+    assert summary.verdict == "passive"
+
+
+def test_a_dead_man_button_lets_go_of_both() -> None:
+    device = Fingers(speed=0.02)
+    grasp = hb.Grasp("left", device, grip_axis=GripAxis("hinge", 10.0), dead_man=0)
+    with hb.Bridge(tongs(), [grasp], clock=hb.SimulatedClock()) as bridge:
+        device.buttons = 1
+        bridge.run(0.5)
+        assert abs(device.felt[-1]) > 0.05
+        device.buttons = 0
+        bridge.run(0.5)
+        assert device.felt[-1] == 0.0
+
+
+def test_a_device_whose_grip_axis_is_not_coupled_gets_six_numbers() -> None:
+    device = Fingers()
+    with hb.Bridge("point_mass", device, clock=hb.SimulatedClock()) as bridge:
+        bridge.run(0.1)
+    assert {each.shape for each in device.sent} == {(6,)}
+
+
+@pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
+def test_the_simulated_one_fulfils_the_contract(check: Callable[[Any], None]) -> None:
+    check(GrippingDevice(SimulatedDevice(), SimulatedDevice(dof=3), travel=0.03))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: bridge_of(Fingers(travel=None), GripAxis("hinge")), "name the joint's motion per"),
+        (lambda: bridge_of("simulated", GripAxis("jaw")), "load it with these"),
+        (lambda: bridge_of(SimulatedDevice(), GripAxis("hinge")), "has no grip axis for joint"),
+        (lambda: GripAxis(""), "it must name a joint"),
+        (lambda: GripAxis("hinge", 0.0), "must be finite and not 0"),
+        (lambda: loaded("left", "joint:jaw"), "no hinge or slide 'jaw' to hold; .* 'hinge'"),
+        (lambda: loaded(JOINT, "left"), "can only be held beside a site or a body"),
+        (lambda: Fingers(axes=("y",)), "grip_axis = .* must be a DeviceInfo with the axis x"),
+    ],
+)
+def test_what_cannot_be_is_refused(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises((HapticBridgeError, TypeError), match=message):
+        call()
+
+
+def loaded(*grips: str) -> hb.Scene:
+    return hb.load_scene(mujoco.MjSpec.from_string(TONGS), grips)
+
+
+def test_the_data_sheet_holds_one_grip_axis_and_no_more() -> None:
+    info = Fingers().info
+    assert hb.DeviceInfo.from_json(info.to_json()) == info
+    assert info.grip_axis is not None
+    nested = info.to_json().replace('"grip_axis": null', '"grip_axis": {"grip_axis": {}}')
+    with pytest.raises(DeviceError, match="grip_axis"):
+        hb.DeviceInfo.from_json(nested)
+
+
+def test_the_command_couples_the_joint_that_the_scene_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, run = tmp_path / "tongs.xml", ["--fast", "--duration", "0.3", "--grip", "left"]
+    text = '<custom><text name="grip_axis" data="hinge"/></custom><worldbody>'
+    scene.write_text(TONGS.replace("<worldbody>", text, 1))
+    (tmp_path / "tongs_hinge.csv").write_text("t,x,y,z\n0,0,0,0\n0.3,0.01,0,0\n")
+    assert main(["run", str(scene), *run]) == 0
+    assert "on the fingers" in capsys.readouterr().out
+    assert main(["run", str(scene), *run, "--grip-axis", "none"]) == 0
+    assert "on the fingers" not in capsys.readouterr().out
+    assert main(["run", str(scene), *run, "--hand", "left+hinge=simulated"]) == 2
+    capsys.readouterr()
+    assert main(["run", str(scene), *run[:3], "--hand", "left+hinge=simulated"]) == 0
+    assert "on the fingers" in capsys.readouterr().out
+    motion = ["--device", f"trajectory:{tmp_path / 'tongs_hinge.csv'}"]
+    assert main(["run", str(scene), *run, *motion]) == 0
+    assert "has no grip axis, so joint 'hinge' moves freely" in capsys.readouterr().err
+    assert main(["run", str(scene), *run, *motion, "--grip-axis", "hinge"]) == 2
+    assert "has no grip axis for joint 'hinge'" in capsys.readouterr().err
