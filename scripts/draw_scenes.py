@@ -15,8 +15,10 @@ import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from hapticbridge import Bridge, HapticBridgeError, SimulatedClock, load_scene
-from hapticbridge.scene import Scene, custom_numbers, scene_names, scene_path
+from hapticbridge import Bridge, Grasp, HapticBridgeError, SimulatedClock, load_scene
+from hapticbridge.hands import GripAxis
+from hapticbridge.kernel.codes import JOINT
+from hapticbridge.scene import Scene, custom_numbers, custom_text, scene_names, scene_path
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,11 +31,14 @@ name, in pixels."""
 
 
 def advance(scene: Scene) -> None:
-    """Moves a scene along its hand path to the moment of its picture."""
+    """Moves a scene along its hand path, and its fingers', to the moment of its picture."""
     path, moment = scene.path.with_suffix(".csv"), custom_numbers(scene.model, "picture")
     if not moment or not path.is_file():
         return
-    with Bridge(scene, f"trajectory:{path}", clock=SimulatedClock()) as bridge:
+    device: str | list[Grasp] = f"trajectory:{path}"
+    if joint := custom_text(scene.model, "grip_axis"):
+        device = [Grasp(scene.grip, grip_axis=GripAxis(joint))]
+    with Bridge(scene, device, clock=SimulatedClock()) as bridge:
         bridge.run(duration=moment[0])
 
 
@@ -44,6 +49,8 @@ def picture(name: str) -> Image.Image:
         HapticBridgeError: There is no such scene, or it cannot be loaded or run.
     """
     scene = load_scene(name)
+    if joint := custom_text(scene.model, "grip_axis"):
+        scene = load_scene(name, (scene.grip, f"{JOINT}{joint}"))
     advance(scene)
     model, data = scene.model, scene.data
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""Writes the scripted hand paths of the scenes: ``models/NAME/NAME.csv``.
+"""Writes the scripted hand paths of the scenes: ``models/NAME/NAME.csv``, and of further hands.
 
     python scripts/make_hand_paths.py [DIR]
 
@@ -322,7 +322,7 @@ PATHS = {
     ),
     # Close the pliers until the wire is just not touched, hold, crush it, hold, let go; close them
     # again, less far: they meet the wire later than before.
-    "pliers": HandPath(
+    "bench_pliers": HandPath(
         swinging(
             0.1,
             Reach(0.4, 1.2, degrees=(0, 0, -5.3)),
@@ -400,9 +400,31 @@ PATHS = {
         axes=(1, 1, 1, 1, 1, 1),
         seed=11,
     ),
+    # Lift the pliers, hold them still while the fingers work, and put them back.
+    "pliers": HandPath(
+        reaching(
+            Reach(0.1, 0.9, (0, 0, 15.0), degrees=(0, 8.0, 0)),
+            Reach(7.0, 0.9, (0, 0, -15.0), degrees=(0, -8.0, 0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=12,
+    ),
+    # The fingers, along x: close until the wire is just not touched, hold, crush it, hold, let go;
+    # close again, less far.
+    "pliers/pliers_hinge": HandPath(
+        reaching(
+            Reach(1.0, 1.0, (11.0, 0, 0)),
+            Reach(2.4, 1.4, (11.0, 0, 0)),
+            Reach(4.4, 1.0, (-22.0, 0, 0)),
+            Reach(5.5, 0.8, (19.0, 0, 0)),
+            Reach(6.5, 0.8, (-19.0, 0, 0)),
+        ),
+        axes=(1, 0, 0, 0, 0, 0),
+        seed=13,
+    ),
 }
-"""The path of every scene. Each reaching motion adds up to zero, so that the hand ends where it
-began."""
+"""The path of every scene, or as ``SCENE/FILE`` that of a further hand or of the fingers. Each
+reaching motion adds up to zero, so that the hand ends where it began."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -417,13 +439,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     directory: Path = parser.parse_args(arguments).directory
     for name, path in PATHS.items():
-        folder = directory / name
+        scene, _, file = name.rpartition("/")
+        folder = directory / (scene or file)
         if not folder.is_dir():
             print(
                 f"no folder '{folder}' for the scene's hand path; create it first", file=sys.stderr
             )
             return 2
-        write_csv(folder / f"{name}.csv", table(path))
+        write_csv(folder / f"{file}.csv", table(path))
     return 0
 
 

@@ -34,7 +34,7 @@ SCENES = (
     "round_peg",
     "hammer",
     "drawer",
-    "pliers",
+    "bench_pliers",
     "open_wrench",
     "ratchet",
 )

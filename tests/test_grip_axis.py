@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -206,3 +206,74 @@ def test_the_command_couples_the_joint_that_the_scene_names(
     assert "has no grip axis, so joint 'hinge' moves freely" in capsys.readouterr().err
     assert main(["run", str(scene), *run, *motion, "--grip-axis", "hinge"]) == 2
     assert "has no grip axis for joint 'hinge'" in capsys.readouterr().err
+
+
+# The pliers, as their own fingers close them
+
+
+class Squeezed(NamedTuple):
+    """Run of the pliers: per tick, crush of the wire in m, and the records of both hands."""
+
+    crushed: NDArray[np.float64]
+    hand: NDArray[np.void]
+    fingers: NDArray[np.void]
+
+
+LEVER = 0.25 / 0.03
+"""Motion of the hinge per motion of the fingers in rad/m: range over travel."""
+
+
+@pytest.fixture(scope="module")
+def squeezed(tmp_path_factory: pytest.TempPathFactory) -> Squeezed:
+    path = tmp_path_factory.mktemp("pliers") / "run.mcap"
+    grasp = hb.Grasp("grip", grip_axis=GripAxis("hinge"))
+    crushed = []
+    with hb.Bridge("pliers", [grasp], clock=hb.SimulatedClock(), recording=path) as bridge:
+        wire = bridge.scene.data.joint("crush")
+        bridge.run(on_tick=lambda _: crushed.append(float(wire.qpos[0])))
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.environment, report.resimulation) == (
+        "passive",
+        "strict",
+        "bit for bit",
+    )
+    hand, fingers = (hb.read_recording(path, hand=each).ticks for each in (0, 1))
+    return Squeezed(np.array([*crushed[1:], crushed[-1]]), hand, fingers)
+
+
+def spring(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the torque of the return spring in N m."""
+    return 0.4 * (angle + 0.15)
+
+
+def test_the_fingers_feel_the_return_spring_until_the_wire(squeezed: Squeezed) -> None:
+    angle, force = squeezed.fingers["tool_position"][:, 0], squeezed.fingers["wrench_on_device"]
+    still = slice(2050, 2350)  # closed to just before the wire
+    assert not squeezed.fingers["contacts"][still].any()
+    assert -force[still, 0] == pytest.approx(LEVER * spring(angle[still]), rel=0.02)
+
+
+def test_the_wire_yields_between_the_jaws_and_hardens(squeezed: Squeezed) -> None:
+    angle, force = squeezed.fingers["tool_position"][:, 0], squeezed.fingers["wrench_on_device"]
+    at_the_wire = (-force[:, 0] / LEVER - spring(angle)) / 0.02
+    assert squeezed.crushed.max() > 0.6e-3
+    for depth in (0.1e-3, 0.3e-3, 0.5e-3):
+        tick = int(np.argmax(squeezed.crushed > depth))
+        felt = at_the_wire[tick - 20 : tick + 20].mean()
+        assert felt == pytest.approx(16.0 + 16e3 * depth, rel=0.04), depth
+
+
+def test_the_crushed_wire_is_met_later(squeezed: Squeezed) -> None:
+    touched = squeezed.fingers["contacts"] > 0
+    angle = squeezed.fingers["tool_position"][:, 0]
+    first, again = int(np.argmax(touched)), 5500 + int(np.argmax(touched[5500:]))
+    # what the wire gave, 20 mm from the hinge
+    later = squeezed.crushed[again - 1] / 0.02
+    assert angle[again] - angle[first] == pytest.approx(later, abs=2e-3)
+
+
+def test_a_squeeze_is_not_felt_by_the_hand_that_holds_the_pliers(squeezed: Squeezed) -> None:
+    squeeze = slice(3000, 4300)
+    assert np.abs(squeezed.fingers["wrench_on_device"][squeeze, 0]).max() > 5.0
+    # 5 N between the fingers are internal; the hand bears the inertia of 0.1 kg
+    assert np.abs(squeezed.hand["wrench_on_device"][squeeze, :3]).max() < 0.05

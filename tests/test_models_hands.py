@@ -41,7 +41,7 @@ HANDS: list[tuple[str, Values, float, int]] = [
     ("hammer", {}, 0.0, 400),
     ("open_wrench", {}, 0.0, 7000),
     ("ratchet", {}, 0.0, 7000),
-    ("pliers", {}, 0.0, 800),
+    ("bench_pliers", {}, 0.0, 800),
     ("lock", {}, 0.0, 800),
     ("screwdriver", {}, -0.002, 7000),
     ("hex_key", {}, -0.002, 7000),
@@ -54,7 +54,7 @@ otherwise nothing was tried."""
 FIRST = {"round_peg": -0.045, "screwdriver": -1e-3, "hex_key": -1e-3}
 """By how much a hand goes up in m before it is random, in scenes that a strong hand shakes."""
 
-TOWARDS = {"pliers": [0.0, -0.02, 0.0], "lock": [-0.02, 0.0, 0.0]}
+TOWARDS = {"bench_pliers": [0.0, -0.02, 0.0], "lock": [-0.02, 0.0, 0.0]}
 """Where the hand goes while it is random, in m: onto the wire, into the keyway."""
 
 SEED = {"drawer": 8}
@@ -213,8 +213,8 @@ SHOWN: list[tuple[str, slice, int, float, float]] = [
     ("open_wrench", END, 0, math.radians(60.0), math.radians(2.0)),
     *(("open_wrench", END, joint, 0.0, 2e-4) for joint in (2, 3, 4)),
     ("ratchet", END, 0, math.radians(-88.0), math.radians(2.0)),
-    ("pliers", END, 0, 0.38e-3, 0.06e-3),
-    ("pliers", END, 1, 0.0, 2e-3),
+    ("bench_pliers", END, 0, 0.38e-3, 0.06e-3),
+    ("bench_pliers", END, 1, 0.0, 2e-3),
     ("lock", slice(2800, 5800), 4, 0.016, 1e-4),
     ("lock", slice(4400, 4700), 0, math.radians(90.0), math.radians(2.0)),
     ("lock", END, 0, 0.0, math.radians(0.5)),

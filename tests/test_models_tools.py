@@ -19,7 +19,7 @@ from hapticbridge.scene.parameters import apply_parameters
 
 FORCE_LIMIT = 10.0  # N, of the default simulated device
 TASKS = (
-    "drawer", "hammer", "open_wrench", "ratchet", "pliers", "lock", "screwdriver", "hex_key",
+    "drawer", "hammer", "open_wrench", "ratchet", "bench_pliers", "lock", "screwdriver", "hex_key",
     "round_peg",
 )  # fmt: skip
 
@@ -213,7 +213,7 @@ GRIP_DISTANCE = 0.1  # m, from the hinge
 
 def spring_torque(run: reference.Run) -> np.ndarray:
     """Returns what the return spring takes in each tick, in N m."""
-    hinge = reference.spec_of("pliers").compile().joint("hinge")
+    hinge = reference.spec_of("bench_pliers").compile().joint("hinge")
     return np.asarray(hinge.stiffness[0] * (run.joints[:, 1] - hinge.qpos_spring[0]))
 
 
@@ -229,7 +229,7 @@ def touching_angle(wire: float) -> float:
 
 
 def test_hand_feels_the_return_spring_until_the_wire() -> None:
-    run = reference.run_of_own_path("pliers")
+    run = reference.run_of_own_path("bench_pliers")
     closing = slice(900, 2400)
     assert not run.touched["wire"][closing].any()
     spring = spring_torque(run)[closing]
@@ -242,9 +242,9 @@ def test_hand_feels_the_return_spring_until_the_wire() -> None:
 
 
 def test_wire_yields_at_its_force_over_the_lever_and_hardens() -> None:
-    model = reference.spec_of("pliers").compile()
+    model = reference.spec_of("bench_pliers").compile()
     crush = model.joint("crush")
-    run = reference.run_of_own_path("pliers")
+    run = reference.run_of_own_path("bench_pliers")
     lever = GRIP_DISTANCE / -model.body("wire").pos[0]
     assert lever == pytest.approx(5.0)
     at_the_handle = (-reference.moment_about_axis(run) - spring_torque(run)) / GRIP_DISTANCE
@@ -259,7 +259,7 @@ def test_wire_yields_at_its_force_over_the_lever_and_hardens() -> None:
 
 
 def test_wire_stays_crushed_and_is_met_later_the_second_time() -> None:
-    run = reference.run_of_own_path("pliers")
+    run = reference.run_of_own_path("bench_pliers")
     crushed = run.joints[:, 0]
     assert crushed.max() == pytest.approx(0.72e-3, abs=0.03e-3)
     # it creeps back by 16 µm/s
@@ -274,7 +274,7 @@ def test_wire_stays_crushed_and_is_met_later_the_second_time() -> None:
 
 @pytest.mark.parametrize(("distance", "degrees"), [(0.012, 5.0), (0.02, 8.5), (0.03, 10.0)])
 def test_jaw_presses_with_handles_force_times_lever(distance: float, degrees: float) -> None:
-    model, data = scene_with("pliers", wire_distance=distance)
+    model, data = scene_with("bench_pliers", wire_distance=distance)
     run = reference.moved_through(model, data, reference.swung(-degrees, -degrees))
     assert data.ncon == 1
     force = np.zeros(6)
@@ -287,7 +287,7 @@ def test_jaw_presses_with_handles_force_times_lever(distance: float, degrees: fl
 def test_a_wire_that_is_too_strong_holds() -> None:
     runs = []
     for strength in (16.0, 40.0):
-        model, data = scene_with("pliers", yield_force=strength)
+        model, data = scene_with("bench_pliers", yield_force=strength)
         runs.append(reference.moved_through(model, data, reference.swung(-7.5, -7.5)))
     assert runs[0].joints[-1, 0] > 0.15e-3
     # pressed with 26 N, it creeps by 0.04 mm/s

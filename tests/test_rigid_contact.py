@@ -694,7 +694,7 @@ def test_methods_for_comparison_and_earlier_recordings_have_the_contact_of_the_s
     assert method_of({"method": "lossless", "contact": "rigid"}).contact == "rigid"
 
 
-@pytest.mark.parametrize("name", ["lock", "pliers", "planar_peg"])
+@pytest.mark.parametrize("name", ["lock", "bench_pliers", "planar_peg"])
 def test_a_shipped_scene_starts_at_rest_with_rigid_contacts(name: str) -> None:
     run = prepared(load_scene(name), "lossless")
     through(run, samples_of(np.zeros((300, 3))))

@@ -190,7 +190,7 @@ def test_shipped_scenes_with_jointed_grips_among_them_are_strict_and_sharp(rig: 
 
 @pytest.mark.parametrize("period", [2.5e-4, 5e-4, 2e-3, 4e-3])
 def test_rigid_contacts_are_strict_at_other_periods(period: float) -> None:
-    for rig in ("peg", "taps", "stack", "pliers", "lock"):
+    for rig in ("peg", "taps", "stack", "bench_pliers", "lock"):
         for case in cases(rig, (61,))[:2]:
             hold_strict(run_case(replace(rigs.RIGID, period=period), case), case)
 
@@ -209,7 +209,7 @@ def run_with(flags: str, bit: int, case: Case) -> LoopOutcome:
         setattr(option, flags, own)
 
 
-@pytest.mark.parametrize("rig", ["stack", "pliers", "hex_key"])
+@pytest.mark.parametrize("rig", ["stack", "bench_pliers", "hex_key"])
 def test_contacts_are_strict_with_and_without_islands_and_move_alike(rig: str) -> None:
     case = Case(rig, 2400.0, 0.03, 0.1, 61)
     islands = run_case(rigs.RIGID, case, keep_records=True)
@@ -220,7 +220,7 @@ def test_contacts_are_strict_with_and_without_islands_and_move_alike(rig: str) -
     assert np.abs(moved).max() < 1e-6
 
 
-@pytest.mark.parametrize("rig", ["stack", "pliers"])
+@pytest.mark.parametrize("rig", ["stack", "bench_pliers"])
 def test_contacts_of_sleeping_bodies_are_strict(rig: str) -> None:
     case = Case(rig, 2400.0, 0.03, 0.1, 61)
     asleep = run_with("enableflags", int(mujoco.mjtEnableBit.mjENBL_SLEEP), case)

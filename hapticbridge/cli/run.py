@@ -85,9 +85,9 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     usual = default_method()
     if is_method_chosen and method.name != usual.name:
         err.print(f"  {method.name}: {escape(method.about)}")
-    elif method.name != usual.name:
+    elif method.name != usual.name and setup.scene.hand == 0:
         lacking = f"takes one MuJoCo step a tick, and this run {substeps}"
-        reason = "has one hand" if setup.scene.other_grips else lacking
+        reason = "has one hand, without a grip axis" if setup.scene.other_grips else lacking
         err.print(f"  {method.name}, because {usual.name} {reason}")
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")

@@ -203,7 +203,7 @@ RIGS: Mapping[str, Rig] = {
     "slide": _made(_scene("0.015 0.015 0.01", _FLOOR, "0 0 0.0001", gravity=9.81), _dragged),
     "wedge": _made(_groove(), _pushed),
     "stack": _made(_pile(), _shoved),
-    **{name: _shipped(name) for name in ("lock", "hex_key", "ratchet", "pliers", "drawer")},
+    **{name: _shipped(name) for name in ("lock", "hex_key", "ratchet", "bench_pliers", "drawer")},
     "wall": Rig(partial(load_scene, "virtual_wall"), _tapping, damping=2.0),
 }
 """Rigs by name. The peg has a clearance of 0.2 mm a side, the tight one 0.05 mm. ``slide`` is
