@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from hapticbridge.errors import SceneError as SceneError
     from hapticbridge.guard import Limits as Limits
     from hapticbridge.hands import Grasp as Grasp
+    from hapticbridge.hands import GripAxis as GripAxis
     from hapticbridge.options import BridgeOptions as BridgeOptions
     from hapticbridge.options import Workspace as Workspace
     from hapticbridge.record import SAMPLE_DTYPE as SAMPLE_DTYPE

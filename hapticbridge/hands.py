@@ -208,9 +208,12 @@ def resolve_hands(
         setups.append(RunSetup.resolve(held, info, coupling, own, clock, is_recorded=is_recorded))
 
     for grasp, info in zip(grasps, infos, strict=True):
+        workspace = grasp.workspace or options.workspace
+        if scene.of_hand(len(setups)).joint >= 0:
+            workspace = _workspace_of_joint(grasp, options)
         own = replace(
             common,
-            workspace=grasp.workspace or options.workspace,
+            workspace=workspace,
             limits=grasp.limits or options.limits,
             clutch=grasp.clutch,
             dead_man=grasp.dead_man,
@@ -231,6 +234,22 @@ def resolve_hands(
         own = replace(own, workspace=workspace, limits=limits)
         resolve(axis, grasp.grip_axis.coupling, own)
     return tuple(setups)
+
+
+def _workspace_of_joint(grasp: Grasp, options: BridgeOptions) -> Workspace:
+    """Returns the map from a device's x axis to the joint that it holds.
+
+    Raises:
+        HapticBridgeError: The grasp's own axes turn the x axis away from the joint.
+    """
+    if grasp.workspace is None:
+        return replace(options.workspace, axes=_SAME)
+    if abs(grasp.workspace.rotation[0]) != 1.0:
+        raise HapticBridgeError(
+            f"axes of the hand at '{grasp.grip}' turn the device's x axis away; a joint is moved "
+            "by that axis, so they must keep it or reverse it"
+        )
+    return grasp.workspace
 
 
 def _refuse_unsuited(options: BridgeOptions) -> None:

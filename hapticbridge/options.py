@@ -587,6 +587,8 @@ class RunSetup:
             HapticBridgeError: A value is out of range.
         """
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
+        if self.scene.joint >= 0:  # which the device's x axis moves
+            pose = (pose[0], *IDENTITY_POSE[1:])
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
         is_absolute = self.workspace.absolute

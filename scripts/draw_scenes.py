@@ -31,13 +31,17 @@ name, in pixels."""
 
 
 def advance(scene: Scene) -> None:
-    """Moves a scene along its hand path, and its fingers', to the moment of its picture."""
+    """Moves a scene along its hands' paths to the moment of its picture."""
     path, moment = scene.path.with_suffix(".csv"), custom_numbers(scene.model, "picture")
-    if not moment or not path.is_file():
+    if not moment:
         return
     device: str | list[Grasp] = f"trajectory:{path}"
     if joint := custom_text(scene.model, "grip_axis"):
         device = [Grasp(scene.grip, grip_axis=GripAxis(joint))]
+    elif scene.other_grips:
+        device = [Grasp(grip) for grip in (scene.grip, *scene.other_grips)]
+    elif not path.is_file():
+        return
     with Bridge(scene, device, clock=SimulatedClock()) as bridge:
         bridge.run(duration=moment[0])
 

@@ -422,6 +422,46 @@ PATHS = {
         axes=(1, 0, 0, 0, 0, 0),
         seed=13,
     ),
+    # Turn the nut, lift the spanner off, turn it back, put it on again; then once more.
+    "nut_and_wrench/nut_and_wrench_wrench": HandPath(
+        swinging(
+            0.1,
+            Reach(0.2, 1.4, degrees=(0, 0, 67.0)),
+            Reach(1.7, 0.3, degrees=(0, 0, -7.0)),
+            Reach(2.1, 0.5, (0, 0, 16.0)),
+            Reach(2.6, 0.7, degrees=(0, 0, -60.0)),
+            Reach(3.3, 0.5, (0, 0, -16.0)),
+            Reach(3.9, 1.4, degrees=(0, 0, 67.0)),
+            Reach(5.4, 0.3, degrees=(0, 0, -7.0)),
+            Reach(5.8, 0.5, (0, 0, 16.0)),
+            Reach(6.3, 0.8, degrees=(0, 0, -60.0)),
+            Reach(7.1, 0.6, (0, 0, -16.0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=14,
+    ),
+    # Hold the bolt.
+    "nut_and_wrench/nut_and_wrench_bolt": HandPath(
+        reaching(Reach(0.0, 1.0)), axes=(1, 1, 1, 1, 1, 1), seed=15
+    ),
+    # Push the plug in, let it snap, pull it out.
+    "plug_and_socket/plug_and_socket_plug": HandPath(
+        reaching(
+            Reach(0.4, 2.4, (0, 0, -21.0)),
+            Reach(4.0, 2.4, (0, 0, 21.0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=16,
+    ),
+    # Bring the socket, hold it against the plug, take it away.
+    "plug_and_socket/plug_and_socket_socket": HandPath(
+        reaching(
+            Reach(0.3, 2.4, (0, 0, 13.0)),
+            Reach(4.2, 2.4, (0, 0, -13.0)),
+        ),
+        axes=(1, 1, 1, 1, 1, 1),
+        seed=17,
+    ),
 }
 """The path of every scene, or as ``SCENE/FILE`` that of a further hand or of the fingers. Each
 reaching motion adds up to zero, so that the hand ends where it began."""

@@ -31,7 +31,7 @@ SLOW_SCENES = ("beads",)
 """Scenes too slow to step in every tick: 8 s of the beads at 1 kHz take a minute, and they are not
 meant to run so. ``test_slow_scene`` runs them beside the loop."""
 
-LOOP_SCENES = tuple(name for name in scene_names() if name not in SLOW_SCENES)
+LOOP_SCENES = tuple(name for name in scene_names(1) if name not in SLOW_SCENES)
 
 T = 1e-3
 K, B = 2400.0, 0.5

@@ -130,7 +130,7 @@ def test_all_planted_faults_are_named_together(tmp_path: Path) -> None:
     assert len(PLANTS) >= 12
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", scene_names(1))
 def test_shipped_scene_has_no_fault(name: str) -> None:
     assert find_faults(shipped_case(name)) == ()
 

@@ -26,7 +26,7 @@ def inventory_in(case: SceneUnderCheck) -> Inventory:
     return take_inventory(case.model, case.scene.grip, case.places, case.observation)
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", scene_names(1))
 def test_counts_are_those_of_the_model_without_the_bridge(name: str) -> None:
     plain = mujoco.MjModel.from_xml_path(str(scene_path(name)))
     counted = inventory_in(shipped_case(name))

@@ -16,7 +16,6 @@ import hapticbridge as hb
 from hapticbridge.cli.main import main
 from hapticbridge.device import GrippingDevice, SimulatedDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError
-from hapticbridge.hands import GripAxis
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.testing.device_contract import CONTRACT
 
@@ -70,7 +69,7 @@ def tongs() -> hb.Scene:
     return hb.load_scene(mujoco.MjSpec.from_string(TONGS), ("left", JOINT))
 
 
-def bridge_of(device: Any, axis: GripAxis, **options: Any) -> hb.Bridge:
+def bridge_of(device: Any, axis: hb.GripAxis, **options: Any) -> hb.Bridge:
     grasp = hb.Grasp("left", device, grip_axis=axis)
     return hb.Bridge(tongs(), [grasp], clock=hb.SimulatedClock(), **options)
 
@@ -78,7 +77,7 @@ def bridge_of(device: Any, axis: GripAxis, **options: Any) -> hb.Bridge:
 @pytest.mark.parametrize("scale", [None, 10.0, -5.0])
 def test_the_fingers_feel_the_spring_through_the_lever(scale: float | None) -> None:
     device = Fingers()
-    with bridge_of(device, GripAxis("hinge", scale)) as bridge:
+    with bridge_of(device, hb.GripAxis("hinge", scale)) as bridge:
         device.speed = 0.01
         bridge.run(0.8)
         device.speed = 0.0
@@ -98,7 +97,7 @@ def test_the_fingers_feel_the_spring_through_the_lever(scale: float | None) -> N
 def test_a_run_is_passive_repeats_to_the_bit_and_notices_a_change(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     device = GrippingDevice(SimulatedDevice(), SimulatedDevice(dof=3), travel=0.05)
-    with bridge_of(device, GripAxis("hinge"), recording=path) as bridge:
+    with bridge_of(device, hb.GripAxis("hinge"), recording=path) as bridge:
         summary = bridge.run(1.5)
     assert [each.grip for each in summary.hands] == ["left", JOINT]
     assert summary.verdict == "passive"
@@ -113,16 +112,22 @@ def test_a_run_is_passive_repeats_to_the_bit_and_notices_a_change(tmp_path: Path
     assert not ticks["tool_position"][:, 1:].any()
 
 
-def test_two_devices_may_hold_a_tool_and_its_joint() -> None:
+def test_two_devices_may_hold_a_tool_and_its_joint(tmp_path: Path) -> None:
+    # the second moves along all six axes, of which the joint takes x
     hands = [hb.Grasp("left"), hb.Grasp(JOINT, workspace=hb.Workspace(scale=10.0))]
-    with hb.Bridge(tongs(), hands, clock=hb.SimulatedClock()) as bridge:
-        summary = bridge.run(0.5)
+    path = tmp_path / "run.mcap"
+    with hb.Bridge(tongs(), hands, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(1.5)
     assert summary.verdict == "passive"
+    ticks = hb.read_recording(path, hand=1).ticks
+    assert np.ptp(ticks["handle_position"][:, 0]) > 0.01
+    assert not ticks["wrench_on_tool"][:, 1:].any()
+    assert hb.audit(path, in_process=True).resimulation == "bit for bit"
 
 
 def test_the_force_of_the_fingers_stops_at_their_limit() -> None:
     device = Fingers(speed=0.05)
-    with bridge_of(device, GripAxis("hinge", 10.0)) as bridge:
+    with bridge_of(device, hb.GripAxis("hinge", 10.0)) as bridge:
         bridge.run(1.0)
         summary = bridge.summary()
     # the hinge stops at 0.3 rad, and the fingers go on
@@ -133,7 +138,7 @@ def test_the_force_of_the_fingers_stops_at_their_limit() -> None:
 
 def test_a_dead_man_button_lets_go_of_both() -> None:
     device = Fingers(speed=0.02)
-    grasp = hb.Grasp("left", device, grip_axis=GripAxis("hinge", 10.0), dead_man=0)
+    grasp = hb.Grasp("left", device, grip_axis=hb.GripAxis("hinge", 10.0), dead_man=0)
     with hb.Bridge(tongs(), [grasp], clock=hb.SimulatedClock()) as bridge:
         device.buttons = 1
         bridge.run(0.5)
@@ -158,11 +163,15 @@ def test_the_simulated_one_fulfils_the_contract(check: Callable[[Any], None]) ->
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: bridge_of(Fingers(travel=None), GripAxis("hinge")), "name the joint's motion per"),
-        (lambda: bridge_of("simulated", GripAxis("jaw")), "load it with these"),
-        (lambda: bridge_of(SimulatedDevice(), GripAxis("hinge")), "has no grip axis for joint"),
-        (lambda: GripAxis(""), "it must name a joint"),
-        (lambda: GripAxis("hinge", 0.0), "must be finite and not 0"),
+        (
+            lambda: bridge_of(Fingers(travel=None), hb.GripAxis("hinge")),
+            "name the joint's motion",
+        ),
+        (lambda: bridge_of("simulated", hb.GripAxis("jaw")), "load it with these"),
+        (lambda: bridge_of(SimulatedDevice(), hb.GripAxis("hinge")), "has no grip axis for joint"),
+        (lambda: hb.GripAxis(""), "it must name a joint"),
+        (lambda: hb.GripAxis("hinge", 0.0), "must be finite and not 0"),
+        (lambda: turned_away(ASIDE), "a joint is moved by that axis"),
         (lambda: loaded("left", "joint:jaw"), "no hinge or slide 'jaw' to hold; .* 'hinge'"),
         (lambda: loaded(JOINT, "left"), "can only be held beside a site or a body"),
         (lambda: Fingers(axes=("y",)), "grip_axis = .* must be a DeviceInfo with the axis x"),
@@ -171,6 +180,15 @@ def test_the_simulated_one_fulfils_the_contract(check: Callable[[Any], None]) ->
 def test_what_cannot_be_is_refused(call: Callable[[], Any], message: str) -> None:
     with pytest.raises((HapticBridgeError, TypeError), match=message):
         call()
+
+
+ASIDE = hb.Workspace(axes=(0, -1, 0, 1, 0, 0, 0, 0, 1))
+"""Turns the device's x axis to the scene's y axis."""
+
+
+def turned_away(aside: hb.Workspace) -> hb.Bridge:
+    hands = [hb.Grasp("left"), hb.Grasp(JOINT, workspace=aside)]
+    return hb.Bridge(tongs(), hands, clock=hb.SimulatedClock())
 
 
 def loaded(*grips: str) -> hb.Scene:
@@ -226,7 +244,7 @@ LEVER = 0.25 / 0.03
 @pytest.fixture(scope="module")
 def squeezed(tmp_path_factory: pytest.TempPathFactory) -> Squeezed:
     path = tmp_path_factory.mktemp("pliers") / "run.mcap"
-    grasp = hb.Grasp("grip", grip_axis=GripAxis("hinge"))
+    grasp = hb.Grasp("grip", grip_axis=hb.GripAxis("hinge"))
     crushed = []
     with hb.Bridge("pliers", [grasp], clock=hb.SimulatedClock(), recording=path) as bridge:
         wire = bridge.scene.data.joint("crush")

@@ -21,7 +21,7 @@ import hapticbridge as hb
 from hapticbridge.kernel.codes import HANDLE
 from hapticbridge.scene import scene_names
 
-SCENES = scene_names()
+SCENES = scene_names(1)
 CONTACT_SCENES = set(SCENES) - {"point_mass"}
 
 BRISK = {"hammer": (0.7, 25.0)}

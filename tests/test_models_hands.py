@@ -313,7 +313,7 @@ def own_hand(name: str) -> Hand:
     return scene_hand(scenes.plain_model(scenes.read_scene(name)), scene_path(name))
 
 
-@pytest.mark.parametrize("name", [n for n in scene_names() if own_hand(n) != DEFAULT_HAND])
+@pytest.mark.parametrize("name", [n for n in scene_names(1) if own_hand(n) != DEFAULT_HAND])
 def test_a_scene_is_strict_in_its_own_hand_at_random(name: str) -> None:
     scene = hb.load_scene(name)
     loop = ClosedLoop(scene)

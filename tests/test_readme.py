@@ -6,7 +6,6 @@ import json
 import re
 import runpy
 import shlex
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +26,6 @@ def blocks(language: str) -> list[str]:
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder with the files that the README's commands take for granted."""
     monkeypatch.chdir(tmp_path)
-    shutil.copy(ROOT / "models/peg_in_hole/peg_in_hole.csv", "hand.csv")
     scene = (ROOT / "models/point_mass/point_mass.xml").read_text(encoding="utf-8")
     Path("my_tool.xml").write_text(scene.replace('name="grip"', 'name="tip"'), encoding="utf-8")
     return tmp_path

@@ -133,7 +133,7 @@ def test_contact_without_a_spring_stores_nothing_and_sinks_for_ever() -> None:
     assert math.isinf(numbers.softness)
 
 
-@pytest.mark.parametrize("name", scene_names())
+@pytest.mark.parametrize("name", scene_names(1))
 def test_shipped_scenes_obey_the_whole_rule(name: str) -> None:
     loaded = load_scene(name)
     assert check_contacts(loaded.model, loaded.grip, is_thorough=True) == []

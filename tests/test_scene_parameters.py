@@ -135,7 +135,7 @@ def test_a_shipped_default_gives_the_scene_of_the_file(
 ) -> None:
     plain, asked = (
         load_scene(name),
-        load_scene(name, "grip", as_is=False, **{parameter.name: parameter.default}),
+        load_scene(name, None, as_is=False, **{parameter.name: parameter.default}),
     )
     assert plain.parameters == asked.parameters
     for field in FIELDS:
@@ -147,8 +147,8 @@ def test_a_shipped_default_gives_the_scene_of_the_file(
 def test_both_ends_of_a_shipped_range_load_and_differ(
     name: str, parameter: scenes.Parameter
 ) -> None:
-    low = load_scene(name, "grip", as_is=False, **{parameter.name: parameter.minimum})
-    high = load_scene(name, "grip", as_is=False, **{parameter.name: parameter.maximum})
+    low = load_scene(name, None, as_is=False, **{parameter.name: parameter.minimum})
+    high = load_scene(name, None, as_is=False, **{parameter.name: parameter.maximum})
     assert low.parameters[parameter.name] == parameter.minimum
     assert compiled_model(low.model) != compiled_model(high.model)
     assert parameter.about

@@ -27,7 +27,7 @@ from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.mouse import MouseDevice
-from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.errors import HapticBridgeError, RecordingError, choices
 from hapticbridge.guard import (
     USUAL_ENERGY,
     USUAL_HOLD_TORQUE,
@@ -49,7 +49,14 @@ from hapticbridge.options import (
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import RunCoupling, default_method
-from hapticbridge.scene import Scene, SceneSource, compile_scene, read_scene, settings_from
+from hapticbridge.scene import (
+    Scene,
+    SceneSource,
+    compile_scene,
+    own_grips,
+    read_scene,
+    settings_from,
+)
 from hapticbridge.scene.compile import custom_text
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
 from hapticbridge.summary import WELD, coarse_spring, is_always_implicit
@@ -396,13 +403,7 @@ class Run:
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
-        if self.hand:
-            held = self._held()
-            if len(held) > 1:
-                return self._run_hands(held, clock)
-            grip, axis, name = held[0]
-            alone = replace(self, hand=(), grip=grip, device=name, grip_axis=axis or self.grip_axis)
-            return alone.execute()
+        held = self._held()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
         is_viewed = self.view or self.device.partition(":")[0] == "mouse"
         if self.port is not None and not is_viewed:
@@ -410,9 +411,15 @@ class Run:
         window = self._window() if is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
-            with err.status("reading and trying the scene …"):
+            with err.status("reading the scene …"):
+                source = read_scene(self.scene, **settings_from(self.settings))
+            held = self._completed(held, own_grips(source))
+            if len(held) > 1:
+                return self._run_hands(source, held, clock, stack, interrupts)
+            if held:
+                return self._alone(*held[0]).execute()
+            with err.status("trying the scene …"):
                 with compiling(self.scene):
-                    source = read_scene(self.scene, **settings_from(self.settings))
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
                 if not self.as_json:
                     _warn_of_faults(source, scene)
@@ -447,6 +454,8 @@ class Run:
 
     def _held(self) -> list[tuple[str, str, str]]:
         """Returns grip, joint of the grip axis (may be empty) and device of each --hand."""
+        if not self.hand:
+            return []
         if self.grip != "grip" or self.device != "simulated":
             raise HapticBridgeError("--hand GRIP=DEVICE takes the place of --grip and --device")
         held = []
@@ -458,7 +467,33 @@ class Run:
             held.append((grip, joint, device))
         return held
 
-    def _run_hands(self, held: Sequence[tuple[str, str, str]], clock: Clock) -> int:
+    def _alone(self, grip: str, joint: str, device: str) -> Run:
+        """Returns the run of one hand that --hand names."""
+        joint_of_all = joint or self.grip_axis
+        return replace(self, hand=(), grip=grip, device=device, grip_axis=joint_of_all)
+
+    def _completed(
+        self, held: list[tuple[str, str, str]], grips: tuple[str, ...]
+    ) -> list[tuple[str, str, str]]:
+        """Adds a simulated device for each grip that the scene names and no --hand holds."""
+        if not held and self.grip != "grip":
+            return []
+        if grips and not held and self.device != "simulated":
+            raise HapticBridgeError(
+                f"several hands hold {choices(grips)} in this scene; name the device of each, as "
+                f"in --hand {grips[0]}={self.device}"
+            )
+        named = {grip for grip, _, _ in held}
+        return held + [(grip, "", "simulated") for grip in grips if grip not in named]
+
+    def _run_hands(
+        self,
+        source: SceneSource,
+        held: Sequence[tuple[str, str, str]],
+        clock: Clock,
+        stack: ExitStack,
+        interrupts: Interrupts,
+    ) -> int:
         """Runs several hands, each with its grip, grip axis and device; returns the exit code."""
         for _, _, device in held:
             refuse_simulated_time(device, clock)
@@ -467,20 +502,17 @@ class Run:
             raise HapticBridgeError(
                 "the view shows one hand: --view, --port and the mouse exclude --hand"
             )
-        with ExitStack() as stack:
-            interrupts = stack.enter_context(interrupting_on_signals())
-            with err.status("reading and trying the scene …"), compiling(self.scene):
-                axes = {grip: GripAxis(joint) for grip, joint, _ in held if joint}
-                grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
-                source = read_scene(self.scene, **settings_from(self.settings))
-                scene = compile_scene(source, grips, as_is=self.as_is)
-            grasps = []
-            for grip, joint, name in held:
-                own = scene.of_hand(grips.index(grip))
-                opened = device_for(own, name, notify, joint)
-                stack.callback(opened.close)
-                grasps.append(self._grasp(grip, joint, opened))
-            return self._feel(scene, grasps, clock, stack, None, interrupts)
+        axes = {grip: GripAxis(joint) for grip, joint, _ in held if joint}
+        grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
+        with err.status("trying the scene …"), compiling(self.scene):
+            scene = compile_scene(source, grips, as_is=self.as_is)
+        grasps = []
+        for grip, joint, name in held:
+            own = scene.of_hand(grips.index(grip))
+            opened = device_for(own, name, notify, joint)
+            stack.callback(opened.close)
+            grasps.append(self._grasp(grip, joint, opened))
+        return self._feel(scene, grasps, clock, stack, None, interrupts)
 
     def _gains(self) -> dict[str, float]:
         """Returns the gains of the coupling that the user named."""

@@ -42,6 +42,7 @@ from hapticbridge.kernel.force_level import (
     spend_within_tank,
 )
 from hapticbridge.kernel.handle import (
+    UPRIGHT,
     anchor_handle,
     device_from_scene,
     follow_in_part,
@@ -180,6 +181,8 @@ def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tupl
 def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elapsed: float) -> int:
     """Checks a sample, observes the energy of the previous tick, and moves the handle.
 
+    A joint is moved by the device's x axis alone.
+
     Returns:
         ``OK``, or the reason to refuse the sample; nothing was changed then.
     """
@@ -188,6 +191,8 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
     if not _is_pose(position, quaternion_of(sample[0].quaternion)):
         return BAD_SAMPLE
     quaternion = canonical(quaternion_of(sample[0].quaternion))
+    if s.mj.held_qpos != 0:
+        position, quaternion = (position[0], 0.0, 0.0), UPRIGHT
     moved, turned = _device_motion(pose, position, quaternion)
     code = refusal(s, moved, turned, elapsed)
     if code != OK:

@@ -13,6 +13,7 @@ from hapticbridge.scene.grip import grips as grips
 from hapticbridge.scene.load import SceneSource as SceneSource
 from hapticbridge.scene.load import compile_scene as compile_scene
 from hapticbridge.scene.load import load_scene as load_scene
+from hapticbridge.scene.load import own_grips as own_grips
 from hapticbridge.scene.load import plain_model as plain_model
 from hapticbridge.scene.load import read_scene as read_scene
 from hapticbridge.scene.load import scene_names as scene_names

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 
@@ -43,13 +44,24 @@ def _folder() -> Path:
     return installed if installed.is_dir() else package.parent / "models"
 
 
-def scene_names() -> tuple[str, ...]:
-    """Returns the names of the shipped scenes, sorted."""
-    return tuple(sorted(path.parent.name for path in _folder().glob("*/*.xml") if _is_scene(path)))
+def scene_names(hands: int | None = None) -> tuple[str, ...]:
+    """Returns the names of the shipped scenes, sorted; of those for so many hands, if named."""
+    return tuple(name for name, count in _scenes() if hands in (count, None))
 
 
-def _is_scene(path: Path) -> bool:
-    return path.stem == path.parent.name
+@cache
+def _scenes() -> tuple[tuple[str, int], ...]:
+    """Returns name and number of hands of the shipped scenes, sorted."""
+    paths = [path for path in _folder().glob("*/*.xml") if path.stem == path.parent.name]
+    texts = [ElementTree.parse(path).find("custom/text[@name='grips']") for path in paths]
+    hands = [1 if text is None else len(text.get("data", "").split()) for text in texts]
+    return tuple(sorted(zip((path.stem for path in paths), hands, strict=True)))
+
+
+def own_grips(source: SceneSource) -> tuple[str, ...]:
+    """Returns the grips that a scene names for several hands, in its custom text ``grips``."""
+    named = (text.data.split() for text in source.spec.texts if text.name == "grips")
+    return tuple(next(named, ()))
 
 
 def scene_path(path_or_name: str | Path) -> Path:
@@ -108,7 +120,7 @@ class SceneSource:
 
 def load_scene(
     source: str | Path | mujoco.MjSpec,
-    grip: str | Sequence[str] = "grip",
+    grip: str | Sequence[str] | None = None,
     *,
     as_is: bool = False,
     **parameters: float,
@@ -126,7 +138,8 @@ def load_scene(
         grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
             ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``). Several hands hold
             several grips, in order; each has a handle and a coupling of its own (``kernel.hands``),
-            and two may hold one tool.
+            and two may hold one tool. None holds those that the scene names in its custom text
+            ``grips``, else the site ``grip``.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the
             coupling, force limits of joints, a tool inside something); else it is changed, and
             ``Scene.changes`` lists the changes.
@@ -222,7 +235,7 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
 
 def compile_scene(
     source: SceneSource,
-    grip: str | Sequence[str] = "grip",
+    grip: str | Sequence[str] | None = None,
     *,
     as_is: bool = False,
     warns: bool = True,
@@ -233,7 +246,7 @@ def compile_scene(
 
     Args:
         source: Result of ``read_scene``, possibly with a changed specification; it is not modified.
-        grip: Site, ``BODY`` or ``BODY@x,y,z``, or several of them, as for ``load_scene``.
+        grip: Grip or grips, as for ``load_scene``.
         as_is: If true, a scene that must be changed to be felt is refused.
         warns: If true, deviations of the run from the file are issued as warnings.
         checks_start: If true, a start that is not finite is refused.
@@ -246,6 +259,8 @@ def compile_scene(
         UserWarning: The run deviates from the file in a detail.
     """
     path, spec = source.path, source.spec.copy()
+    if grip is None:
+        grip = own_grips(source) or "grip"
     grips = (grip,) if isinstance(grip, str) else tuple(grip)
     if not grips:
         raise SceneError(f"no grip is named for scene '{path}'; name one per hand")
