@@ -21,6 +21,9 @@ from hapticbridge.testing.device_contract import CONTRACT
 
 JOINT = "joint:hinge"
 
+ASIDE = hb.Workspace(axes=(0, -1, 0, 1, 0, 0, 0, 0, 1))
+"""Turns the device's x axis to the scene's y axis."""
+
 
 class Fingers:
     """Device with a grip axis that moves as told and keeps what it was sent."""
@@ -180,10 +183,6 @@ def test_the_simulated_one_fulfils_the_contract(check: Callable[[Any], None]) ->
 def test_what_cannot_be_is_refused(call: Callable[[], Any], message: str) -> None:
     with pytest.raises((HapticBridgeError, TypeError), match=message):
         call()
-
-
-ASIDE = hb.Workspace(axes=(0, -1, 0, 1, 0, 0, 0, 0, 1))
-"""Turns the device's x axis to the scene's y axis."""
 
 
 def turned_away(aside: hb.Workspace) -> hb.Bridge:
