@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from device_benches import PERIOD, ticks
-from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, SIGMA7, Stub
+from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, OMEGA7, SIGMA7, Stub
+from emulated.hid_seam import DrivingClock
 
+import hapticbridge as hb
 from hapticbridge.device import open_device
 from hapticbridge.device.base import checked_rotation
 from hapticbridge.device.driver import FoundDevice
@@ -249,3 +251,70 @@ def test_without_library_device_is_listed_with_its_want(monkeypatch: pytest.Monk
     (device,) = forcedimension.find()
     assert device.problem is not None
     assert device.problem.startswith("the library '/no/such.so' cannot be loaded")
+
+
+# The gripper
+
+
+@pytest.mark.parametrize(("kind", "axes"), [(OMEGA7, 3), (SIGMA7, 6)])
+def test_a_gripper_is_the_grip_axis_and_is_pushed_apart(kind: int, axes: int) -> None:
+    stub, device = started(kind, numbers={"grip_damping": 2.0, "grip_travel": 0.025})
+    grip = device.info.grip_axis
+    assert grip is not None
+    assert (grip.axes, grip.force_limit, grip.reach, grip.damping) == (("x",), 8.0, 0.025, 2.0)
+    assert len(device.info.axes) == axes
+    stub.call("squeeze", 0.01)
+    ticks(device, stub, 300, np.zeros(6))
+    samples = np.zeros(2, SAMPLE_DTYPE)
+    device.read(samples)
+    assert samples["position"][1].tolist() == pytest.approx([-0.01, 0.0, 0.0], abs=1e-5)
+    assert samples["quaternion"][1].tolist() == [1.0, 0.0, 0.0, 0.0]
+    wrench = np.zeros((2, 6))
+    wrench[0, :3], wrench[1, 0] = (1.0, 0.0, 0.0), -3.0  # against closing
+    device.write(wrench)
+    assert stub.number("grip_force") == 3.0
+    assert stub.force()[0] == 1.0
+    device.write(np.zeros(6))  # one wrench alone leaves the grip without force
+    assert stub.number("grip_force") == 0.0
+    device.write(wrench)
+    stub.now += 0.1  # the loop hangs
+    assert stub.number("grip_force") == 0.0
+    device.write(wrench)
+    device.close()
+    assert stub.number("grip_force") == 0.0
+
+
+def test_a_model_without_motor_at_its_gripper_has_no_grip_axis() -> None:
+    stub = Stub(OMEGA7)
+    stub.call("gripper", 0)
+    assert stub.opened().info.grip_axis is None
+    assert Stub(OMEGA3).opened().info.grip_axis is None
+
+
+@pytest.mark.parametrize("gap", [-0.001, 11.0, math.nan])
+def test_a_gap_that_is_none_is_not_reported(gap: float) -> None:
+    stub, device = started(SIGMA7)
+    stub.call("spoil_gap", gap)
+    with pytest.raises(DeviceError, match="impossible gap of its gripper"):
+        device.read(np.zeros(2, SAMPLE_DTYPE))
+
+
+def test_fingers_close_the_pliers_through_the_library() -> None:
+    """The hand squeezes the gripper of the stand-in, and feels the spring of the scene's hinge."""
+    stub = Stub(SIGMA7)
+    numbers = {"damping": 1.5, "rotational_damping": 4e-3, "grip_damping": 2.0}
+    device = stub.opened(numbers=numbers | {"grip_travel": 0.025})
+    grasp = hb.Grasp("grip", device, grip_axis=hb.GripAxis("hinge"))
+
+    def squeeze(tick: int) -> None:
+        if tick == 700:  # the force has risen
+            stub.call("squeeze", 0.017)
+
+    with hb.Bridge("pliers", [grasp], clock=DrivingClock(stub)) as bridge:
+        bridge.run(2.0, on_tick=squeeze)
+        angle = float(bridge.scene.data.joint("hinge").qpos[0])
+        force = -bridge.latest_records(1)["wrench_on_device"][-1, 0]
+    assert stub.number("grip_force") == 0.0
+    assert angle > 0.05
+    # 10 rad/m; the spring of the pliers, and what holds the jaws apart
+    assert force == pytest.approx(10.0 * 0.4 * (angle + 0.15), rel=0.05)

@@ -14,9 +14,10 @@ static struct {
   double max_force, max_torque, effector, hand_stiffness, hand_damping, hand_mass;
   double x[3], v[3], turn[3], spin[3], target[3], command[6];
   double commanded, guard_until, spoiled;
+  double gap, gap_speed, grip_command, squeeze, gap_spoiled;
   long steps;
   int type, count, is_open, enabled, gravity, expert, watchdog, has_watchdog, fails, buttons;
-  int stale, forces, closed;
+  int stale, forces, closed, gripper;
 } s;
 
 static const char *text = "no error";
@@ -26,6 +27,7 @@ STUB void stub_reset(int type) {
   s.type = type; s.count = 1; s.mass = 0.25; s.damping = 1.5; s.inertia = 2e-4;
   s.turn_damping = 4e-3; s.limit = 12.0; s.torque_limit = 0.4; s.max_force = -1.0;
   s.max_torque = -1.0; s.effector = 0.19; s.has_watchdog = 1; text = "no error";
+  s.gap = 0.025; s.gripper = 1;
 }
 STUB void stub_mechanics(double mass, double damping, double friction, double resolution) {
   s.mass = mass; s.damping = damping; s.friction = friction; s.resolution = resolution;
@@ -48,6 +50,12 @@ STUB void stub_buttons(int mask) { s.buttons = mask; }
 STUB void stub_watchdog(int has) { s.has_watchdog = has; }
 STUB double stub_force(int axis) { return s.enabled ? s.command[axis] : 0.0; }
 STUB double stub_command(int axis) { return s.command[axis]; }
+/* the gripper: 0.05 kg and 2 N s/m at the gap; fingers squeeze towards a gap with 2000 N/m */
+STUB void stub_squeeze(double gap) { s.squeeze = gap; }
+STUB void stub_gripper(int has) { s.gripper = has; }
+STUB void stub_spoil_gap(double value) { s.gap_spoiled = value; }
+STUB double stub_gap(void) { return s.gap; }
+STUB double stub_grip_force(void) { return s.enabled ? s.grip_command : 0.0; }
 STUB int stub_gravity(void) { return s.gravity; }
 STUB int stub_watchdog_steps(void) { return s.watchdog; }
 STUB int stub_enabled(void) { return s.enabled; }
@@ -59,7 +67,13 @@ static double rubbed(double v, double rub) {
 
 static void step(void) {
   for (int i = 0; i < 6 && s.watchdog > 0; i++)
-    if (s.now - s.commanded > 125e-6 * s.watchdog) s.command[i] = 0.0;
+    if (s.now - s.commanded > 125e-6 * s.watchdog) s.command[i] = s.grip_command = 0.0;
+  {
+    double m = 0.05, b = 2.0 + 8.0 * (s.squeeze > 0.0), k = s.squeeze > 0.0 ? 2000.0 : 0.0;
+    double f = stub_grip_force() + k * (s.squeeze - s.gap);
+    s.gap_speed = ((m - 0.5 * STEP * b) * s.gap_speed + STEP * f) / (m + 0.5 * STEP * b);
+    s.gap = fmin(fmax(s.gap + STEP * s.gap_speed, 0.0), 0.025);
+  }
   for (int i = 0; i < 3; i++) {
     double m = s.mass + s.hand_mass, b = s.damping + s.hand_damping;
     double f = stub_force(i) + s.hand_stiffness * (s.target[i] - s.x[i]);
@@ -139,11 +153,26 @@ STUB int dhdSetForceAndTorque(double x, double y, double z, double a, double b, 
   if (called(id) < 0) return -1;
   double command[6] = {scale * x, scale * y, scale * z, turned * a, turned * b, turned * c};
   for (int i = 0; i < 6; i++) s.command[i] = command[i];
+  s.grip_command = 0.0;
   s.commanded = s.now;
   return scale < 1.0 || turned < 1.0 ? 2 : 0;
 }
 STUB int dhdSetForce(double x, double y, double z, char id) {
   return dhdSetForceAndTorque(x, y, z, 0.0, 0.0, 0.0, id);
+}
+STUB int dhdHasActiveGripper(char id) { return called(id) < 0 ? -1 : s.gripper; }
+STUB int dhdGetGripperGap(double *gap, char id) {
+  *gap = s.gap_spoiled != 0.0 ? s.gap_spoiled : s.gap;
+  return called(id);
+}
+STUB int dhdSetForceAndTorqueAndGripperForce(double x, double y, double z, double a, double b,
+                                             double c, double grip, char id) {
+  int code = dhdSetForceAndTorque(x, y, z, a, b, c, id);
+  if (code >= 0) s.grip_command = grip;
+  return code;
+}
+STUB int dhdSetForceAndGripperForce(double x, double y, double z, double grip, char id) {
+  return dhdSetForceAndTorqueAndGripperForce(x, y, z, 0.0, 0.0, 0.0, grip, id);
 }
 STUB double dhdGetTime(void) { return s.now; }
 STUB const char *dhdErrorGetLastStr(void) { return text; }

@@ -10,7 +10,7 @@ from hapticbridge.device import Motion
 from hapticbridge.device.force_dimension.device import ForceDimensionDevice
 from hapticbridge.device.force_dimension.dhd import Dhd
 
-OMEGA3, OMEGA6, SIGMA7 = 33, 34, 104
+OMEGA3, OMEGA6, OMEGA7, SIGMA7 = 33, 34, 35, 104
 CALL = 100e-6
 """In s: what each call of the library takes."""
 

@@ -8,10 +8,13 @@ The device's frame is the library's: the origin in the middle of the workspace, 
 y to the right, z up. A wrist with motors (sigma.7, lambda.7) adds three axes. Its orientation is
 read as a matrix (``dhdGetPositionAndOrientationFrame``), because the library's angles are joint
 angles. A wrist without motors (omega.6 and omega.7) is ignored: its rotation would put energy into
-the scene without a motor to balance it. The maker's gravity compensation is on unless ``gravity=0``
+the scene without a motor to balance it. A gripper with a motor (omega.7, sigma.7, lambda.7) is the
+grip axis: x = −gap, so that it rises as the fingers close, and the force on it is that against the
+gap. The maker's gravity compensation is on unless ``gravity=0``
 is set. It depends on the position only, so it creates no energy.
 
-The driver has not been verified on hardware.
+The driver has not been verified on hardware, nor has the sign of the gripper's force: if it is
+reversed, the watch takes the force away (``kernel.swing_watch``).
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from hapticbridge.device.base import (
     AXES,
     DeviceInfo,
     calling_on_error,
+    checked_number,
     checked_period,
     checked_rotation,
     stated_numbers,
@@ -44,6 +48,7 @@ from hapticbridge.device.driver import (
 )
 from hapticbridge.device.force_dimension.dhd import (
     FILES,
+    GRIP_FORCE,
     MAX_WATCHDOG,
     MODELS,
     SATURATED,
@@ -103,8 +108,8 @@ class ForceDimensionDevice:
         self._dhd = dhd
         what = f"Force Dimension device {index} cannot be opened"
         self._id = dhd.require("dhdOpenID", index, what=what)
-        self._is_open, self._is_started = True, False
-        self._place = [c_double() for _ in range(3)]
+        self._is_open, self._is_started, self._has_grip = True, False, False
+        self._place, self._gap = [c_double() for _ in range(3)], c_double()
         self._frame = (c_double * 9)()
         self._references = [byref(number) for number in self._place]
         self.saturated = 0
@@ -125,7 +130,20 @@ class ForceDimensionDevice:
                 float(dhd[call](self._id)) for call in ("dhdGetMaxForce", "dhdGetMaxTorque")
             ]
             limits = limits_of(model, library_limits, known)
-            rate, delay = dhd.timing(lambda: (self._get(), self._send((0.0,) * 6)))
+            self._has_grip = dhd.has_gripper(self._id, model)
+            rate, delay = dhd.timing(lambda: (self._get(), self._send((0.0,) * 7)))
+            grip_axis = None
+            if self._has_grip:
+                grip_axis = DeviceInfo(
+                    name=f"grip of {self._name}",
+                    axes=AXES[:1],
+                    mass=known.get("grip_mass"),
+                    damping=known.get("grip_damping"),
+                    force_limit=min(known.get("grip_force_limit", GRIP_FORCE), GRIP_FORCE),
+                    reach=known.get("grip_travel"),
+                    rate=rate,
+                    delay=delay,
+                )
             self.info = DeviceInfo(
                 name=self._name,
                 axes=AXES if self._turns else AXES[:3],
@@ -135,6 +153,7 @@ class ForceDimensionDevice:
                 rate=rate,
                 delay=delay,
                 serial=serial,
+                grip_axis=grip_axis,
             )
         carried = "unknown" if self.effector_mass is None else f"{self.effector_mass:g} kg"
         notify(
@@ -143,7 +162,7 @@ class ForceDimensionDevice:
             + f"; gravity compensation {'on' if gravity else 'off'}, end effector {carried}"
         )
         self._notify = notify
-        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._sample = np.zeros(1 + self._has_grip, SAMPLE_DTYPE)
         self._sample["quaternion"] = (1.0, 0.0, 0.0, 0.0)
         self._watch = SilenceDetector(dhd.now())
 
@@ -167,7 +186,7 @@ class ForceDimensionDevice:
                 f"{self._name} has no watchdog ({self._dhd.last_error()}): its last force would "
                 "remain if the program hangs"
             )
-        self._send((0.0,) * 6)
+        self._send((0.0,) * 7)
         self._require("dhdEnableForce", 1)
         self.saturated = 0
         begin = self._dhd.now()
@@ -183,7 +202,7 @@ class ForceDimensionDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Reads the pose; blocks as long as the library does.
+        """Reads the pose, and the grip into a second sample; blocks as long as the library does.
 
         Raises:
             DeviceError: The device was not started, or reports an invalid pose.
@@ -197,12 +216,12 @@ class ForceDimensionDevice:
             self._fill()
         if self._watch.is_silent(now, is_new=is_fresh):
             raise DeviceLost(f"{self._name} has given no fresh sample for {1e3 * SILENCE:g} ms")
-        sample[0] = self._sample[0]
+        sample[:] = self._sample[: sample.size]
         return 0 if is_fresh else int(TickFlag.STALE_SAMPLE)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a wrench on the axes that have motors; it must be finite."""
-        values = wrench.tolist()
+        """Commands a wrench on the axes that have motors, or with that of the grip; finite."""
+        values = [*wrench.ravel()[:7].tolist(), 0.0]
         if not all(map(math.isfinite, values)):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
         self.saturated += self._send(values) == SATURATED
@@ -212,22 +231,30 @@ class ForceDimensionDevice:
         if not self._is_open:
             return
         self._is_open = self._is_started = False
-        for name, arguments in (
-            ("dhdSetForce", (0.0, 0.0, 0.0)),
-            ("dhdEnableForce", (0,)),
-            ("dhdClose", ()),
-        ):
+        calls: list[tuple[str, tuple[float, ...]]] = [("dhdSetForce", (0.0, 0.0, 0.0))]
+        if self._has_grip:
+            calls = [("dhdSetForceAndGripperForce", (0.0, 0.0, 0.0, 0.0))]
+        for name, arguments in (*calls, ("dhdEnableForce", (0,)), ("dhdClose", ())):
             self._dhd[name](*arguments, self._id)  # if a call fails, the watchdog ends the force
 
     def _get(self) -> int:
+        """Reads pose and gap; returns the warning of the pose."""
+        if self._has_grip:
+            self._require("dhdGetGripperGap", byref(self._gap))
         if self._turns:
             name = "dhdGetPositionAndOrientationFrame"
             return self._require(name, *self._references, self._frame)
         return self._require("dhdGetPosition", *self._references)
 
     def _send(self, values: tuple[float, ...] | list[float]) -> int:
+        """Sends force, torque, and the force that closes the grip."""
+        if self._has_grip and self._turns:
+            wrench = *values[:6], -values[6]
+            return self._require("dhdSetForceAndTorqueAndGripperForce", *wrench)
+        if self._has_grip:
+            return self._require("dhdSetForceAndGripperForce", *values[:3], -values[6])
         if self._turns:
-            return self._require("dhdSetForceAndTorque", *values)
+            return self._require("dhdSetForceAndTorque", *values[:6])
         return self._require("dhdSetForce", *values[:3])
 
     def _require(self, name: str, *arguments: object) -> int:
@@ -242,14 +269,21 @@ class ForceDimensionDevice:
                 f"{self._name} reports an impossible position: {x}, {y}, {z} m; each must be "
                 f"within {FARTHEST:g} m"
             )
-        self._sample["position"] = (x, y, z)
+        self._sample["position"][0] = (x, y, z)
+        if self._has_grip:
+            if not 0.0 <= self._gap.value < FARTHEST:
+                raise DeviceError(
+                    f"{self._name} reports an impossible gap of its gripper: {self._gap.value} m"
+                )
+            self._sample["position"][1] = (-self._gap.value, 0.0, 0.0)
         self._sample["buttons"] = self._dhd["dhdGetButtonMask"](self._id) & 0xFFFF
         if self._turns:
-            self._sample["quaternion"] = checked_rotation(self._frame[:], self._name)
+            self._sample["quaternion"][0] = checked_rotation(self._frame[:], self._name)
 
 
 # Discovery of Force Dimension's devices
 
+_GRIP = ("grip_mass", "grip_damping", "grip_force_limit", "grip_travel")
 _NUMBERS = (*MEASURED, "force_limit", "torque_limit")
 
 
@@ -257,13 +291,19 @@ def open_forcedimension(options: Mapping[str, object], notify: Notify) -> ForceD
     """Loads the library and opens one of its devices.
 
     The options are ``library`` (its file), ``serial``, ``gravity`` (1 or 0), and numbers of the
-    data sheet. ``serial`` is the device's number in the library's list, from 0.
+    data sheet, with those of the grip: ``grip_mass``, ``grip_damping``, ``grip_force_limit`` and
+    ``grip_travel`` in kg, N s/m, N and m. ``serial`` is the device's number in the library's list,
+    from 0.
 
     Raises:
         DeviceError: No library or no device is found, or an option is not valid.
         DeviceLost: The device is gone.
     """
-    numbers = stated_numbers(options, _NUMBERS)
+    numbers = stated_numbers(options, _NUMBERS) | {
+        name: checked_number(name, options[name], unit, is_positive=True)
+        for name, unit in zip(_GRIP, ("kg", "N s/m", "N", "m"), strict=True)
+        if options.get(name) is not None
+    }
     gravity = stated_switch(options, "gravity")
     dhd = Dhd(FILES.located(options.get("library")))
     device = select_device(DRIVER, _listed(dhd), options.get("serial"))
@@ -307,12 +347,16 @@ DRIVER = Driver(
     ids=(UsbId(0x1451, 0x0402, "Force Dimension omega"),),
     vendor=0x1451,
     transport="library",
-    axes="x, y, z; with rx, ry, rz where the wrist has motors",
+    axes="x, y, z; with rx, ry, rz where the wrist has motors, and a grip axis where a gripper has",
     force="the library's limit, else 12 N (omega, sigma, lambda) or 20 N (delta)",
     rate="4 kHz, as stated by the maker",
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms; a device without "
     "one is reported at its start",
-    options={"library": str, "serial": str, **dict.fromkeys(("gravity", *_NUMBERS), float)},
+    options={
+        "library": str,
+        "serial": str,
+        **dict.fromkeys(("gravity", *_NUMBERS, *_GRIP), float),
+    },
     open=open_forcedimension,
     find=find,
     medium=medium,

@@ -30,31 +30,36 @@ class Model:
         turns: True if its wrist has motors.
         force: Largest force in N if the library sets no limit; None if unknown.
         torque: Largest torque in N m if the library sets no limit; None if unknown.
+        grips: True if it may have a gripper with a motor.
     """
 
     name: str
     turns: bool = False
     force: float | None = None
     torque: float | None = None
+    grips: bool = False
 
 
 MODELS = {
     33: Model("omega.3", force=12.0),
     34: Model("omega.6", force=12.0),
     36: Model("omega.6 left", force=12.0),
-    35: Model("omega.7", force=12.0),
-    37: Model("omega.7 left", force=12.0),
+    35: Model("omega.7", force=12.0, grips=True),
+    37: Model("omega.7 left", force=12.0, grips=True),
     60: Model("Novint Falcon", force=8.0),
     63: Model("delta.3", force=20.0),
-    104: Model("sigma.7", turns=True, force=12.0, torque=0.4),
-    105: Model("sigma.7 left", turns=True, force=12.0, torque=0.4),
-    108: Model("lambda.7", turns=True, force=12.0),
-    109: Model("lambda.7 left", turns=True, force=12.0),
+    104: Model("sigma.7", turns=True, force=12.0, torque=0.4, grips=True),
+    105: Model("sigma.7 left", turns=True, force=12.0, torque=0.4, grips=True),
+    108: Model("lambda.7", turns=True, force=12.0, grips=True),
+    109: Model("lambda.7 left", turns=True, force=12.0, grips=True),
     203: Model("lambda.3"),
     206: Model("sigma.3"),
 }
 """Device types by ``dhdGetSystemType``, numbered as in the SDK's header. Forces and torques are
 those that CHAI3D allows; the maker's own figures are equal or larger."""
+
+GRIP_FORCE = 8.0
+"""Largest force of a gripper in N, that of omega.7 and sigma.7 in CHAI3D."""
 
 
 def limits_of(
@@ -125,6 +130,14 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 """Functions that are called, with the types of result and arguments."""
 
+GRIPPER: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "dhdHasActiveGripper": (c_int, (c_byte,)),
+    "dhdGetGripperGap": (c_int, (_NUMBERS, c_byte)),
+    "dhdSetForceAndGripperForce": (c_int, (c_double,) * 4 + (c_byte,)),
+    "dhdSetForceAndTorqueAndGripperForce": (c_int, (c_double,) * 7 + (c_byte,)),
+}
+"""Functions of a gripper, which an older library may lack."""
+
 FILES = LibraryFiles(
     variable="HAPTICBRIDGE_DHD",
     stems=("drd", "dhd"),
@@ -146,7 +159,8 @@ class Dhd(MakerLibrary):
     """
 
     def __init__(self, path: str) -> None:
-        super().__init__(path, FUNCTIONS, "Force Dimension's library, or is older than 3.3")
+        about = "Force Dimension's library, or is older than 3.3"
+        super().__init__(path, FUNCTIONS, about, GRIPPER)
 
     def now(self) -> float:
         """Returns the time of the library's own clock in s."""
@@ -156,6 +170,11 @@ class Dhd(MakerLibrary):
         """Returns the library's description of its last error."""
         text = self["dhdErrorGetLastStr"]()
         return text.decode(errors="replace") if text else "no reason reported"
+
+    def has_gripper(self, device: int, model: Model) -> bool:
+        """Returns True if a device has a gripper with a motor, and the library drives it."""
+        is_driven = model.grips and all(name in self for name in GRIPPER)
+        return is_driven and int(self["dhdHasActiveGripper"](device)) == 1
 
     def require(self, name: str, *arguments: Any, what: str) -> int:
         """Calls a function of ``FUNCTIONS`` and returns its code, 0 or a warning.

@@ -23,15 +23,18 @@ class MakerLibrary:
         path: Its file.
         functions: Functions that are called.
         about: Name of the library and its oldest version that has them, for messages.
+        optional: Functions that an older library may lack.
 
     Attributes:
         path: Its file.
 
     Raises:
-        DeviceError: The library cannot be loaded, or lacks a function.
+        DeviceError: The library cannot be loaded, or lacks a function that is not optional.
     """
 
-    def __init__(self, path: str, functions: Signatures, about: str) -> None:
+    def __init__(
+        self, path: str, functions: Signatures, about: str, optional: Signatures | None = None
+    ) -> None:
         try:
             library = ctypes.CDLL(path)
         except OSError as error:
@@ -39,13 +42,20 @@ class MakerLibrary:
             raise DeviceError(f"the library '{path}' cannot be loaded: {reason}") from None
         self.path = path
         self._functions: dict[str, Any] = {}
-        for name, (result, arguments) in functions.items():
+        optional = optional or {}
+        for name, (result, arguments) in (dict(functions) | dict(optional)).items():
             try:
                 function = getattr(library, name)
             except AttributeError:
+                if name in optional:
+                    continue
                 raise DeviceError(f"'{path}' has no {name}: it is not {about}") from None
             function.restype, function.argtypes = result, arguments
             self._functions[name] = function
+
+    def __contains__(self, name: str) -> bool:
+        """Returns True if a function was bound."""
+        return name in self._functions
 
     def __getitem__(self, name: str) -> Any:
         """Returns a function that was bound."""
