@@ -126,7 +126,8 @@ int sketch_broken_sections() { return broken_sections; }
 #include "hb_protocol.h"
 
 static HbSheet sheet = {HB_X | HB_RZ, 990, NAN, 0.4f, NAN,  0.01f, 0.05f,
-                        1.5e-5f,      4,   0.1f, 2,   5e-4f, "shim"};
+                        1.5e-5f,      4,   0.1f, 2,   5e-4f, "shim", 0};
+static const HbGrip grip = {0.05f, 2, NAN, 1e-5f, 8, 3, 0.03f};
 static HbDevice* device = 0;
 
 extern "C" {
@@ -135,6 +136,22 @@ void shim_reset() {
   delete device;
   device = new HbDevice(sheet);
 }
+void shim_reset_with_grip() {
+  delete device;
+  HbSheet with_grip = sheet;
+  with_grip.axes |= HB_GRIP;
+  with_grip.grip = &grip;
+  device = new HbDevice(with_grip);
+}
+void shim_grip_state(float position, float speed, unsigned char* frame) {
+  HbMotion motion;
+  memset(&motion, 0, sizeof motion);
+  motion.angular_velocity[2] = 7;
+  motion.grip_position = position;
+  motion.grip_speed = speed;
+  device->state(motion, 0, frame);
+}
+float shim_grip_force(unsigned now_us) { return device->wrench(now_us).grip; }
 int shim_receive(const unsigned char* frame, unsigned now_us) {
   return device->receive(frame, now_us);
 }

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from device_benches import PERIOD, paddle, read
 from device_benches import opened_rawhid as opened
-from emulated.hid_seam import HidSeam
-from emulated.rawhid_model import NAN, Claims, RawHid, crc
+from emulated.hid_seam import DrivingClock, HidSeam
+from emulated.rawhid_model import NAN, Claims, Fingers, RawHid, crc
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.device import SimulatedDevice
+import hapticbridge as hb
+from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.base import AXES
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
@@ -59,7 +60,7 @@ def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
         (Claims(rate=NAN), "does not report its rate"),
         (Claims(mass=-1.0), "reports an impossible data sheet: mass = -1.0"),
         (Claims(axes=0), "reports an impossible data sheet: axes"),
-        (Claims(axes=64), "reports an impossible data sheet: axes"),
+        (Claims(axes=128), "reports an impossible data sheet: axes"),
     ],
 )
 def test_a_sheet_without_what_nobody_can_guess_is_refused(claims: Claims, words: str) -> None:
@@ -293,3 +294,56 @@ def test_a_board_of_any_vendor_is_found_by_its_usage_page() -> None:
     model.vendor, model.product, model.product_name = 0x303A, 0x4004, "my board"
     device = open_rawhid({}, ignore_message, HidSeam(model))
     assert device.info.name == "test bench"
+
+
+# A grip axis
+
+
+def gripping(path: Motion | None = None, **fingers: float) -> RawHid:
+    """Returns a board with six axes that a hand holds still, and a grip that fingers close."""
+    still = Motion([0.0, 1.0], np.zeros((2, 3)))
+    hand = Hand(mass=0.02, stiffness=1500.0, damping=8.0)
+    grip = SimulatedDevice(mass=0.05, damping=2.0, hand=hand, dof=3, path=path or still)
+    return RawHid(SimulatedDevice(path=still), grip=grip, fingers=Fingers(**fingers))
+
+
+def test_a_grip_axis_has_a_sheet_of_its_own_that_the_user_may_correct() -> None:
+    grip = opened(gripping())[0].info.grip_axis
+    assert grip is not None
+    assert (grip.axes, grip.damping, grip.friction) == (("x",), 2.0, None)
+    assert (grip.force_limit, grip.speed_limit, grip.reach) == (8.0, 3.0, 0.03)
+    changed = opened(gripping(), grip_damping=1.2, grip_force_limit=5.0)[0].info
+    assert changed.grip_axis is not None
+    assert (changed.grip_axis.damping, changed.grip_axis.force_limit) == (1.2, 5.0)
+    assert changed.damping == 2.0
+    assert opened()[0].info.grip_axis is None
+    with pytest.raises(DeviceError, match="does not report its grip's force_limit"):
+        opened(gripping(force_limit=NAN))
+
+
+def test_fingers_on_a_board_close_the_pliers_and_feel_their_spring() -> None:
+    closing = Motion([0.0, 0.2, 0.6], [[0.0] * 3, [0.0] * 3, [0.0105, 0.0, 0.0]])
+    board, model, seam = opened(gripping(closing))
+    grasp = hb.Grasp("grip", board, grip_axis=hb.GripAxis("hinge"))
+    limits = hb.Limits(force=10.0, torque=0.5, ramp=0.0)
+    felt = []
+    with hb.Bridge("pliers", [grasp], clock=DrivingClock(seam), limits=limits) as bridge:
+        summary = bridge.run(1.5, on_tick=lambda _: felt.append(model.grip_force))
+        angle = float(bridge.scene.data.joint("hinge").qpos[0])
+    assert summary.verdict == "passive"
+    assert angle > 0.06
+    assert felt[-1] == pytest.approx(-(0.25 / 0.03) * 0.4 * (angle + 0.15), rel=0.03)
+    assert model.grip_force == 0.0  # at the end
+    assert np.abs(model.wrench).max() == 0.0
+
+
+def test_the_watchdog_of_a_board_ends_the_force_of_its_grip_too() -> None:
+    board, model, seam = opened(gripping())
+    board.start(1e-3)
+    board.write(np.array([[0.0] * 6, [-2.0, 0, 0, 0, 0, 0]]))
+    seam.advance(seam.now + 1e-3)
+    assert model.grip_force == -2.0
+    seam.advance(seam.now + 0.1)
+    assert model.grip_force == 0.0
+    with pytest.raises(DeviceError, match="not finite"):
+        board.write(np.array([[0.0] * 6, [np.nan, 0, 0, 0, 0, 0]]))

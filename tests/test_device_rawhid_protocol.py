@@ -56,12 +56,24 @@ STATE = protocol.State(protocol.Status.ENABLED, 258, 1, 1_000_000, MOTION, 7)
 SHEET = (1, 990.0, NAN, 0.4, NAN, NAN, 0.05, 1.5e-5, 4.0, NAN, 2.0, 5e-4)
 UNKNOWN = protocol.Numbers(1, *[NAN] * 11)
 
+GRIP = protocol.GripNumbers(0.05, 2.0, NAN, 1e-5, 8.0, 3.0, 0.03)
+CLOSED = (0.0,) * 9 + (0.012, -0.1, 0.0)
+
+
+def grip_frame(sequence: int, numbers: protocol.GripNumbers) -> bytes:
+    """Returns page 2 of a device's sheet, by the document."""
+    return sealed(struct.pack("<BBBBHH7f26x", 0x48, 1, 0x44, 2, sequence, 0, *numbers))
+
+
 WRITTEN = {
     "Force 7": protocol.force_frame(7, (1.0, -0.5, 0.0, 0.0, 0.0, 0.01), 20),
     "State 258": state_frame(STATE),
     "Ask 1": protocol.ask_frame(1, 0),
     "Sheet, page 0": sheet_frames(1, protocol.Numbers(*SHEET), "")[0],
     "Sheet, page 1": sheet_frames(2, UNKNOWN, "one-axis capstan paddle")[1],
+    "Force 8": protocol.force_frame(8, (0.0,) * 6 + (-3.5,), 20),
+    "State 259": state_frame(protocol.State(protocol.Status.ENABLED, 259, 0, 2_000_000, CLOSED, 8)),
+    "Sheet, page 2": grip_frame(3, GRIP),
 }
 
 
@@ -302,6 +314,7 @@ def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL
     numbers = protocol.decoded(frame.raw)
     assert isinstance(numbers, protocol.Numbers)
     assert numbers.axis_names == ("x", "rz")
+    assert not numbers.has_grip
     sheet = (990.0, None, 0.4, None, 0.01, 0.05, 1.5e-5, 4.0, 0.1, 2.0, 5e-4)
     assert tuple(numbers.known().values()) == sheet
     shim.shim_receive(protocol.ask_frame(2, 1), 0)
@@ -309,6 +322,29 @@ def test_the_firmware_answers_with_its_sheet_once_per_question(shim: ctypes.CDLL
     assert protocol.decoded(frame.raw) == "shim"
     shim.shim_receive(protocol.ask_frame(3, 2), 0)
     assert not shim.shim_answer(frame)
+
+
+def test_the_firmware_has_a_grip_axis_where_its_sheet_says_so(shim: ctypes.CDLL) -> None:
+    shim.shim_grip_state.argtypes = ctypes.c_float, ctypes.c_float, ctypes.c_char_p
+    shim.shim_grip_force.restype = ctypes.c_float
+    frame = ctypes.create_string_buffer(64)
+    for is_there in (False, True):
+        (shim.shim_reset_with_grip if is_there else shim.shim_reset)()
+        shim.shim_receive(protocol.ask_frame(1, 2), 0)
+        assert bool(shim.shim_answer(frame)) == is_there
+        shim.shim_receive(protocol.force_frame(1, (0.0,) * 6 + (-3.5,), 20), 0)
+        assert shim.shim_grip_force(10) == -3.5  # a device without a grip has no motor for it
+        assert shim.shim_grip_force(20_000) == 0.0  # its watchdog
+    numbers = protocol.decoded(frame.raw)
+    assert isinstance(numbers, protocol.GripNumbers)
+    expected = GRIP.known()
+    assert numbers.known() == expected
+    shim.shim_grip_state(0.012, -0.1, frame)
+    state = protocol.decoded(frame.raw)
+    assert isinstance(state, protocol.State)
+    assert state.numbers[9:] == pytest.approx((0.012, -0.1, 0.0))
+    bad = protocol.force_frame(2, (0.0,) * 6 + (math.inf,), 20)
+    assert not shim.shim_receive(bad, 5)
 
 
 @pytest.fixture(scope="module", name="sketch")

@@ -40,7 +40,7 @@ def test_a_run_refused_late_lets_its_device_go(
 
 def test_a_refused_bridge_lets_go_of_what_it_opened_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     opened, own = Counted(), Counted()
-    monkeypatch.setattr(arrangement, "device_for", lambda *_: opened)
+    monkeypatch.setattr(arrangement, "device_for", lambda *_, **__: opened)
     limits = Limits(force=1e6, torque=1.0)
     with pytest.raises(DeviceError, match="force limit"):
         Bridge("point_mass", "falcon", limits=limits)

@@ -117,6 +117,24 @@ def closing_twice_is_allowed(device: Device) -> None:
     device.close()
 
 
+def a_grip_axis_has_a_sample_and_a_wrench_of_its_own(device: Device) -> None:
+    """Checks a device whose sheet has a grip axis: two samples and wrenches, or one of each."""
+    if device.info.grip_axis is not None:
+        _require(device.start(PERIOD).shape == (2,), "start() must return two samples")
+        samples = np.full(2, -7, SAMPLE_DTYPE)
+        device.read(samples)
+        _require(
+            np.abs(samples["position"][1, 1:]).max() != 7, "read() leaves 'position' unwritten"
+        )
+        _require(
+            samples["quaternion"][1, 0] == 1.0, "the second sample's quaternion is not (1, 0, 0, 0)"
+        )
+        device.write(np.zeros((2, 6)))
+        device.read(samples[:1])
+        device.write(np.zeros(6))
+    device.close()
+
+
 def an_impossible_period_and_a_read_before_the_start_are_refused(device: Device) -> None:
     """Checks that misuse raises ``DeviceError`` with a reason."""
     _require_refusal(lambda: device.read(np.zeros(1, SAMPLE_DTYPE)), "start", "read before start()")
@@ -141,6 +159,7 @@ CONTRACT: tuple[Callable[[Device], None], ...] = (
     force_moves_a_device_unless_its_motion_is_prescribed,
     the_data_sheet_survives_json,
     closing_twice_is_allowed,
+    a_grip_axis_has_a_sample_and_a_wrench_of_its_own,
     an_impossible_period_and_a_read_before_the_start_are_refused,
 )
 """All checks."""

@@ -38,6 +38,23 @@ class Claims:
     delay: float = 0.0
 
 
+GRIP = 64
+"""Bit of the sheet's axes for a grip axis."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fingers:
+    """Grip axis that a model claims, in the page's order, and that its fingers have."""
+
+    mass: float = 0.05
+    damping: float = 2.0
+    friction: float = NAN
+    resolution: float = 0.0
+    force_limit: float = 8.0
+    speed_limit: float = 3.0
+    travel: float = 0.03
+
+
 def crc(data: bytes) -> int:
     """CRC-16/CCITT-FALSE, bit by bit, as the document gives it."""
     register = 0xFFFF
@@ -54,6 +71,8 @@ class RawHid(HidDevice):
 
     Args:
         mechanics: What is behind it; it then reports that pose, rounded to the claimed resolution.
+        grip: What is behind its grip axis, along x; without one it has none.
+        fingers: The page of the sheet for it.
         claims: Its data sheet.
         title: Its name in the sheet.
 
@@ -81,8 +100,13 @@ class RawHid(HidDevice):
         title: str = "test bench",
         serial: str = "12345",
         clock_start_us: int = 0,
+        grip: SimulatedDevice | None = None,
+        fingers: Fingers | None = None,
     ) -> None:
         super().__init__()
+        self._grip = None if grip is None else Handle(grip)
+        self._fingers = fingers or Fingers()
+        self.grip_force = 0.0
         self.serial = serial
         self.claims = claims or Claims()
         self.wrench: NDArray[np.float64] = np.zeros(6)
@@ -123,12 +147,16 @@ class RawHid(HidDevice):
         if self._expires is not None and now >= self._expires:
             self._push_with(self._expires)
             self.wrench, self._expires, self._has_expired = np.zeros(6), None, True
+            self.grip_force = 0.0
         self._push_with(now)
 
     def _push_with(self, now: float) -> None:
         if self._handle is not None:
             self._handle.force[:] = 0.0 if self.status & (8 | 16) else self.wrench
             self._handle.advance(now)
+        if self._grip is not None:
+            self._grip.force[0] = 0.0 if self.status & (8 | 16) else self.grip_force
+            self._grip.advance(now)
 
     # -- frames ----------------------------------------------------------------------------------
 
@@ -155,7 +183,10 @@ class RawHid(HidDevice):
             position = step * np.round(position / step)
         w, x, y, z = quaternion
         turned = Rotation.from_quat([x, y, z, w]).as_rotvec()
-        return (*position, *turned, *self._handle.velocity())
+        velocity = self._handle.velocity()
+        if self._grip is not None:
+            velocity[3:] = self._grip.pose()[0][0], self._grip.velocity()[0], 0.0
+        return (*position, *turned, *velocity)
 
     def output(self, report: bytes, now: float) -> None:
         good = len(report) == 64 and report[:2] == b"\x48\x01"
@@ -168,11 +199,13 @@ class RawHid(HidDevice):
             self._send_sheet(option, sequence)
         elif kind == 0x46:
             wrench = np.array(struct.unpack_from("<6f", report, 8))
-            if not np.isfinite(wrench).all():
+            (grip,) = struct.unpack_from("<f", report, 32)
+            if not np.isfinite([*wrench, grip]).all():
                 return
             self.commands += 1
             self.is_enabled = bool(option & 1)
             self.wrench = wrench if self.is_enabled else np.zeros(6)
+            self.grip_force = grip if self.is_enabled else 0.0
             self._echo = sequence
             self._expires, self._has_expired = now + 1e-3 * min(watchdog_ms, 1000), False
 
@@ -184,7 +217,12 @@ class RawHid(HidDevice):
             c.resolution, c.force_limit, c.torque_limit, c.speed_limit, c.delay,
         )  # fmt: skip
         if page == 0:
-            body = head + struct.pack("<H11f10x", c.axes, *numbers)
+            axes = c.axes | (GRIP if self._grip is not None else 0)
+            body = head + struct.pack("<H11f10x", axes, *numbers)
+        elif page == 2:
+            f = self._fingers
+            own = f.mass, f.damping, f.friction, f.resolution, f.force_limit, f.speed_limit
+            body = head + struct.pack("<H7f26x", 0, *own, f.travel)
         else:
             body = head + bytes(2) + self._title.encode()[:54].ljust(54, b"\0")
         self.push(body + struct.pack("<H", crc(body)))

@@ -21,11 +21,13 @@ from hapticbridge.device.base import (
 from hapticbridge.device.driver import Driver, Notify, UsbId
 from hapticbridge.device.rawhid.protocol import (
     DOCUMENT,
+    GRIP_PAGE,
     LARGEST,
     LONGEST_WATCHDOG_MS,
     NAME_PAGE,
     NUMBERS_PAGE,
     VERSION,
+    GripNumbers,
     Numbers,
     State,
     Status,
@@ -72,13 +74,17 @@ a second per page."""
 POLLING = 1e-3
 """Polling interval of a full-speed device in s, in each direction."""
 
-_MUST_SAY = ("rate", "speed_limit")
+_MUST_SAY, _GRIP_MUST_SAY = ("rate", "speed_limit"), ("force_limit", "speed_limit")
 CHANGES = tuple(name for name in Numbers._fields if name not in ("axes", "rate", "delay"))
 """Numbers of the data sheet that the user may replace."""
+GRIP_CHANGES = ("grip_mass", "grip_damping", "grip_force_limit")
+"""Numbers of the grip axis that the user may replace."""
+
+_PAGES = {NUMBERS_PAGE: Numbers, NAME_PAGE: str, GRIP_PAGE: GripNumbers}
 
 
-def request_sheet(link: FrameLink, name: str) -> tuple[Numbers, str]:
-    """Requests both pages of a device's sheet.
+def request_sheet(link: FrameLink, name: str) -> tuple[Numbers, str, GripNumbers | None]:
+    """Requests the pages of a device's sheet; the third is that of a grip axis.
 
     Raises:
         DeviceError: The device does not answer, or has another version of the protocol.
@@ -86,15 +92,17 @@ def request_sheet(link: FrameLink, name: str) -> tuple[Numbers, str]:
     """
     numbers, title = _page(link, name, NUMBERS_PAGE), _page(link, name, NAME_PAGE)
     assert isinstance(numbers, Numbers)
-    return numbers, str(title)
+    grip = _page(link, name, GRIP_PAGE) if numbers.has_grip else None
+    assert grip is None or isinstance(grip, GripNumbers)
+    return numbers, str(title), grip
 
 
-def _page(link: FrameLink, name: str, page: int) -> Numbers | str:
+def _page(link: FrameLink, name: str, page: int) -> Numbers | GripNumbers | str:
     for _ in range(ASKS):
         link.write(b"\0" + ask_frame(page, page))
         for report in reports(link, ASK_WAIT_MS):
             answer = decoded(report)
-            if isinstance(answer, Numbers if page == NUMBERS_PAGE else str):
+            if isinstance(answer, Numbers | GripNumbers | str) and type(answer) is _PAGES[page]:
                 return answer
             if (version := version_of(report)) not in (None, VERSION):
                 raise DeviceError(
@@ -116,12 +124,11 @@ def reports(link: FrameLink, timeout_ms: int) -> Iterator[bytes]:
 
 def data_sheet(
     name: str,
-    numbers: Numbers,
-    title: str,
+    pages: tuple[Numbers, str, GripNumbers | None],
     changes: dict[str, Any],
     round_trip: float | None = None,
 ) -> DeviceInfo:
-    """Returns the data sheet from the device's numbers, its title and the user's changes.
+    """Returns the data sheet from the device's pages and the user's changes.
 
     The delay is the device's own plus ``round_trip``, the measured time in s from a written force
     to the state that confirms it. A measured delay includes what the device does not report.
@@ -130,8 +137,10 @@ def data_sheet(
     Raises:
         DeviceError: A required number is missing, or one is out of range.
     """
+    numbers, title, grip = pages
     known: dict[str, Any] = numbers.known()
     axes = numbers.axis_names
+    of_grip = {key.removeprefix("grip_"): changes.pop(key) for key in GRIP_CHANGES & changes.keys()}
     moves, turns = (any(axis in axes for axis in kind) for kind in (AXES[:3], AXES[3:]))
     if not moves:
         known["force_limit"] = USUAL_FORCE_LIMIT
@@ -142,12 +151,19 @@ def data_sheet(
     if missing := [field for field in must if known[field] is None]:
         raise DeviceError(f"{name} does not report its {missing[0]}, which is required")
     delay = known.pop("delay")
+    values: dict[str, Any] = {} if grip is None else grip.known() | of_grip
+    if missing := [each for each in _GRIP_MUST_SAY if each in values and values[each] is None]:
+        raise DeviceError(f"{name} does not report its grip's {missing[0]}, which is required")
     try:
         if round_trip is not None:
             delay = (delay or 0.0) + round_trip
         elif delay is not None:
             delay += 1.0 / known["rate"] + 2.0 * POLLING
-        return DeviceInfo(name=title or name, axes=axes, delay=delay, **known)
+        info = DeviceInfo(name=title or name, axes=axes, delay=delay, **known)
+        if grip is None:
+            return info
+        own: dict[str, Any] = {"axes": AXES[:1], "rate": info.rate, "delay": delay} | values
+        return replace(info, grip_axis=DeviceInfo(name=f"grip of {info.name}", **own))
     except (DeviceError, ZeroDivisionError) as error:
         raise DeviceError(f"{name} reports an impossible data sheet: {error}") from None
 
@@ -244,9 +260,11 @@ class RawHidDevice:
         self._link, self._name, self._now = link, name, now
         self._sequence = 0
         self.states = StateStream(name)
-        self.info = data_sheet(name, *request_sheet(link, name), dict(changes or {}), round_trip)
+        self.info = data_sheet(name, request_sheet(link, name), dict(changes or {}), round_trip)
         self._mask = np.array([float(axis in self.info.axes) for axis in AXES])
-        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._has_grip = self.info.grip_axis is not None
+        self._sample = np.zeros(1 + self._has_grip, SAMPLE_DTYPE)
+        self._sample["quaternion"][:, 0] = 1.0
         self._watch = SilenceDetector(now())
         self._watchdog_ms = LONGEST_WATCHDOG_MS
         self._is_open, self._has_begun = True, False
@@ -284,7 +302,7 @@ class RawHidDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Returns the newest pose without waiting.
+        """Returns the newest pose, and in a second sample the grip, without waiting.
 
         Raises:
             DeviceLost: The device is gone, or silent for longer than ``SILENCE``.
@@ -303,20 +321,23 @@ class RawHidDevice:
             silence = 1e3 * self._watch.silence
             raise DeviceLost(f"{self._name} has sent nothing for {silence:.0f} ms; check its cable")
         if not is_new:
-            sample[0] = self._sample[0]
+            sample[:] = self._sample[: sample.size]
             return int(TickFlag.STALE_SAMPLE)
         self._refuse_fault(states.newest)
         self._fill(states.newest)
-        sample[0] = self._sample[0]
+        sample[:] = self._sample[: sample.size]
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
-        """Commands a finite wrench on the axes that the device has.
+        """Commands a finite wrench on the axes that the device has, or with that of the grip.
 
         Raises:
             DeviceError: It is not finite, or the loop hung and the guardian ended the force.
         """
-        values = (wrench * self._mask).tolist()
+        flat = wrench.ravel()
+        values = (flat[:6] * self._mask).tolist()
+        if self._has_grip and flat.size > 6:
+            values.append(float(flat[6]))
         if not all(abs(value) < LARGEST for value in values):
             raise DeviceError(f"{self._name}: a wrench that is not finite was not sent")
         if self.last_word is not None:
@@ -343,6 +364,8 @@ class RawHidDevice:
         state = self.states.newest
         numbers = (0.0,) * 12 if state is None else state.numbers
         moving: NDArray[np.float64] = np.array(numbers[6:]) * self._mask
+        if self._has_grip:  # which is in its place
+            moving[3:] = 0.0
         return moving
 
     @property
@@ -367,6 +390,8 @@ class RawHidDevice:
         x, y, z = pose[3:].tolist()
         sample["quaternion"] = canonical(quaternion_exp((x, y, z)))
         sample["buttons"] = state.buttons
+        if self._has_grip:
+            self._sample["position"][1, 0] = state.numbers[9]
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) & 0xFFFF
@@ -393,7 +418,7 @@ def open_rawhid(
     Raises:
         DeviceError: No device is found, it cannot be opened, or it has another protocol.
     """
-    changes = {key: value for key, value in options.items() if key in CHANGES}
+    changes = {key: options[key] for key in (*CHANGES, *GRIP_CHANGES) if key in options}
     with opened(DRIVER, options, api) as (plugged, link):
         device = RawHidDevice(link, str(plugged), changes, now)
     device.info = replace(device.info, serial=plugged.serial)
@@ -408,10 +433,10 @@ DRIVER = Driver(
     about="home-made devices with our open protocol over USB HID (as on Teensy)",
     ids=(UsbId(0x16C0, 0x0486, "Teensy raw HID"),),
     transport="hid",
-    axes="1 to 6, as built",
+    axes="1 to 6, and a grip axis, as built",
     force="as built",
     rate="to 1 kHz, as built",
-    options={"serial": str, "log": str, **dict.fromkeys(CHANGES, float)},
+    options={"serial": str, "log": str, **dict.fromkeys((*CHANGES, *GRIP_CHANGES), float)},
     open=open_rawhid,
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "
     "to the protocol",

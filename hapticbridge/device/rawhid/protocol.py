@@ -71,11 +71,12 @@ class Status(IntFlag):
 ENABLE = 1
 """Byte 3 of a force frame that enables the motors."""
 
-NUMBERS_PAGE, NAME_PAGE = 0, 1
+NUMBERS_PAGE, NAME_PAGE, GRIP_PAGE = 0, 1, 2
 """Pages of the sheet, byte 3 of a frame that requests or holds one."""
 
 _STATE = struct.Struct("<BBBBHHI12fH")
-_FORCE = struct.Struct("<BBBBHH6f30x")
+_FORCE = struct.Struct("<BBBBHH7f26x")
+_GRIP = struct.Struct("<BBBBHH7f26x")
 _NUMBERS = struct.Struct("<BBBBHH11f10x")
 _NAME = struct.Struct("<BBBBHH54s")
 _CRC = struct.Struct("<H")
@@ -90,7 +91,8 @@ class State(NamedTuple):
         buttons: 16 bits, one per button.
         time_us: The device's clock when the pose was latched, in µs modulo 2^32 (71.6 min).
         numbers: Position in m, rotation vector in rad, velocity in m/s, angular velocity in rad/s:
-            3 each, in the device's frame.
+            3 each, in the device's frame. With a grip axis the last three are how far it is closed
+            in m, its speed in m/s, and 0.
         echo: Sequence of the newest force frame that the device applies.
     """
 
@@ -107,11 +109,19 @@ class State(NamedTuple):
         return all(map(math.isfinite, self.numbers))
 
 
+def _known(values: dict[str, float]) -> dict[str, float | None]:
+    # shortest text of the float32: 0.1 instead of 0.10000000149
+    return {
+        name: float(str(np.float32(value))) if math.isfinite(value) else None
+        for name, value in values.items()
+    }
+
+
 class Numbers(NamedTuple):
     """Page 0 of the device's data sheet; NaN for unknown numbers.
 
     Attributes:
-        axes: Bit i is set if it has axis i of ``AXES``.
+        axes: Bit i is set if it has axis i of ``AXES``, bit 6 if it has a grip axis.
         rate: Rate of state frames in Hz.
         mass: Mass in kg.
         damping: Damping in N s/m.
@@ -143,16 +153,43 @@ class Numbers(NamedTuple):
         """Returns the numbers by name, None for NaN and infinity."""
         values = self._asdict()
         del values["axes"]
-        # shortest text of the float32: 0.1 instead of 0.10000000149
-        return {
-            name: float(str(np.float32(value))) if math.isfinite(value) else None
-            for name, value in values.items()
-        }
+        return _known(values)
 
     @property
     def axis_names(self) -> tuple[str, ...]:
         """Axes by name, in the order of ``AXES``."""
         return tuple(name for i, name in enumerate(AXES) if self.axes >> i & 1)
+
+    @property
+    def has_grip(self) -> bool:
+        """True if it has a grip axis."""
+        return bool(self.axes >> len(AXES) & 1)
+
+
+class GripNumbers(NamedTuple):
+    """Page 2 of the data sheet, its grip axis; NaN for unknown numbers.
+
+    Attributes:
+        mass: Inertia at the fingers in kg.
+        damping: Damping in N s/m.
+        friction: Coulomb friction in N.
+        resolution: Step of the position in m.
+        force_limit: Largest force in N.
+        speed_limit: Largest speed in m/s.
+        reach: How far it closes in m.
+    """
+
+    mass: float
+    damping: float
+    friction: float
+    resolution: float
+    force_limit: float
+    speed_limit: float
+    reach: float
+
+    def known(self) -> dict[str, float | None]:
+        """Returns the numbers by name, None for NaN and infinity."""
+        return _known(self._asdict())
 
 
 def crc16(data: bytes) -> int:
@@ -165,15 +202,16 @@ def force_frame(
 ) -> bytes:
     """Returns the frame that commands a wrench: 6 finite numbers in N and N m.
 
-    The device ends the force ``watchdog_ms``, 1 to 1000, after the last frame.
+    A seventh is the force that closes the grip, in N. The device ends the force ``watchdog_ms``, 1
+    to 1000, after the last frame.
     """
-    flags = ENABLE if is_enabled else 0
-    return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *wrench))
+    flags, numbers = ENABLE if is_enabled else 0, (*wrench, 0.0)[:7]
+    return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.FORCE, flags, sequence, watchdog_ms, *numbers))
 
 
 def ask_frame(sequence: int, page: int) -> bytes:
     """Returns the frame that requests a page of the sheet."""
-    return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 6))
+    return _sealed(_FORCE.pack(MAGIC, VERSION, Kind.ASK, page, sequence, 0, *[0.0] * 7))
 
 
 def _sealed(body: bytes) -> bytes:
@@ -188,8 +226,8 @@ def version_of(frame: bytes) -> int | None:
     return frame[1] if crc16(frame[:-2]) == crc else None
 
 
-def decoded(frame: bytes) -> State | Numbers | str | None:
-    """Decodes any bytes from the device: a state, page 0 of the sheet, or the name of page 1.
+def decoded(frame: bytes) -> State | Numbers | GripNumbers | str | None:
+    """Decodes any bytes from the device: a state, or a page of the sheet.
 
     None stands for another length, version or kind, or a damaged frame. Numbers may be any float32.
     """
@@ -202,6 +240,8 @@ def decoded(frame: bytes) -> State | Numbers | str | None:
         return State(status, sequence, buttons, time_us, values[7:19], values[19])
     if kind == Kind.SHEET and page == NUMBERS_PAGE:
         return Numbers(*_NUMBERS.unpack_from(frame)[5:])
+    if kind == Kind.SHEET and page == GRIP_PAGE:
+        return GripNumbers(*_GRIP.unpack_from(frame)[6:])
     if kind == Kind.SHEET and page == NAME_PAGE:
         return printable(_NAME.unpack_from(frame)[6].split(b"\0")[0].decode(errors="replace"))
     return None

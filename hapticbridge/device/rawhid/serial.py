@@ -29,7 +29,7 @@ from hapticbridge.device.driver import (
     Notify,
     access_problem,
 )
-from hapticbridge.device.rawhid.device import CHANGES, NO_WRENCH, RawHidDevice
+from hapticbridge.device.rawhid.device import CHANGES, GRIP_CHANGES, NO_WRENCH, RawHidDevice
 from hapticbridge.device.rawhid.protocol import (
     DOCUMENT,
     NUMBERS_PAGE,
@@ -408,7 +408,7 @@ def open_serial(
     if "baud" in options:
         baud = checked_number("baud", options["baud"], "bit/s", is_positive=True)
         bauds = (round(baud),)
-    changes = {key: value for key, value in options.items() if key in CHANGES}
+    changes = {key: options[key] for key in (*CHANGES, *GRIP_CHANGES) if key in options}
     plugged, (link, baud) = _first_answer(
         _candidates(options, source), source, bauds, notify, options
     )
@@ -477,7 +477,7 @@ DRIVER = Driver(
         "baud": int,
         "serial": str,
         "log": str,
-        **dict.fromkeys(CHANGES, float),
+        **dict.fromkeys((*CHANGES, *GRIP_CHANGES), float),
     },
     open=open_serial,
     on_stall=f"its watchdog ends the force after {1e3 * SHORTEST_WATCHDOG:g} ms, if it was built "

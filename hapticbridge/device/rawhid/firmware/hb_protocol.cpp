@@ -99,7 +99,7 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
     asked_page_ = frame[3];
     asked_sequence_ = get16(frame + 4);
   } else if (frame[2] == FORCE) {
-    for (int i = 0; i < 6; i++) {
+    for (int i = 0; i < 7; i++) {
       if (!is_finite(float_bits(frame + 8 + 4 * i))) return false;
     }
     uint16_t watchdog_ms = get16(frame + 6);
@@ -108,6 +108,7 @@ bool HbDevice::receive(const uint8_t frame[HB_FRAME_BYTES], uint32_t now_us) {
       command_.commanded.force[i] = get_float(frame + 8 + 4 * i);
       command_.commanded.torque[i] = get_float(frame + 20 + 4 * i);
     }
+    command_.commanded.grip = get_float(frame + 32);
     echo_ = get16(frame + 4);
     command_.is_enabled = (frame[3] & ENABLE) != 0;
     command_.watchdog_us = 1000u * watchdog_ms;
@@ -162,6 +163,14 @@ bool HbDevice::answer(uint8_t frame[HB_FRAME_BYTES]) {
     begin(frame, SHEET, 1, asked_sequence_);
     const size_t length = strlen(sheet_.name);
     memcpy(frame + 8, sheet_.name, length < HB_NAME_BYTES ? length : HB_NAME_BYTES);
+  } else if (page == 2 && (sheet_.axes & HB_GRIP) != 0) {
+    begin(frame, SHEET, 2, asked_sequence_);
+    const HbGrip& grip = *sheet_.grip;
+    const float numbers[] = {grip.mass,        grip.damping,     grip.friction, grip.resolution,
+                             grip.force_limit, grip.speed_limit, grip.travel};
+    for (size_t i = 0; i < sizeof numbers / sizeof *numbers; i++) {
+      put_float(frame + 8 + 4 * i, numbers[i]);
+    }
   } else {
     return false;
   }
@@ -184,6 +193,11 @@ void HbDevice::state(const HbMotion& motion, uint32_t now_us, uint8_t frame[HB_F
     put_float(frame + 24 + 4 * i, motion.rotation[i]);
     put_float(frame + 36 + 4 * i, motion.velocity[i]);
     put_float(frame + 48 + 4 * i, motion.angular_velocity[i]);
+  }
+  if (sheet_.axes & HB_GRIP) {
+    put_float(frame + 48, motion.grip_position);
+    put_float(frame + 52, motion.grip_speed);
+    put_float(frame + 56, 0.0f);
   }
   put16(frame + 60, echo_);
   seal(frame);

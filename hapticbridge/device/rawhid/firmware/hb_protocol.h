@@ -24,8 +24,8 @@ static const size_t HB_NAME_BYTES = 54;
 // Longest watchdog in ms that a host may request.
 static const uint16_t HB_LONGEST_WATCHDOG_MS = 1000;
 
-// Axes, one bit each: along x, y, z and about them.
-enum HbAxis { HB_X = 1, HB_Y = 2, HB_Z = 4, HB_RX = 8, HB_RY = 16, HB_RZ = 32 };
+// Axes, one bit each: along x, y, z and about them; and the grip between the fingers.
+enum HbAxis { HB_X = 1, HB_Y = 2, HB_Z = 4, HB_RX = 8, HB_RY = 16, HB_RZ = 32, HB_GRIP = 64 };
 
 // Status bits of a state frame. The builder sets SATURATED, FAULT and NOT_READY in HbMotion; the
 // others are the protocol's.
@@ -36,6 +36,17 @@ enum HbStatus {
   HB_FAULT = 8,       // encoder, driver or temperature: the device gives no force
   HB_NOT_READY = 16,  // the pose is not valid yet
   HB_DAMAGED = 32     // a frame with a wrong CRC has come since the newest valid one
+};
+
+// Data sheet of a grip axis; NAN for unknown numbers. The limits must be known.
+struct HbGrip {
+  float mass;         // kg, at the fingers
+  float damping;      // N s/m, physical
+  float friction;     // N, Coulomb
+  float resolution;   // m, step of the reported position
+  float force_limit;  // N
+  float speed_limit;  // m/s
+  float travel;       // m, how far it closes
 };
 
 // Data sheet of the device; NAN for unknown numbers. rate, speed_limit, and the limit of each kind
@@ -54,6 +65,7 @@ struct HbSheet {
   float speed_limit;         // m/s
   float delay;               // s, latch of the pose to sending it, plus reception to motors
   const char* name;          // UTF-8, at most HB_NAME_BYTES
+  const HbGrip* grip;        // its grip axis; read only with HB_GRIP in axes
 };
 
 // Motion of the device in its own frame, latched at one time. Missing axes stay 0.
@@ -64,12 +76,16 @@ struct HbMotion {
   float angular_velocity[3];  // rad/s
   uint16_t buttons;
   uint8_t status;  // HB_SATURATED, HB_FAULT, HB_NOT_READY
+  // with a grip axis, sent in place of the angular velocity
+  float grip_position;  // m, rises as it closes
+  float grip_speed;     // m/s
 };
 
 // Wrench that the motors must apply.
 struct HbWrench {
   float force[3];   // N, on the handle, in the device's frame
   float torque[3];  // N m
+  float grip;       // N, closes the grip
 };
 
 // Command of the host with its expiry: all that an interrupt needs.
