@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+import numpy as np
 from emulated.falcon_model import FalconModel
 from emulated.handle import Handle, planar_hand
 from emulated.pid_layouts import ODD, USUAL
 from emulated.pid_model import PidStick
 from emulated.rawhid_model import Claims, RawHid
 
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.device.driver import FoundDevice
 from hapticbridge.scene import load_scene
@@ -31,6 +32,9 @@ NEWTONS, TRAVEL = 4.0, 0.12
 
 STICK = f"pid:newtons={NEWTONS},travel={TRAVEL},mass={MASS},damping={DAMPING},friction={FRICTION}"
 
+FIRM = Hand(stiffness=1000.0, damping=30.0)
+"""A hand that turns a nut."""
+
 PROGRAM = bytes(range(256)) * 31
 """Stands for the maker's program: about its size, and every byte value in it."""
 
@@ -44,6 +48,17 @@ def mechanics() -> SimulatedDevice:
 def falcon() -> FalconModel:
     """Returns a Falcon that runs its program and has found its zeros."""
     return FalconModel(Handle(mechanics()))
+
+
+def turning_falcon() -> FalconModel:
+    """Returns a Falcon in a hand that moves to and fro along y, as with a spanner."""
+    times = np.arange(0.0, 60.0, 0.02)
+    places = np.zeros((len(times), 3))
+    places[:, 1] = 0.015 * np.sin(2.0 * np.pi * times)
+    mechanics = SimulatedDevice(
+        mass=MASS, damping=DAMPING, friction=FRICTION, hand=FIRM, path=Motion(times, places)
+    )
+    return FalconModel(Handle(mechanics))
 
 
 def free_falcon() -> FalconModel:

@@ -16,13 +16,14 @@ from emulated.usb_device import UsbDevice
 from numpy.typing import NDArray
 
 import hapticbridge as hb
+from hapticbridge.cli.main import main
 from hapticbridge.device import Device
 from hapticbridge.device.discovery import plugged_devices
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.record import SAMPLE_DTYPE
 from usb_tiers import benches
 from usb_tiers.benches import usable_devices, wait_for
-from usb_tiers.conftest import IS_TIME_VIRTUAL, Plug
+from usb_tiers.conftest import FIRST_FRONT_END, IS_TIME_VIRTUAL, TIER, Plug
 
 PERIOD = 1e-3
 
@@ -184,6 +185,40 @@ def test_a_deflected_spacemouse_moves_the_handle(plug_hid: Plug, has_long_report
 def _deflected(now: float) -> tuple[float, ...]:
     """Half way to the right, and no more."""
     return (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _still(now: float) -> tuple[float, ...]:
+    return (0.0,) * 6
+
+
+@pytest.mark.usefixtures("no_spin")
+@pytest.mark.parametrize("plug_hid", FIRST_FRONT_END, indirect=True)
+def test_a_falcon_turns_the_nut_of_a_bolt_that_a_spacemouse_holds(
+    plug_usb: Plug, plug_hid: Plug, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if TIER == "umock":
+        pytest.skip("umockdev aborts where a process uses a USB and a HID device")
+    plug_usb(benches.turning_falcon)
+    wait_for(usable_devices)
+    plug_hid(lambda: SpaceMouse(_still))
+    wait_for(lambda: len(usable_devices()) == 2)
+    file = tmp_path / "run.mcap"
+    hands = ["--hand", f"wrench={benches.FALCON}", "--hand", "bolt=spacemouse"]
+    duration = ["--duration", f"{TURN:g}", "--record", str(file)]
+    status = main(["run", "nut_and_wrench", *hands, *duration])
+    assert status in (0, 1), capsys.readouterr().err
+    spanner, bolt = (hb.read_recording(file, hand=each).ticks for each in (0, 1))
+    moved = np.ptp(spanner["device_position"], axis=0)
+    assert moved[1] > 5e-3
+    # the falcon feels the nut, and the hand at the bolt bears it, without a motor to tell
+    assert np.abs(spanner["wrench_on_device"][:, :3]).max() > 0.3
+    assert np.abs(bolt["wrench_on_tool"][:, 5]).max() > 0.03
+    report = hb.audit(file, in_process=True)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+TURN = 0.8
+"""In s: how long the nut is turned, to and fro in 1 s."""
 
 
 def _pulled_out_of_a_run(
