@@ -18,7 +18,7 @@ from hapticbridge.export_viewers import FoxgloveSink, RerunSink
 from hapticbridge.files import import_extra, reason_of
 from hapticbridge.record import FLAG_LEGEND, TableColumns, Timeline, due_times
 from hapticbridge.recording import RecordingFile, open_recording
-from hapticbridge.recording.reader import CUTTING_EVENTS
+from hapticbridge.recording.reader import CUTTING_EVENTS, hand_named
 from hapticbridge.run_description import meta_float
 
 # Interface of table writers
@@ -240,6 +240,7 @@ def export(
     *,
     span: tuple[float, float] = EVERYTHING,
     overwrite: bool = False,
+    hand: str | None = None,
 ) -> Exported:
     """Writes a recording as a table: a row per tick, a column per number and one of seconds.
 
@@ -257,14 +258,15 @@ def export(
             in it are written; metadata ``cut`` then holds the two times. Events that say that the
             recording lacks an end, and metadata ``incomplete`` with the reason, are always written.
         overwrite: True replaces existing files.
+        hand: Grip of the hand whose records are written; None for a run of one hand.
 
     Raises:
-        RecordingError: The recording cannot be read; the format is unknown or its package is not
-            installed; no tick lies in the span; or the target exists, is the recording, has a wrong
-            extension or cannot be written.
+        RecordingError: The recording cannot be read, or has no such hand; the format is unknown or
+            its package is not installed; no tick lies in the span; or the target exists, is the
+            recording, has a wrong extension or cannot be written.
     """
     sink_type, endings = _sink(form)
-    recording = open_recording(path)
+    recording = open_recording(path, None if hand is None else hand_named(path, hand))
     target = target_for(path, form) if target is None else Path(target)
     if target.suffix.lower() not in endings:
         raise RecordingError(f"the {form} file '{target}' must end in {' or '.join(endings)}")

@@ -12,7 +12,7 @@ import io
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,12 @@ from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import FREE_CAMERA, STATES
-from hapticbridge.kernel.codes import coupling_ids
+from hapticbridge.kernel.codes import JOINT, added_actuators
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.snapshot import MAX_CONTACTS
 from hapticbridge.run_description import parameters_of
 
@@ -129,7 +130,8 @@ class Stage:
         parameters: Parameters of the run.
         model: The scene.
         data: State at the tick last shown, with contacts as they were solved.
-        row: Record of that tick, one element of ``TICK_DTYPE``.
+        row: Record of that tick, one element of ``TICK_DTYPE``; of several hands, the first's.
+        rows: Records of that tick, one per hand.
         passed: Records after the tick shown before and before this one.
         hand_force: Force of the device on the hand at that tick, (3,) in N in the scene's frame;
             zero for a prescribed motion, which no hand feels.
@@ -143,27 +145,40 @@ class Stage:
     def __init__(
         self, path: str | Path | RecordingFile, on_compiled: Callable[[], object] | None = None
     ) -> None:
-        opened = path if isinstance(path, RecordingFile) else open_recording(path)
+        hands: tuple[RecordingFile, ...]
+        if isinstance(path, RecordingFile):
+            hands = (path,) if path.hands == 1 else open_hands(path.path)
+        else:
+            hands = open_hands(path)
+        opened = hands[0]
         self.recording: RecordingFile = opened
         reason = obstacle(self.recording)
         if not self.recording.count:
             reason = "it holds no tick"
         if reason:
             raise RecordingError(f"'{opened.path}' cannot be drawn: {reason}")
-        self.parameters: RunParameters = AuditedRun.of(self.recording).parameters
-        self._run = Resimulator(self.recording, self.parameters)
+        self._hands = tuple(AuditedRun.of(each).parameters for each in hands)
+        self.parameters: RunParameters = self._hands[0]
+        others = list(zip(hands[1:], self._hands[1:], strict=True))
+        self._run = Resimulator(self.recording, self.parameters, others=others)
         if on_compiled is not None:
             on_compiled()
         self.model = self._run.model
         _light(self.model)
         self.data = mujoco.MjData(self.model)
-        self._rest = self.recording.blocks()
+        self._rest = _blocks_of(hands)
         self._block = next(self._rest)
         self._at = 0  # index within the block
-        self.row = self.passed = self._block[:1]
-        self._is_held = is_held(self.recording.meta)
+        self.rows = self._block[0]
+        self.row = self.passed = self._block[:1, 0]
+        self._is_held = [is_held(each.meta) for each in hands]
         hand, tool = zip(
-            *(peak_forces(block, self.parameters.axes) for block in self.recording.blocks()),
+            *(
+                peak_forces(block, own.axes)
+                for each, own in zip(hands, self._hands, strict=True)
+                if not own.grip.startswith(JOINT)
+                for block in each.blocks()
+            ),
             strict=True,
         )
         self.hand_reference = max(MIN_REFERENCE, *hand)
@@ -204,10 +219,10 @@ class Stage:
                 self._block, self._at = next(self._rest), 0
             end = min(len(self._block), self._at + tick + 1 - self._run.done)
             recorded = self._block[self._at : end]
-            again = self._run.add(recorded)
-            self._refuse_another_run(recorded, again)
-            passed.append(recorded)
-            self._at, self.row = end, recorded[-1:]
+            again = self._run.add(recorded if len(self._hands) > 1 else recorded[:, 0])
+            self._refuse_another_run(recorded, again.reshape(-1, len(self._hands)))
+            passed.append(recorded[:, 0])
+            self._at, self.rows, self.row = end, recorded[-1], recorded[-1:, 0]
         self.passed = np.concatenate(passed) if passed else self.row
         mujoco.mj_copyData(self.data, self.model, self._run.data)
         # contacts stay as the tick solved them; only the drawn quantities are brought to its end
@@ -218,9 +233,10 @@ class Stage:
         mujoco.mj_tendon(self.model, self.data)
 
     def _refuse_another_run(self, recorded: NDArray[np.void], again: NDArray[np.void]) -> None:
-        off = np.abs(recorded["tool_position"][: len(again)] - again["tool_position"]).max(axis=1)
+        off = np.abs(recorded["tool_position"][: len(again)] - again["tool_position"])
+        off = off.reshape(len(again), -1).max(axis=1)
         if len(again) < len(recorded) or not (off <= PLACE).all():
-            tick = int(recorded["tick"][0]) + int(np.argmax(np.append(~(off <= PLACE), True)))
+            tick = int(recorded["tick"][0, 0]) + int(np.argmax(np.append(~(off <= PLACE), True)))
             raise RecordingError(
                 f"'{self.recording.path}' cannot be drawn: simulated again, the tool is not where "
                 f"the record of tick {tick} says; 'hapticbridge audit' tells more"
@@ -229,7 +245,11 @@ class Stage:
     @property
     def hand_force(self) -> NDArray[np.float64]:
         """Force of the device on the hand at the tick shown."""
-        return np.asarray(force_on_hand(self.row, self.parameters.axes)[0] * self._is_held)
+        return self._force_on(0)
+
+    def _force_on(self, hand: int) -> NDArray[np.float64]:
+        force = force_on_hand(self.rows[hand : hand + 1], self._hands[hand].axes)[0]
+        return np.asarray(force * self._is_held[hand])
 
     def contacts(self) -> NDArray[np.float64]:
         """Returns the contacts of the tick shown that carry a force; see ``contacts_of``."""
@@ -246,9 +266,17 @@ class Stage:
             _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, _CONTACT, between=(place, tip), size=size)
 
     def add_coupling(self, scene: mujoco.MjvScene) -> None:
-        """Draws handle, coupling and the force on the hand into a scene made from ``data``."""
-        row, size = self.row[0], 0.015 * self.model.stat.extent
-        handle, tool, force = row["handle_position"], row["tool_position"], self.hand_force
+        """Draws handle, coupling and the force on each hand into a scene made from ``data``.
+
+        A joint that is held has no handle in the scene.
+        """
+        for hand, own in enumerate(self._hands):
+            if not own.grip.startswith(JOINT):
+                self._add_coupling_of(hand, scene)
+
+    def _add_coupling_of(self, hand: int, scene: mujoco.MjvScene) -> None:
+        row, size = self.rows[hand], 0.015 * self.model.stat.extent
+        handle, tool, force = row["handle_position"], row["tool_position"], self._force_on(hand)
         pull = float(np.linalg.norm(row["wrench_on_tool"][:3]))
         colour = (*force_colour(pull, self.tool_reference), 1.0)
         _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, _GHOST, position=handle, size=size)
@@ -264,6 +292,12 @@ class Stage:
 HEADLIGHT_AMBIENT, HEADLIGHT_DIFFUSE = 0.4, 0.6
 """Light from the camera on a scene without lights, 0 to 1 in each colour. MuJoCo's own, 0.1 and
 0.4, is meant to be added to lights, and leaves such a scene dark."""
+
+
+def _blocks_of(hands: Sequence[RecordingFile]) -> Iterator[NDArray[np.void]]:
+    """Yields the records of all hands in blocks, (n, hands)."""
+    for blocks in zip(*(hand.blocks() for hand in hands), strict=True):
+        yield np.stack(blocks, axis=1)
 
 
 def _light(model: mujoco.MjModel) -> None:
@@ -460,7 +494,7 @@ def _confine(job: dict[str, Any], recording: RecordingFile) -> float:
 
 
 def _draw(job: dict[str, Any]) -> None:
-    recording, on_compiled = open_recording(job["recording"]), None
+    recording, on_compiled = open_recording(job["recording"], 0), None
     if not job["in_process"]:
         seconds = _confine(job, recording)
         _answer(seconds=seconds)
@@ -497,7 +531,7 @@ def _draw(job: dict[str, Any]) -> None:
 def _write_states(out: str, stage: Stage, ticks: list[int], camera: Camera | None) -> None:
     """Writes the states of some ticks, and their pictures, for ``hapticbridge.dataset``."""
     rows, states, pictures = [], [], bytearray()
-    ends, model, ours = [], stage.model, coupling_ids(stage.model)
+    ends, model, ours = [], stage.model, added_actuators(stage.model)
     own = [k for k in range(model.nactuator) if k not in ours]
     for number, tick in enumerate(ticks, start=1):
         stage.show(tick)

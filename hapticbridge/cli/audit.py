@@ -29,7 +29,7 @@ from hapticbridge.film import Shot, still
 from hapticbridge.guard import trip_remedy
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.recording.reader import CUT
+from hapticbridge.recording.reader import CUT, read_hands
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
@@ -202,7 +202,7 @@ class Audit:
             if "trip" in report.events:
                 _print_trip(report)
             return
-        evidence = Evidence.of(read_recording(report.path))
+        evidence = Evidence.of(read_recording(report.path, 0))
         excess = evidence and excess_of(evidence, report, in_process=self.in_process)
         if excess:
             out.print(
@@ -272,13 +272,20 @@ class Audit:
         return found.exit_code
 
     def _draw(self, report: AuditReport) -> None:
-        recording = read_recording(report.path)
+        recording, *others = read_hands(report.path)
         with err.status("drawing …"):
             if self.plot is not None:
-                plot_recording(recording, self.plot)
+                plot_recording(self.plot, recording, *others)
             if self.report is not None:
                 scene = self._scene_picture(recording, report)
-                write_report(recording, report, self.report, scene, in_process=self.in_process)
+                write_report(
+                    recording,
+                    report,
+                    self.report,
+                    scene,
+                    others=others,
+                    in_process=self.in_process,
+                )
         print_written(self.plot, self.report)
 
     def _scene_picture(self, recording: Recording, report: AuditReport) -> bytes | None:

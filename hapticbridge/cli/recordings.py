@@ -49,6 +49,8 @@ class Export:
     not exist for 'lerobot' and 'robomimic', by default the format's name."""
     overwrite: bool = False
     """Replace the file if it exists."""
+    hand: Annotated[str | None, tyro.conf.arg(metavar="GRIP")] = None
+    """Grip of the hand to write, of a run of several; a table has one hand."""
     fps: int | None = None
     """Frames per second of a data set, by default 30."""
     camera: str | None = None
@@ -75,7 +77,14 @@ class Export:
             )
         with err.status(f"exporting {plain(str(self.files[0]))} …"):
             span = self.start, self.end
-            done = export(self.files[0], self.form, self.out, span=span, overwrite=self.overwrite)
+            done = export(
+                self.files[0],
+                self.form,
+                self.out,
+                span=span,
+                overwrite=self.overwrite,
+                hand=self.hand,
+            )
         found = done.recording
         marks = [time_of(event) for event in found.events if event.get("event") == "mark"]
         if self.as_json:
@@ -97,10 +106,10 @@ class Export:
 
     def _write_dataset(self) -> int:
         """Writes a data set; returns the exit code."""
-        if (self.start, self.end) != EVERYTHING or self.overwrite:
+        if (self.start, self.end) != EVERYTHING or self.overwrite or self.hand is not None:
             raise RecordingError(
-                "--from, --to and --overwrite go with tables; a data set has whole recordings, in "
-                "a new folder"
+                "--from, --to, --overwrite and --hand go with tables; a data set has whole "
+                "recordings, in a new folder"
             )
         width, height = self.size or (320, 240)
         shot = Shot(

@@ -126,7 +126,7 @@ class Render:
         if self.at is None and self.output.suffix.lower() == ".png":
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
 
-            shot = replace(shot, at=telling_time(read_recording(self.file)))
+            shot = replace(shot, at=telling_time(read_recording(self.file, 0)))
         with err.status("drawing …"), progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")

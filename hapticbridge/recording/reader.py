@@ -421,6 +421,16 @@ def read_recording(path: str | Path, hand: int | None = None) -> Recording:
     return read_with_attachments(Path(path), hand)[0]
 
 
+def read_hands(path: str | Path) -> tuple[Recording, ...]:
+    """Reads a recording once per hand, as ``read_recording`` does; once for a run of one hand.
+
+    Raises:
+        RecordingError: As for ``read_recording``.
+    """
+    first = read_recording(path, 0)
+    return first, *(read_recording(path, hand) for hand in range(1, first.hands))
+
+
 def open_recording(path: str | Path, hand: int | None = None) -> RecordingFile:
     """Opens a recording; its ticks are loaded only if there are few (``MAX_KEPT``).
 
@@ -442,6 +452,18 @@ def open_recording(path: str | Path, hand: int | None = None) -> RecordingFile:
     kept = _join(runs, facts["record"])[: facts["count"]]
     kept.flags.writeable = False
     return RecordingFile(**facts, kept=kept)
+
+
+def hand_named(path: str | Path, grip: str) -> int:
+    """Returns the number of the hand that holds a grip.
+
+    Raises:
+        RecordingError: As for ``read_recording``, or no hand holds it.
+    """
+    grips = [str(each.meta.get("grip")) for each in open_hands(path)]
+    if grip not in grips:
+        raise RecordingError(f"{path} has no hand at {grip!r:.60}; its hands hold {choices(grips)}")
+    return grips.index(grip)
 
 
 def open_hands(path: str | Path) -> tuple[RecordingFile, ...]:
@@ -540,8 +562,9 @@ def _hands_in(path: Path, meta: Mapping[str, str], hand: int | None, problems: l
     if hand is None and others:
         grips = choices([str(each.get("grip")) for each in (meta, *others)])
         raise RecordingError(
-            f"{path} is a run of {count} hands ({grips}), which 'hapticbridge audit' alone takes "
-            "together; in Python, read_recording(path, hand=0) reads one of them"
+            f"{path} is a run of {count} hands ({grips}), and one is needed here: 'hapticbridge "
+            "export' takes one with --hand, read_recording(path, hand=0) in Python; 'audit', its "
+            "--plot and --report, and 'render' take them together"
         )
     if hand is not None and not 0 <= hand < count:
         raise RecordingError(f"{path} has no hand {hand}; its hands are 0 to {count - 1}")

@@ -28,7 +28,7 @@ from hapticbridge.files import remove_file
 from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
-from hapticbridge.recording.reader import read_with_attachments
+from hapticbridge.recording.reader import read_hands, read_with_attachments
 from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.seal import Signer
@@ -87,30 +87,32 @@ def salvage(path: Path, rows: NDArray[np.void], events: Sequence[Mapping[str, ob
     """Rewrites a cut recording with the records and events that it lacks.
 
     The ring keeps the last seconds of records, read or not, so records that the recorder had taken
-    but not written are still available. ``rows`` and ``events`` are the newest ones, oldest first.
-    The file is replaced on success, otherwise unchanged.
+    but not written are still available. ``rows`` and ``events`` are the newest ones, oldest first;
+    of several hands, the records of each tick in the order of the hands. The file is replaced on
+    success, otherwise unchanged.
 
     Returns:
         The outcome, as a clause.
     """
     beside = path.with_name(path.name + ".salvaged")
     try:
-        recording, attachments = read_with_attachments(path)
-        ticks = recording.ticks
-        last = int(ticks["tick"][-1]) if ticks.size else -1
-        rest = rows[rows["tick"] > last]
-        if rest.size and int(rest["tick"][0]) != last + 1:
+        recording, attachments = read_with_attachments(path, 0)
+        ticks = [hand.ticks for hand in read_hands(path)]
+        last = int(ticks[0]["tick"][-1]) if ticks[0].size else -1
+        whole = rows[rows.size % len(ticks) :].reshape(-1, len(ticks))
+        rest = whole[whole[:, 0]["tick"] > last]
+        if rest.size and int(rest["tick"][0, 0]) != last + 1:
             return "the records after it are lost"
         known = {_key(event) for event in recording.events}
         kept = [*recording.events, *(event for event in events if _key(event) not in known)]
-        ticks = np.concatenate([ticks, rest])
+        ticks = [np.concatenate([own, rest[:, hand]]) for hand, own in enumerate(ticks)]
         rewrite(recording, attachments, beside, ticks, kept)
         beside.replace(path)
     except (RecordingError, OSError, ValueError):
         with contextlib.suppress(OSError):
             beside.unlink(missing_ok=True)
         return "the records after it could not be written"
-    return f"the bridge has repaired it: all {ticks.size} records are there"
+    return f"the bridge has repaired it: all {sum(map(len, ticks))} records are there"
 
 
 def _key(event: Mapping[str, object]) -> tuple[object, ...]:

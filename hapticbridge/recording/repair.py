@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
-from hapticbridge.recording.reader import Recording, read_recording, read_with_attachments
+from hapticbridge.recording.reader import Recording, read_hands, read_with_attachments
 from hapticbridge.recording.writer import RecordingWriter
 
 _BATCH = 4096
@@ -25,14 +25,14 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     describes the repair, and the digest is computed anew.
 
     Returns:
-        The new recording, as read back.
+        The new recording, as read back; of several hands, that of the first.
 
     Raises:
         RecordingError: The recording cannot be read or is not cut, or the output exists or cannot
             be written.
     """
     path, output = Path(path), Path(output)
-    recording, attachments = read_with_attachments(path)
+    recording, attachments = read_with_attachments(path, 0)
     if not recording.is_cut:
         raise RecordingError(f"{path} is not cut, so there is nothing to repair")
     deadlines = recording.ticks["deadline_ns"][-1:].tolist()
@@ -44,20 +44,23 @@ def repair(path: str | Path, output: str | Path) -> Recording:
         "time_ns": max([*deadlines, *map(_time, recording.events)], default=0),
     }
     events = [*recording.events, made]
-    rewrite(recording, attachments, output, recording.ticks, events, exclusive=True)
-    return read_recording(output)
+    ticks = [recording.ticks, *(hand.ticks for hand in read_hands(path)[1:])]
+    rewrite(recording, attachments, output, ticks, events, exclusive=True)
+    return read_hands(output)[0]
 
 
 def rewrite(
     recording: Recording,
     attachments: Sequence[Attachment],
     output: Path,
-    ticks: NDArray[np.void],
+    ticks: Sequence[NDArray[np.void]],
     events: Sequence[Mapping[str, object]],
     *,
     exclusive: bool = False,
 ) -> None:
     """Writes a recording's metadata and attachments again, with these records and events.
+
+    ``ticks`` are the records of each hand, equally many.
 
     Digest, chain and index are computed anew. A signature is not kept, because it is of another
     file.
@@ -78,15 +81,16 @@ def rewrite(
     def write_until(stop: int) -> None:
         nonlocal written
         for start in range(written, stop, _BATCH):
-            writer.write_ticks(ticks[start : min(start + _BATCH, stop)])
+            for hand, own in enumerate(ticks):
+                writer.write_ticks(own[start : min(start + _BATCH, stop)], hand)
         written = max(written, stop)
 
     try:
         for event in events:  # each where it happened, so that a later cut does not lose them all
             time = _time(event)
-            write_until(int(np.searchsorted(ticks["deadline_ns"], time, side="right")))
+            write_until(int(np.searchsorted(ticks[0]["deadline_ns"], time, side="right")))
             writer.write_event(event, time)
-        write_until(ticks.size)
+        write_until(ticks[0].size)
         writer.close()
     except RecordingError:
         output.unlink(missing_ok=True)

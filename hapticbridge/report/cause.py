@@ -463,10 +463,12 @@ class Excess:
 def excess_of(
     evidence: Evidence, report: AuditReport, *, in_process: bool = False
 ) -> Excess | None:
-    """Returns the excess of an active run; None for any other run.
+    """Returns the excess of an active run; None for any other run, and for one of several hands.
 
     ``in_process`` is as for ``likely_cause``.
     """
+    if evidence.recording.hands > 1:
+        return None
     cause = likely_cause(evidence, report, in_process=in_process)
     if cause is None or report.tick is None:
         return None

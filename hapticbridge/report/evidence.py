@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import printable
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.record import due_times, force_on_hand
@@ -107,13 +108,40 @@ def is_motion_prescribed(meta: Mapping[str, str]) -> bool:
         return True
 
 
-def draw_recording(recording: Recording) -> Figure:
-    """Draws force, position and energies over time.
+def draw_recording(*hands: Recording) -> Figure:
+    """Draws force, position and energies over time; of several hands, each in a column.
 
     Raises:
         RecordingError: The recording has no tick, no run parameters, or a number that cannot be
             drawn.
     """
+    figure = new_figure(8 if len(hands) == 1 else 5.5 * len(hands), 8)
+    columns = figure.subplots(3, len(hands), sharex=True, squeeze=False).T
+    for recording, panels in zip(hands, columns, strict=True):
+        _draw_hand(recording, panels, is_alone=len(hands) == 1)
+    meta = hands[0].meta
+    method, period = method_of(meta), parameters_of(meta).period
+    title = printable(f"{meta.get('scene', '')}: method {method.name}, {1 / period:g} Hz")
+    if len(hands) == 1:
+        title += f"\n{_coupling_sentence(hands[0])}"
+    figure.suptitle(title, fontsize="medium", parse_math=False)
+    return figure
+
+
+def _coupling_sentence(recording: Recording) -> str:
+    meta, parameters = recording.meta, parameters_of(recording.meta)
+    coupling = RunCoupling.of(
+        method_of(meta),
+        parameters.timestep,
+        requested_of(meta),
+        law=parameters.coupling,
+        measured=parameters.effective,
+        is_always_implicit=was_always_implicit(recording.ticks),
+    ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
+    return coupling.sentences()[0]
+
+
+def _draw_hand(recording: Recording, panels: NDArray[np.object_], *, is_alone: bool) -> None:
     ticks, meta = recording.ticks, recording.meta
     if not len(ticks):
         raise RecordingError(f"'{recording.path}' has no tick to draw")
@@ -121,19 +149,20 @@ def draw_recording(recording: Recording) -> Figure:
     if not all((np.abs(ticks[name]) < DRAWABLE).all() for name in _DRAWN):
         raise RecordingError(f"'{recording.path}' holds numbers that cannot be drawn")
     time = due_times(ticks, parameters.period)
-    figure = new_figure(8, 8)
-    force_axes, position_axes, energy_axes = figure.subplots(3, 1, sharex=True)
+    force_axes, position_axes, energy_axes = panels
     position_axes.plot([], [], color="grey", **HANDLE, label="handle")
     hand = force_on_hand(ticks, parameters.axes)
     is_held = not is_motion_prescribed(meta)
-    for i, (axis, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
+    is_joint = parameters.grip.startswith(JOINT)
+    unit = 1.0 if is_joint else 1e3
+    for i, (axis, colour) in enumerate(zip(AXES[:1] if is_joint else AXES, COLOURS, strict=False)):
         tool_force = decimated(time, ticks["wrench_on_tool"][:, i])
         if is_held:
             force_axes.plot(*decimated(time, hand[:, i]), color=colour, label=f"hand {axis}")
         force_axes.plot(*tool_force, color=colour, ls=":", lw=1, label=f"tool {axis}")
         start = ticks["tool_position"][0, i]
-        tool = 1e3 * (ticks["tool_position"][:, i] - start)
-        handle = 1e3 * (ticks["handle_position"][:, i] - start)
+        tool = unit * (ticks["tool_position"][:, i] - start)
+        handle = unit * (ticks["handle_position"][:, i] - start)
         position_axes.plot(*decimated(time, tool), color=colour, label=f"tool {axis}")
         position_axes.plot(*decimated(time, handle), color=colour, **HANDLE)
     for name, label, colour, style in _ENERGIES:
@@ -142,23 +171,17 @@ def draw_recording(recording: Recording) -> Figure:
             energy_axes.plot(*decimated(time, 1e3 * joules), color=colour, ls=style, label=label)
     force_axes.set_ylabel("force on hand and tool (N)" if is_held else "force on the tool (N)")
     position_axes.set_ylabel("displacement (mm)")
+    if is_joint:
+        force_axes.set_ylabel("force on the fingers (N), on the joint (N or N m)")
+        position_axes.set_ylabel("displacement of the joint (m or rad)")
     energy_axes.set_ylabel("energy (mJ)")
     energy_axes.set_xlabel("time (s)")
-    method = method_of(meta)
-    coupling = RunCoupling.of(
-        method,
-        parameters.timestep,
-        requested_of(meta),
-        law=parameters.coupling,
-        measured=parameters.effective,
-        is_always_implicit=was_always_implicit(ticks),
-    )
-    title = f"{meta.get('scene', '')}: method {method.name}, {1 / parameters.period:g} Hz"
-    title = f"{printable(title)}\n{coupling.sentences()[0]}"
-    figure.suptitle(title, fontsize="medium", parse_math=False)
-    for axes in (force_axes, position_axes, energy_axes):
+    for axes in panels:
         finish(axes)
-    return figure
+    if not is_alone:
+        head = f"{printable(parameters.grip)}: {_coupling_sentence(recording)}"
+        head = head.partition(" effective")[0]
+        force_axes.set_title(head, fontsize="small", loc="left", pad=46, parse_math=False)
 
 
 def finish(axes: Axes) -> None:
@@ -168,14 +191,14 @@ def finish(axes: Axes) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=4, frameon=False)
 
 
-def plot_recording(recording: Recording, path: Path) -> None:
+def plot_recording(path: Path, *hands: Recording) -> None:
     """Writes ``draw_recording`` to a picture file.
 
     Raises:
         RecordingError: The recording cannot be drawn.
         HapticBridgeError: The file's extension is no picture format, or it cannot be written.
     """
-    write_picture(draw_recording(recording), path)
+    write_picture(draw_recording(*hands), path)
 
 
 Array = NDArray[np.float64]
@@ -253,10 +276,27 @@ class Evidence:
         return self.created, self.allowed if is_slack_used_up else np.zeros_like(self.allowed)
 
     @classmethod
-    def of(cls, recording: Recording) -> Evidence | None:
+    def of_hands(cls, hands: Sequence[Recording]) -> tuple[Evidence, ...]:
+        """Computes the evidence of every hand; empty if one is damaged or has no ticks.
+
+        The slack of the scene is that of all hands together.
+        """
+        found = []
+        for hand in hands:
+            others = [other for other in hands if other is not hand]
+            evidence = cls.of(hand, others)
+            if evidence is None:
+                return ()
+            found.append(evidence)
+        allowed = np.sum([each.allowed for each in found], axis=0)
+        return tuple(replace(each, allowed=allowed) for each in found)
+
+    @classmethod
+    def of(cls, recording: Recording, others: Sequence[Recording] = ()) -> Evidence | None:
         """Computes the evidence of a recording; None if it is damaged or has no ticks.
 
-        The recording need not have passed an audit.
+        The recording need not have passed an audit. ``others`` are those of the other hands, whose
+        work on the scene counts.
         """
         ticks = recording.ticks
         fields = (name for name in ticks.dtype.names or () if ticks.dtype[name].base.kind == "f")
@@ -267,8 +307,13 @@ class Evidence:
             worst = run.worst
             state = AuditState.at_start(recording, run.parameters)
             # by blocks, because the whole run at once would need much more memory
-            blocks = (ticks[begin : begin + BLOCK] for begin in range(0, len(ticks), BLOCK))
-            balances = energy_balances(blocks, state, run.events, run.delay)
+            begins = range(0, len(ticks), BLOCK)
+            blocks = (ticks[begin : begin + BLOCK] for begin in begins)
+            work = None
+            if others:
+                total = np.sum([other.ticks["coupling_work"] for other in others], axis=0)
+                work = (total[begin : begin + BLOCK] for begin in begins)
+            balances = energy_balances(blocks, state, run.events, run.delay, work)
             energies = np.concatenate(
                 [
                     (each.environment_energy, each.slack, each.excess_device_energy)

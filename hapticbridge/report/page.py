@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -158,19 +159,22 @@ def write_report(
     path: Path,
     scene: bytes | None = None,
     *,
+    others: Sequence[Recording] = (),
     in_process: bool = False,
 ) -> None:
     """Writes one self-contained HTML page of less than 1 MB, for any length of run.
 
-    ``scene`` is a PNG picture of the scene at ``telling_time``, or None. An existing file is
-    replaced. ``in_process`` is as for ``audit``.
+    ``scene`` is a PNG picture of the scene at ``telling_time``, or None. ``others`` are the records
+    of the other hands of a run of several. An existing file is replaced. ``in_process`` is as for
+    ``audit``.
 
     Raises:
         RecordingError: The page cannot be written, or not under this name.
     """
-    evidence, meta = Evidence.of(recording), recording.meta
+    hands, meta = Evidence.of_hands((recording, *others)), recording.meta
+    evidence = hands[0] if hands else None
     rows = event_rows(recording.events)
-    run = None if evidence is None else _evidence_parts(evidence, report, in_process)
+    run = _evidence_parts(hands, report, in_process) if hands else None
     moment = None if run is None else run["moment"]
     write_page(
         path,
@@ -191,25 +195,34 @@ def write_report(
         lead=lead_sentence(report, None if moment is None else moment["excess"].worst),
         notes=notes(report),
         is_warned=is_warned(report),
-        curves="" if evidence is not None else _bare_curves(recording),
+        curves="" if evidence is not None else _bare_curves(recording, *others),
     )
 
 
-def _bare_curves(recording: Recording) -> str:
+def _bare_curves(*hands: Recording) -> str:
     """Returns the curves of a run with a damaged data sheet; empty if they cannot be drawn."""
     try:
-        return inline_svg(draw_recording(recording))
+        return inline_svg(draw_recording(*hands))
     except RecordingError:
         return ""
 
 
-def _evidence_parts(evidence: Evidence, report: AuditReport, in_process: bool) -> dict[str, Any]:
+def _evidence_parts(
+    hands: Sequence[Evidence], report: AuditReport, in_process: bool
+) -> dict[str, Any]:
+    evidence = hands[0]
     lateness = evidence.lateness
     is_timed = bool(lateness.any())
     return {
         "head": head_facts(report, evidence),
-        "motion": inline_svg(draw_motion(evidence)),
-        "energies": inline_svg(draw_energies(evidence)),
+        "hands": [
+            {
+                "name": each.parameters.grip if len(hands) > 1 else "",
+                "motion": inline_svg(draw_motion(each)),
+                "energies": inline_svg(draw_energies(each)),
+            }
+            for each in hands
+        ],
         "timing": inline_svg(draw_timing(evidence)),
         "balance": balance_of(report),
         "moment": moment_of(evidence, report, in_process=in_process),

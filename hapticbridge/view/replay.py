@@ -35,6 +35,8 @@ Progress = Callable[[int, int], None]
 class Replay:
     """Every instant of a recorded run, ready to be shown in any order.
 
+    Of several hands, handle and forces are those of the first one.
+
     The run is simulated in a child process with limits (``confinement``), which hands over poses
     and triangles.
 
@@ -63,7 +65,7 @@ class Replay:
     def __init__(
         self, path: str | Path, progress: Progress | None = None, *, in_process: bool = False
     ) -> None:
-        self.recording = recording = open_recording(path)
+        self.recording = recording = open_recording(path, 0)
         self.parameters = parameters_of(recording.meta)
         self.sights: list[Sight] = []
         self.trace = Trace(is_held=is_held(recording.meta))
