@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -301,14 +302,16 @@ class DeviceGroup:
             duration=max(known) if len(known) == len(durations) else None,
         )
         self.external_flags: NDArray[np.int64] = np.zeros(sum(counts), np.int64)
-        self._devices = tuple(devices)
+        self._devices, self._counts = tuple(devices), tuple(counts)
+        self._reads = tuple(checked_read(device) for device in devices)
+        self._writes = tuple(checked_write(device) for device in devices)
         ends = np.cumsum(counts).tolist()
-        parts = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
-        self._counts = tuple(counts)
-        self._reads = tuple(zip(parts, map(checked_read, devices), strict=True))
-        # a device with one hand gets its wrench, (6,)
-        own = [part if count > 1 else part.start for part, count in zip(parts, counts, strict=True)]
-        self._writes = tuple(zip(own, map(checked_write, devices), strict=True))
+        self._parts = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        # taking an array apart costs as much as reading a device, so it is done once per array
+        self._sample: object = None
+        self._wrench: object = None
+        self._reading: list[tuple[int, Any, NDArray[np.int64] | None, Any]] = []
+        self._writing: list[tuple[Any, NDArray[np.float64]]] = []
 
     def start(self, period: float) -> NDArray[np.void]:
         """Starts every device; returns their poses, (n,), ``SAMPLE_DTYPE``.
@@ -325,9 +328,17 @@ class DeviceGroup:
         Raises:
             DeviceLost: One of them is gone, or silent for too long.
         """
-        for part, read in self._reads:
-            self.external_flags[part] = read(sample[part])
-            sample["buttons"][part] = sample["buttons"][part.start]
+        if sample is not self._sample:
+            self._sample = sample
+            self._reading = [
+                (part.start, read, sample["buttons"][part] if count > 1 else None, sample[part])
+                for read, part, count in zip(self._reads, self._parts, self._counts, strict=True)
+            ]
+        flags = self.external_flags
+        for hand, read, buttons, own in self._reading:
+            flags[hand] = read(own)
+            if buttons is not None:  # those of the device are those of its grip axis
+                flags[hand + 1], buttons[1] = flags[hand], buttons[0]
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -338,10 +349,20 @@ class DeviceGroup:
         Raises:
             DeviceLost: One of them is gone.
         """
+        if wrench is not self._wrench:
+            self._wrench = wrench
+            # a device with one hand gets its wrench, (6,)
+            self._writing = [
+                (
+                    write,
+                    wrench if wrench.ndim == 1 else wrench[part if count > 1 else part.start],
+                )
+                for write, part, count in zip(self._writes, self._parts, self._counts, strict=True)
+            ]
         failed: DeviceError | None = None
-        for part, write in self._writes:
+        for write, own in self._writing:
             try:
-                write(wrench if wrench.ndim == 1 else wrench[part])
+                write(own)
             except DeviceError as error:
                 failed = failed or error
         if failed is not None:

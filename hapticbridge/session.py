@@ -205,12 +205,9 @@ class TickKernel:
         """Loads the machine code of several hands, whose ticks have one step and no half."""
         states, own = np.zeros(count, STATE_DTYPE), np.zeros(count, TICK_DTYPE)
         rows, cursors = self.rows, self.cursors
-        before = direct(before_hands, states, self.sample, own, 0.0)
-        answer = direct(answer_hands, states, own)
-        finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0)
-        self.before = lambda state, sample, row, _, elapsed: before(state, sample, row, elapsed)
-        self.answer = lambda state, row, _: answer(state, row)
-        self.finish = lambda *arguments: finish(*arguments[:-1])
+        self.before = direct(before_hands, states, self.sample, own, 0, 0.0)
+        self.answer = direct(answer_hands, states, own, 0)
+        self.finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0, True)
         self._publish = direct(publish_hands, own, rows, cursors, 0, 0, 0, 0, 0)
 
     def bind_hands(self, hands: BoundHands) -> None:

@@ -154,7 +154,7 @@ def one_after_the_other(
 
     The wrench of the first hand is evaluated before the second one repeats the step.
     """
-    if before_hands(states, samples, rows, elapsed) != OK:
+    if before_hands(states, samples, rows, 0, elapsed) != OK:
         return False
     keep_state(states[1])
     advance(states[0:1])

@@ -11,7 +11,9 @@ may hold one body. A hand that reaches its force level changes the step of the o
 wrench is evaluated before the levels of all hands are settled (``force_level.settle_levels``). For
 each device, the other hands are ports of the scene: what they put in may come out here.
 
-Valid for a coupling that MuJoCo solves whole, with one step per tick (``Scheme.IMPLICIT``).
+Valid for a coupling that MuJoCo solves whole, with one step per tick (``Scheme.IMPLICIT``). The
+stages take the arguments of their like in ``kernel.tick``, so that the loop calls either alike; the
+number of the substep is 0, and no positions are computed ahead.
 """
 
 from __future__ import annotations
@@ -57,7 +59,11 @@ from hapticbridge.kernel.timing import note_delay
 
 @compiled
 def before_hands(
-    states: NDArray[np.void], samples: NDArray[np.void], rows: NDArray[np.void], elapsed: float
+    states: NDArray[np.void],
+    samples: NDArray[np.void],
+    rows: NDArray[np.void],
+    _substep: int,
+    elapsed: float,
 ) -> int:
     """Moves every handle by its device's sample, and gives MuJoCo the controls of its next step.
 
@@ -83,7 +89,7 @@ def before_hands(
 
 
 @compiled
-def answer_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
+def answer_hands(states: NDArray[np.void], rows: NDArray[np.void], _substep: int) -> int:
     """Computes the wrenches of the step that just ended, on all tools and devices.
 
     Returns:
@@ -179,6 +185,7 @@ def finish_hands(
     read_ns: int,
     write_ns: int,
     flags: int,
+    _has_positions: bool,
 ) -> int:
     """Runs ``close_hands`` and ``publish_hands`` in one call.
 
@@ -204,10 +211,10 @@ def whole_tick_of_hands(
     Returns:
         False if a sample was refused or a result is not usable.
     """
-    if before_hands(states, samples, rows, elapsed) != OK:
+    if before_hands(states, samples, rows, 0, elapsed) != OK:
         return False
     advance(states[0:1])
-    return answer_hands(states, rows) == OK and close_hands(states, rows) == OK
+    return answer_hands(states, rows, 0) == OK and close_hands(states, rows) == OK
 
 
 @compiled_for_threads
