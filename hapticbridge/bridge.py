@@ -164,8 +164,6 @@ class Bridge:
             raise HapticBridgeError("several hands are named by a Grasp each: Grasp(GRIP, DEVICE)")
         if coupling is not None:
             raise HapticBridgeError("each of several hands has a coupling of its own: Grasp(…)")
-        if self.output.observer is not None:
-            raise HapticBridgeError("the view shows one hand; leave it out with several")
         loaded = scene_of_grasps(scene, grasps)
         with devices_for_run(loaded, grasps, self.clock) as devices:
             self.setup, *others = resolve_hands(

@@ -251,6 +251,18 @@ class Stage:
         force = force_on_hand(self.rows[hand : hand + 1], self._hands[hand].axes)[0]
         return np.asarray(force * self._is_held[hand])
 
+    @property
+    def other_grips(self) -> tuple[str, ...]:
+        """Grips of the further hands; a joint has no place in the scene."""
+        grips = (own.grip for own in self._hands[1:])
+        return tuple(grip for grip in grips if not grip.startswith(JOINT))
+
+    def others(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
+        """Yields the record (1,) of each further hand, and the force on it in N, (3,)."""
+        for hand, own in enumerate(self._hands[1:], 1):
+            if not own.grip.startswith(JOINT):
+                yield self.rows[hand : hand + 1], self._force_on(hand)
+
     def contacts(self) -> NDArray[np.float64]:
         """Returns the contacts of the tick shown that carry a force; see ``contacts_of``."""
         return contacts_of(self.model, self.data, self.parameters)

@@ -455,8 +455,8 @@ def test_one_hand_that_is_named_is_as_today(
         (("--hand", "left"), "--hand is 'left'; it must be GRIP=DEVICE"),
         (("--hand", "a=simulated", "--device", "mouse"), "takes the place of --grip and --device"),
         (
-            ("--hand", "left=simulated", "--hand", "right=simulated", "--view"),
-            "--view, --port and the mouse exclude --hand",
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--port", "0"),
+            "--port without --view has no effect",
         ),
         (("--hand", "a=simulated", "--hand", "b=mouse"), "the device 'mouse' moves in real time"),
         (

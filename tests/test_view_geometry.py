@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -11,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from view_cases import Canvas
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -156,13 +156,6 @@ TOOL = """<mujoco>
     </body>
   </worldbody>
 </mujoco>"""
-
-
-class Canvas:
-    """Takes what is drawn."""
-
-    def __getattr__(self, _: str) -> Any:
-        return lambda name, *_, **__: self.__dict__.setdefault(name, SimpleNamespace())
 
 
 def sight(handle: tuple[float, float, float], force: tuple[float, float, float]) -> Sight:

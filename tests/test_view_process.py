@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, recorded
 from report_runs import LOOSE
-from view_cases import AT_ONCE, FLOOR, pressed
+from two_hands import GRIPS, SCENES, two_handed
+from view_cases import AT_ONCE, FLOOR, Canvas, pressed
 
+import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
@@ -23,8 +26,9 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 
 
 from hapticbridge.view.geometry import Tendons
-from hapticbridge.view.page import Sight
+from hapticbridge.view.page import Ghost, Sight
 from hapticbridge.view.process import LiveRun, run_of
+from hapticbridge.view.replay import Replay
 
 # viser's threads and sockets end with the process
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -114,6 +118,47 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
     assert touched > 5
     assert np.ptp([sight.places[lift, 2] for sight in sights]) > 0.008
     assert audit(path).resimulation == "bit for bit"
+
+
+@pytest.mark.parametrize("scene", ["bar", "tongs"])
+def test_a_live_view_shows_every_hand_that_has_a_handle(tmp_path: Path, scene: str) -> None:
+    watcher, sights, path = Watcher(), list[Sight](), tmp_path / "run.mcap"
+    hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3")]
+    if scene == "tongs":  # a grip axis has no place in the scene
+        hands = [hb.Grasp("left", grip_axis=hb.GripAxis("hinge"))]
+    loaded = two_handed(SCENES[scene], GRIPS.get(scene, ("left", "right")))
+
+    def look(_: int) -> None:
+        assert watcher.live is not None
+        if (sight := watcher.live.look()) is not None:
+            sights.append(sight)
+
+    how: Any = {"clock": hb.SimulatedClock(), "recording": path, "observer": watcher}
+    with hb.Bridge(loaded, hands, **how) as bridge:
+        bridge.run(0.6, look)
+    assert len(sights) > 15
+    first, second = (hb.read_recording(path, hand=each).ticks for each in (0, 1))
+    assert watcher.live is not None
+    has_others = scene == "bar"
+    assert len(watcher.live.scenery.other_tools) == has_others
+    for sight in sights:
+        tick = int(np.searchsorted(first["deadline_ns"], round(1e9 * sight.time)))
+        assert sight.handle.tolist() == first["handle_position"][tick].tolist()
+        assert len(sight.others) == has_others
+        for other in sight.others:
+            assert other.handle.tolist() == second["handle_position"][tick].tolist()
+            assert other.tool_force.tolist() == second["wrench_on_tool"][tick, :3].tolist()
+            assert other.hand_force == pytest.approx(second["wrench_on_device"][tick, :3])
+    time, lines = watcher.live.trace.curves()
+    at = np.searchsorted(first["deadline_ns"], np.round(1e9 * time).astype(np.int64))
+    np.testing.assert_allclose(lines[3], 1e3 * first["device_energy"][at])
+    replay = Replay(path, in_process=True)
+    assert len(replay.sights[-1].others) == has_others
+    for hand, held in enumerate(replay.sights[-1].hands):
+        canvas: Any = Canvas()
+        Ghost(canvas, replay.scenery, hand).show(held, 1.0, 1.0)
+        name = "/handle 2" if hand else "/handle"
+        assert canvas.__dict__[name].position.tolist() == held.handle.tolist()
 
 
 def test_a_picture_that_is_being_written_is_not_shown() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from audit_cases import ScriptedDevice
 from report_runs import LOOSE, made_in
@@ -37,3 +39,10 @@ def pressed_floor(folder: Path) -> Path:
     """Records a ball that is moved aside and pressed onto a floor, and held there."""
     path, device = folder / "floor.mcap", ScriptedDevice(pressed)
     return made_in(path, FLOOR, device, LOOSE, duration=1.5, limits=AT_ONCE)
+
+
+class Canvas:
+    """Takes what is drawn."""
+
+    def __getattr__(self, _: str) -> Any:
+        return lambda name, *_, **__: self.__dict__.setdefault(name, SimpleNamespace())

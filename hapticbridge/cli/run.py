@@ -415,7 +415,7 @@ class Run:
                 source = read_scene(self.scene, **settings_from(self.settings))
             held = self._completed(held, own_grips(source))
             if len(held) > 1:
-                return self._run_hands(source, held, clock, stack, interrupts)
+                return self._run_hands(source, held, clock, stack, window, interrupts)
             if held:
                 return self._alone(*held[0]).execute()
             with err.status("trying the scene …"):
@@ -492,16 +492,14 @@ class Run:
         held: Sequence[tuple[str, str, str]],
         clock: Clock,
         stack: ExitStack,
+        window: Window | None,
         interrupts: Interrupts,
     ) -> int:
         """Runs several hands, each with its grip, grip axis and device; returns the exit code."""
         for _, _, device in held:
             refuse_simulated_time(device, clock)
-        is_mouse = any(device.partition(":")[0] == "mouse" for _, _, device in held)
-        if self.view or self.port is not None or is_mouse:
-            raise HapticBridgeError(
-                "the view shows one hand: --view, --port and the mouse exclude --hand"
-            )
+            if device.partition(":")[0] == "mouse":
+                raise HapticBridgeError("the mouse is for one hand: --device mouse")
         axes = {grip: GripAxis(joint) for grip, joint, _ in held if joint}
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
         with err.status("trying the scene …"), compiling(self.scene):
@@ -512,7 +510,7 @@ class Run:
             opened = device_for(own, name, notify, joint)
             stack.callback(opened.close)
             grasps.append(self._grasp(grip, joint, opened))
-        return self._feel(scene, grasps, clock, stack, None, interrupts)
+        return self._feel(scene, grasps, clock, stack, window, interrupts)
 
     def _gains(self) -> dict[str, float]:
         """Returns the gains of the coupling that the user named."""

@@ -291,6 +291,7 @@ class Scenery:
         tool: Shell around the tool (``shell``).
         is_always_implicit: True if the method falls back in every tick
             (``summary.is_always_implicit``).
+        other_tools: Shells around the tools of further hands.
     """
 
     bodies: int
@@ -301,10 +302,11 @@ class Scenery:
     colours: Array
     tool: trimesh.Trimesh
     is_always_implicit: bool
+    other_tools: tuple[trimesh.Trimesh, ...] = ()
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, grip: str) -> Scenery:
-        """Returns what is drawn of a scene; ``grip`` is the name of a site on the tool."""
+    def of(cls, model: mujoco.MjModel, grip: str, *others: str) -> Scenery:
+        """Returns what is drawn of a scene; grips are names of sites on the tools."""
         tendons = Tendons(model)
         return cls(
             bodies=int(model.nbody),
@@ -315,6 +317,7 @@ class Scenery:
             colours=tendons.colours,
             tool=shell(model, grip),
             is_always_implicit=is_always_implicit(model, grip),
+            other_tools=tuple(shell(model, other) for other in others),
         )
 
     def parts(self) -> dict[str, Any]:
@@ -322,6 +325,7 @@ class Scenery:
         names = ("bodies", "extent", "centre", "widths", "colours", "is_always_implicit")
         return {name: getattr(self, name) for name in names} | {
             "tool": _surface(self.tool),
+            "other_tools": [_surface(each) for each in self.other_tools],
             "props": [
                 [each.body, each.place, each.turn, each.colour, *_surface(each.mesh)]
                 for each in self.props
@@ -356,6 +360,7 @@ class Scenery:
                 colours=checked(parts["colours"], count, 4),
                 tool=_mesh(*parts["tool"]),
                 is_always_implicit=bool(parts["is_always_implicit"]),
+                other_tools=tuple(_mesh(*each) for each in parts["other_tools"]),
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise RecordingError(f"the scene cannot be drawn: {error}") from None

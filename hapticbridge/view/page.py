@@ -69,6 +69,28 @@ _BLUE, _HAND = (26, 95, 180), (230, 97, 0)
 
 
 @dataclass(frozen=True, slots=True)
+class Held:
+    """Handle and forces of a further hand at one instant; attributes as those of ``Sight``."""
+
+    handle: Array
+    handle_turn: Array
+    grip: Array
+    hand_force: Array
+    tool_force: Array
+
+    @classmethod
+    def of(cls, row: NDArray[np.void], hand_force: Array) -> Held:
+        """Returns what a record, one element of ``TICK_DTYPE``, says of a hand."""
+        return cls(
+            handle=row["handle_position"][0].copy(),
+            handle_turn=row["handle_quaternion"][0].copy(),
+            grip=row["tool_position"][0].copy(),
+            hand_force=hand_force.copy(),
+            tool_force=row["wrench_on_tool"][0, :3].copy(),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Sight:
     """One instant of a run in world coordinates, ready to be drawn.
 
@@ -84,6 +106,7 @@ class Sight:
         contact_places: Positions of the contacts with a force, (n, 3) in m.
         contact_forces: Forces of the contacts, (n, 3) in N.
         tendons: Straight pieces of each visible tendon, (m, 2, 3) in m.
+        others: Further hands with a handle in the scene; a grip axis has none.
     """
 
     time: float
@@ -97,6 +120,7 @@ class Sight:
     contact_places: Array
     contact_forces: Array
     tendons: tuple[NDArray[np.float32], ...] = ()
+    others: tuple[Held, ...] = ()
 
     @classmethod
     def of(
@@ -133,19 +157,27 @@ class Sight:
             tendons=tendons.pieces(data),
         )
 
+    @property
+    def hands(self) -> tuple[Sight | Held, ...]:
+        """All hands with a handle in the scene."""
+        return self, *self.others
+
     def parts(self) -> list[Any]:
         """Returns numbers and arrays from which ``from_parts`` makes an equal one."""
-        return [getattr(self, field.name) for field in fields(self)]
+        *own, others = [getattr(self, field.name) for field in fields(self)]
+        return [*own, [[getattr(each, field.name) for field in fields(each)] for each in others]]
 
     @classmethod
-    def from_parts(cls, parts: Any, bodies: int, tendons: int) -> Sight:
+    def from_parts(cls, parts: Any, bodies: int, tendons: int, others: int = 0) -> Sight:
         """Returns an instant from the numbers of a process that may have been taken over.
 
         Raises:
-            RecordingError: They are no instant of a scene of so many bodies and tendons.
+            RecordingError: They are no instant of a scene of so many bodies, tendons and further
+                hands.
         """
         try:
-            time, places, turns, handle, handle_turn, grip, hand, tool, where, forces, lines = parts
+            time, places, turns, handle, handle_turn, grip, hand, tool, where, forces, *rest = parts
+            lines, held = rest
             return cls(
                 float(checked(np.array(time))),
                 checked(places, bodies, 3),
@@ -160,6 +192,10 @@ class Sight:
                 tuple(
                     checked(each, None, 2, 3).astype(np.float32)
                     for each, _ in zip(lines, range(tendons), strict=True)
+                ),
+                tuple(
+                    Held(*(checked(own, n) for own, n in zip(each, (3, 4, 3, 3, 3), strict=True)))
+                    for each, _ in zip(held, range(others), strict=True)
                 ),
             )
         except (TypeError, ValueError) as error:
@@ -247,26 +283,28 @@ class Ghost:
     Args:
         scene: viser's scene.
         scenery: The scene of the run.
+        hand: Number of the hand among those with a handle.
 
     Attributes:
         times: Length of the drawn spring divided by the stretch.
     """
 
-    def __init__(self, scene: viser.SceneApi, scenery: Scenery) -> None:
+    def __init__(self, scene: viser.SceneApi, scenery: Scenery, hand: int = 0) -> None:
         self._extent = extent = scenery.extent
-        self._shell = scenery.tool
+        self._shell = (scenery.tool, *scenery.other_tools)[hand]
+        own = f" {hand + 1}" if hand else ""
         self._longest, self.times = 0.0, 1
-        self._handle = scene.add_frame("/handle", show_axes=False)
+        self._handle = scene.add_frame(f"/handle{own}", show_axes=False)
         faces = np.asarray(self._shell.faces)
         corners = np.asarray(self._shell.vertices)
         self._surfaces = Surfaces(corners[faces])
-        scene.add_mesh_simple("/handle/shell", corners, faces, color=_BLUE, opacity=0.3)
+        scene.add_mesh_simple(f"/handle{own}/shell", corners, faces, color=_BLUE, opacity=0.3)
         nothing = np.zeros((POINTS, 2, 3), dtype=np.float32)
         self._spring = scene.add_line_segments(
-            "/coupling", nothing, (0, 0, 0), thickness=0.012 * extent
+            f"/coupling{own}", nothing, (0, 0, 0), thickness=0.012 * extent
         )
         self._arrow = scene.add_arrows(
-            "/force on the hand",
+            f"/force on the hand{own}",
             nothing[:1],
             linear(_HAND),
             shaft_radius=0.01 * extent,
@@ -279,11 +317,11 @@ class Ghost:
         self._longest = max(self._longest, stretch)
         self.times = enlargement(FARTHEST * self._extent, self._longest)
 
-    def show(self, sight: Sight, hand_reference: float, tool_reference: float) -> None:
+    def show(self, sight: Sight | Held, hand_reference: float, tool_reference: float) -> None:
         """Draws an instant.
 
         Args:
-            sight: The instant.
+            sight: The instant, or that of a further hand.
             hand_reference: The force on the hand in N that is drawn longest, > 0.
             tool_reference: The force on the tool in N at which the spring is reddest, > 0.
         """
@@ -359,7 +397,9 @@ class Page:
         self.hand_reference = self.tool_reference = MIN_REFERENCE
         self._extent, self._strongest = scenery.extent, 0.0
         self._build_scene(scenery)
-        self._ghost = Ghost(server.scene, scenery)
+        self._ghosts = [
+            Ghost(server.scene, scenery, hand) for hand in range(1 + len(scenery.other_tools))
+        ]
         server.gui.set_panel_label(printable(f"hapticbridge: {facts.get('scene', '')}"))
         self.status = server.gui.add_markdown("waiting for the first tick")
         self._caption = _caption(scenery, parameters, facts)
@@ -394,11 +434,12 @@ class Page:
     def allow(self, sights: Sequence[Sight]) -> None:
         """Enlarges the scales for known later values."""
         for sight in sights:
-            self._ghost.allow(float(np.linalg.norm(sight.handle - sight.grip)))
+            for ghost, held in zip(self._ghosts, sight.hands, strict=True):
+                ghost.allow(float(np.linalg.norm(held.handle - held.grip)))
             self._strongest = max(self._strongest, _strongest(sight))
 
     def _explain(self) -> None:
-        times = self._ghost.times
+        times = self._ghosts[0].times
         said = _COLOURS_MEAN.format(
             length=f"{times} times as long as it is" if times > 1 else "as long as it is",
             pull=format_si(self.tool_reference, "N"),
@@ -421,13 +462,17 @@ class Page:
                 line.visible = bool(len(pieces))
                 if line.visible and not np.array_equal(line.points, pieces):
                     line.points = pieces
-            self._ghost.show(sight, self.hand_reference, self.tool_reference)
+            for ghost, held in zip(self._ghosts, sight.hands, strict=True):
+                ghost.show(held, self.hand_reference, self.tool_reference)
             self._show_contacts(sight)
         if self._plots:
             self._explain()
 
     def forces(self, sight: Sight) -> str:
-        """Names the forces of an instant: on the hand, and on the tool where it differs."""
+        """Names the forces of an instant: on the hand, and on the tool where it differs.
+
+        Of several hands, those of the first; the pictures show all.
+        """
         hand = float(np.linalg.norm(sight.hand_force)) if self._is_held else None
         return format_forces(hand, float(np.linalg.norm(sight.tool_force)))
 

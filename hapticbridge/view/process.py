@@ -13,23 +13,28 @@ import queue
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.film_process import MIN_REFERENCE, is_held
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import force_on_hand
 from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import RecordingFile, Ring
+from hapticbridge.recording.format import further_hands
 from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
-from hapticbridge.view.page import Page, Sight, Trace, quoted
+from hapticbridge.view.page import Held, Page, Sight, Trace, quoted
 from hapticbridge.view.server import serve
 from hapticbridge.view.window import Address
 
@@ -69,12 +74,16 @@ class LiveRun:
 
     def __init__(self, ring: Ring, snapshot: str, run: RecordingFile) -> None:
         self.parameters = parameters_of(run.meta)
-        self.model = compile_recorded(run, self.parameters).model
-        self.scenery = Scenery.of(self.model, self.parameters.grip)
+        metas = [run.meta | own for own in further_hands(run.meta)]
+        self._hands = self.parameters, *map(parameters_of, metas)
+        self.model = compile_recorded(run, *self._hands).model
+        grips = [own.grip for own in self._hands if not own.grip.startswith(JOINT)]
+        self.scenery = Scenery.of(self.model, *grips)
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
         self._is_held = is_held(run.meta)
+        self._are_held = [self._is_held, *map(is_held, metas)]
         self.trace = Trace(TRACE, is_held=self._is_held)
         self.hand_reference = self.tool_reference = MIN_REFERENCE
         self.flags = 0
@@ -85,26 +94,36 @@ class LiveRun:
         if picture is None or picture.number == self._shown:
             return None
         number, rows = self._ring.since(picture.number)
-        if number != picture.number or not rows.size:
-            return None  # its record is not written yet
+        if number != picture.number or rows.size < len(self._hands):
+            return None  # its records are not written yet
         self._shown = number
         self._gather(picture.slack)
         self._data.qpos[:] = picture.qpos
         self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
         force = force_on_hand(rows[:1], self.parameters.axes)[0] * self._is_held
         sight = Sight.of(self.model, self._data, rows[:1], self._tendons, picture.contacts, force)
-        self.hand_reference = max(self.hand_reference, float(np.linalg.norm(force)))
-        pull = float(np.linalg.norm(sight.tool_force))
-        self.tool_reference = max(self.tool_reference, pull)
+        sight = replace(sight, others=tuple(self._others(rows)))
+        for held in sight.hands:
+            size, pull = np.linalg.norm(held.hand_force), np.linalg.norm(held.tool_force)
+            self.hand_reference = max(self.hand_reference, float(size))
+            self.tool_reference = max(self.tool_reference, float(pull))
         return sight
 
+    def _others(self, rows: NDArray[np.void]) -> Iterator[Held]:
+        """Yields the further hands of a tick; a joint has no handle in the scene."""
+        for hand, own in enumerate(self._hands[1:], 1):
+            if not own.grip.startswith(JOINT):
+                row = rows[hand : hand + 1]
+                yield Held.of(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])
+
     def _gather(self, slack: float) -> None:
-        """Adds the records since the last call to the curves."""
+        """Adds the records since the last call to the curves, which are those of the first hand."""
         number, rows = self._ring.since(self._gathered)
         self._gathered = number + len(rows)
-        if rows.size:
+        own = rows[-number % len(self._hands) :: len(self._hands)]
+        if own.size:
             self.flags |= int(np.bitwise_or.reduce(rows["flags"]))
-            self.trace.add(rows, slack)
+            self.trace.add(own, slack)
 
 
 def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
@@ -194,7 +213,8 @@ def run() -> None:
         server = serve(address)
         outlet = Outlet(answers.fileno())
         page = Page(server, live.scenery, live.parameters, dict(run.meta))
-        controls = Controls(server, allowance_of(run.meta), outlet.ask)
+        is_alone = not further_hands(run.meta)
+        controls = Controls(server, allowance_of(run.meta), outlet.ask, is_alone=is_alone)
         if job["has_hand"]:
             add_hand(server, live.parameters, live.scenery.extent, outlet.drag)
         page.add_curves()

@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.run_description import parameters_of
 from hapticbridge.view.geometry import Scenery, Tendons, checked
-from hapticbridge.view.page import Page, Sight, Trace
+from hapticbridge.view.page import Held, Page, Sight, Trace
 from hapticbridge.view.server import serve, stop
 from hapticbridge.view.window import Address
 
@@ -35,7 +36,7 @@ Progress = Callable[[int, int], None]
 class Replay:
     """Every instant of a recorded run, ready to be shown in any order.
 
-    Of several hands, handle and forces are those of the first one.
+    Of several hands, the curves are those of the first one.
 
     The run is simulated in a child process with limits (``confinement``), which hands over poses
     and triangles.
@@ -90,7 +91,8 @@ class Replay:
             return
         instant, point = told
         scenery = self.scenery
-        sight = Sight.from_parts(instant, scenery.bodies, len(scenery.widths))
+        counts = scenery.bodies, len(scenery.widths), len(scenery.other_tools)
+        sight = Sight.from_parts(instant, *counts)
         self.sights.append(sight)
         self.trace.add_point(point)
         if self._progress is not None:
@@ -108,7 +110,7 @@ def _played(recording: RecordingFile, worker: Worker) -> None:
     stage = Stage(recording, worker.allow_run)
     step = max(FRAME, stage.duration / MOST)
     count = max(1, int(stage.duration / step) + 1)
-    scenery = Scenery.of(stage.model, stage.parameters.grip).parts()
+    scenery = Scenery.of(stage.model, stage.parameters.grip, *stage.other_grips).parts()
     references = {"on_hand": stage.hand_reference, "on_tool": stage.tool_reference}
     worker.tell(scenery | references | {"step": step, "count": count})
     tendons, trace = Tendons(stage.model), Trace(is_held=is_held(stage.recording.meta))
@@ -118,6 +120,7 @@ def _played(recording: RecordingFile, worker: Worker) -> None:
         sight = Sight.of(
             stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
         )
+        sight = replace(sight, others=tuple(Held.of(*each) for each in stage.others()))
         worker.tell([sight.parts(), trace.newest])
 
 
