@@ -66,6 +66,14 @@ class SafetyTrip(HapticBridgeError):  # noqa: N818 - the field's word for it
         self.records = records
 
 
+def nearest(name: str, names: Iterable[str]) -> str:
+    """Asks for the valid name most like a mistyped one: ``did you mean 'a'? ``; else empty."""
+    import difflib  # noqa: PLC0415 - for a wrong name alone
+
+    near = difflib.get_close_matches(name, list(names), n=1, cutoff=0.65)
+    return f"did you mean '{near[0]}'? " if near else ""
+
+
 def choices(names: Iterable[str]) -> str:
     """Lists valid names for an error message: ``'a', 'b'``, or ``none exist``."""
     listed = ", ".join(f"'{name}'" for name in sorted(names))

@@ -271,7 +271,6 @@ def _refuse_unsuited(options: BridgeOptions) -> None:
             options.clutch is not None or options.dead_man is not None,
             "each of several hands has buttons of its own: name clutch and dead_man in its Grasp",
         ),
-        (options.live, "the live line shows one hand; leave live out with several"),
     ):
         if is_chosen:
             raise HapticBridgeError(sentence)

@@ -266,15 +266,15 @@ class Timekeeping:
     def _not_kept(self) -> str:
         if self.is_kept is not False:
             return ""
-        at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it needs"
+        at_times = f"at {self.rate:.4g} Hz{f' ({self._late})' if self._late else ''} it would need"
         pairs = zip(self.conditions, self.in_time, strict=True)
         failed = [(late, usual) for late, usual in pairs if late.holds is False]
         if failed:
             late_one, usual = failed[0]
             unit = "N s/m" if usual.axis == "translation" else "N m s/rad"
             found = (
-                f"{at_times} {late_one.needed:.3g} {unit} of damping in {usual.axis}, not "
-                f"{usual.needed:.3g} as in time, and has {usual.available:.3g}"
+                f"{at_times} {late_one.needed:.3g} {unit} of damping in {usual.axis} "
+                f"({usual.needed:.3g} with every tick in time), and has {usual.available:.3g}"
             )
         else:
             found = (

@@ -41,7 +41,10 @@ def format_wrenches(
 ) -> str:
     """Names whose the force and the torque are; as ``format_forces`` for both at once."""
     texts = [
-        ", ".join(format_si(value, unit) for value, unit in zip(values, units, strict=True))
+        ", ".join(
+            format_si(value if abs(value) >= ROUNDING else 0.0, unit)
+            for value, unit in zip(values, units, strict=True)
+        )
         for values in (hand, tool)
         if values is not None
     ]
@@ -54,4 +57,8 @@ def format_wrenches(
 
 def format_energy(joules: float) -> str:
     """Formats an energy; below 1 pJ is the rounding of the sums, which counts as 0."""
-    return format_si(joules if abs(joules) >= 1e-12 else 0.0, "J")
+    return format_si(joules if abs(joules) >= ROUNDING else 0.0, "J")
+
+
+ROUNDING = 1e-12
+"""Energy in J, force in N and torque in N m below which a number is rounding and shown as 0."""

@@ -214,7 +214,6 @@ TWO = (hb.Grasp("left"), hb.Grasp("right"))
         (lambda: bridge_of(TWO, scene_rate=100.0), "the scene steps in every tick for several"),
         (lambda: bridge_of(TWO, pipelined=True), "several hands have no pipelined tick"),
         (lambda: bridge_of(TWO, clutch=0), "name clutch and dead_man in its Grasp"),
-        (lambda: bridge_of(TWO, live=True), "the live line shows one hand"),
         (lambda: bridge_of(TWO, mark=1, recording="x"), "several hands have no mark button"),
         (lambda: bridge_of(TWO[:1]), "there must be 2 to 8 different grips"),
         (lambda: bridge_of((TWO[0], TWO[0])), "there must be 2 to 8 different grips"),

@@ -198,6 +198,21 @@ def test_run_state_counts_the_records_that_were_dropped() -> None:
     assert str(state).endswith("  0 overruns  6 records dropped")
 
 
+def test_run_state_names_the_forces_of_every_hand_and_counts_a_tick_once() -> None:
+    state = RunState((True, False))
+    rows = np.repeat(numbered(0, 4), 2)  # a record per hand and tick
+    rows["wrench_on_device"][:, :3], rows["wrench_on_tool"][:, :3] = 0.0, 0.0
+    rows["wrench_on_device"][0::2, 0] = rows["wrench_on_tool"][0::2, 0] = 1.5
+    rows["wrench_on_tool"][1::2, 1] = 2.5
+    rows["device_energy"][0::2], rows["device_energy"][1::2] = 1e-3, -2e-3
+    rows["flags"][:2] = TickFlag.OVERRUN
+    state.add(rows)
+    words = str(state)
+    assert "1.5 N on the hand | 2.5 N on the tool" in words
+    assert "device 1 mJ | -2 mJ" in words
+    assert words.endswith("1 overruns")
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True

@@ -37,6 +37,7 @@ from hapticbridge.sweep.results import Interrupted, Table
 from hapticbridge.units import format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
+from hapticbridge.whatif.what_if import RUN_WORDS
 
 _VERDICT_COLOURS = {
     "passive": "green",
@@ -92,10 +93,9 @@ def print_what_if(found: WhatIf) -> None:
         table.add_row(name, *map(plain, texts))
     out.print(table)
     for run in found.runs[1:]:
-        for text in sentences(run):
-            out.print(f"{run.name}: {plain(text)}")
-    for condition in found.runs[-1].report.conditions:
-        out.print(plain(condition))
+        out.print(f"{run.name}: {RUN_WORDS[run.name]}")
+        for text in (*sentences(run), *run.report.conditions):
+            out.print(f"  {plain(text)}")
     for note in found.notes:
         err.print(f"note: {plain(note)}")
 
@@ -309,14 +309,17 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
-    for sentence in (*report.coupling_sentences[:1], *report.conditions):
+    kept = report.timekeeping
+    for sentence in report.coupling_sentences[:1]:
         out.print(f"  {plain(sentence)}")
+    in_time = ", with every tick in time" if kept is not None and kept.fault else ""
+    for sentence in report.conditions:
+        out.print(f"  {plain(sentence)}{in_time}")
     if not report.conditions:
         out.print(
             "  device condition b >= KT/2 + B_law: not applicable, the motion is prescribed or the "
             "damping unknown"
         )
-    kept = report.timekeeping
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified)}")
     if report.is_cut:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import tyro
 from rich.markdown import Markdown
 
 from hapticbridge.cli.terminal import out
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, nearest
 
 FOLDER = Path(__file__).parent.parent / "guide"
 """Folder of the pages, one Markdown file each, named after its topic."""
@@ -51,8 +50,7 @@ def page(topic: str) -> str:
     """
     topics = [name for names in TOPICS.values() for name in names]
     if topic not in topics:
-        near = difflib.get_close_matches(topic, topics, n=1)
-        advice = f"did you mean '{near[0]}'?" if near else "'hapticbridge guide' lists the topics"
+        advice = nearest(topic, topics).rstrip() or "'hapticbridge guide' lists the topics"
         raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
     return (FOLDER / f"{topic.replace('-', '_')}.md").read_text(encoding="utf-8")
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from hapticbridge.errors import HapticBridgeError, SafetyTrip
+from hapticbridge.errors import HapticBridgeError, SafetyTrip, nearest
 from hapticbridge.signals import (
     ENDING_SIGNALS,
     interrupting_on_signals,
@@ -276,11 +276,8 @@ def _top_level_help() -> str:
 
 
 def _refuse(word: str) -> int:
-    import difflib  # noqa: PLC0415 - for a wrong command alone
-
-    near = difflib.get_close_matches(word, COMMANDS, n=1)
     kind = "option" if word.startswith("-") else "command"
-    advice = f"did you mean '{near[0]}'?" if near else "'hapticbridge --help' lists the commands"
+    advice = nearest(word, COMMANDS).rstrip() or "'hapticbridge --help' lists the commands"
     return _say("error", f"there is no {kind} '{word}'; {advice}")
 
 

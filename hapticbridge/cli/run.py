@@ -292,9 +292,9 @@ class Run:
     device's grip axis moves. Scale, axes, limits and gains apply to every hand. The method is
     'implicit' or 'compensated'."""
     duration: float | None = None
-    """Duration in s. Each missed deadline uses up one period, so the run has one tick fewer. By
-    default the run ends with the device's motion; without an end of it with Ctrl-C, or after 5 s of
-    --fast."""
+    """Duration in s; each missed deadline uses up one period of it. By default the run ends with
+    the device's motion, which a missed deadline delays; without an end of it with Ctrl-C, or after
+    5 s of --fast."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
@@ -372,7 +372,8 @@ class Run:
     dead_man: int | None = None
     """Button of the device, from 0, that must be held for any force."""
     tool_weight: bool = True
-    """Feel the tool's weight, unless the device cannot hold it. --no-tool-weight carries it."""
+    """By default the hand feels the tool's weight, unless the device cannot hold it. With
+    --no-tool-weight the bridge carries it."""
     mark: int | None = None
     """Button of the device, from 0: each press writes an event 'mark' into the recording.
     'hapticbridge export --from S --to S' cuts a recording."""
@@ -556,7 +557,7 @@ class Run:
         """Runs the bridge on a device that is open, or one per hand; returns the exit code."""
         coupling: dict[str, float] | None = None
         if isinstance(device, Sequence):
-            options = replace(self._options(None), live=False)
+            options = self._options(None)
         else:
             options, coupling = self._options(device.info), self._gains()
         bridge = Bridge(
@@ -583,8 +584,9 @@ class Run:
         if self.as_json:
             print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
         else:
-            for line in str(summary).splitlines():
-                out.print(plain(line))
+            out.print(plain(str(summary)))
+            if window is not None and self.record is not None:
+                notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 

@@ -29,7 +29,8 @@ class Stability:
     """
 
     name: tyro.conf.Positional[str]
-    """A map's name, or 'all'; an unknown one lists them."""
+    """A map's name, or 'all': coupling, rate, device, tool_mass, contact, geometry, rotation,
+    restitution."""
     out: Path = Path("stability")
     """Folder to write to."""
     points: int | None = None

@@ -239,6 +239,8 @@ class CouplingLimits:
         is_known = self.info.damping and (self.info.rotational_damping or not self.info.turns)
         known = "" if is_known else " (assumed; it is unknown)"
         dampings = " and ".join(f"{span.damping:.3g} {UNITS[span.axis][1]}" for span in self.spans)
+        if self.info.is_prescribed:
+            return f"They end where a device with a damping of {dampings} would just suffice."
         return (
             f"They end where the device's damping of {dampings}{known} just suffices. Beyond, the "
             "coupling could push the hand by itself."

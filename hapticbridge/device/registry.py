@@ -17,7 +17,7 @@ from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
-from hapticbridge.errors import DeviceError, choices
+from hapticbridge.errors import DeviceError, choices, nearest
 from hapticbridge.kernel.codes import JOINT
 from hapticbridge.scene import Scene
 
@@ -226,8 +226,10 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
                 device.info = profile.fill(device.info)
         return device
     if name not in _OPENERS:
-        names = choices([*_OPENERS, *DRIVERS, *installed_drivers()])
-        raise DeviceError(f"unknown device '{name}'; choose one of {names}")
+        names = [*_OPENERS, *DRIVERS, *installed_drivers()]
+        raise DeviceError(
+            f"unknown device '{name}'; {nearest(name, names)}choose one of {choices(names)}"
+        )
     return _OPENERS[name](rest, options)
 
 

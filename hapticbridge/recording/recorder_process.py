@@ -48,36 +48,44 @@ REPRINT = 2.0
 class RunState:
     """State of a run for the status line, collected from records.
 
-    ``is_held`` is True if a hand feels the force of the device.
+    ``are_held`` has an entry per hand of the run: True if a hand feels the force of its device.
     """
 
-    def __init__(self, *, is_held: bool = True) -> None:
-        self._is_held = is_held
+    def __init__(self, are_held: tuple[bool, ...] = (True,)) -> None:
+        self._are_held = are_held
         self._last: NDArray[np.void] | None = None
+        self._last_tick = -1
         self._overruns = 0
         self._dropped = 0
 
     def add(self, rows: NDArray[np.void]) -> None:
-        """Adds new records, shape (n,), n >= 1, ``TICK_DTYPE``."""
+        """Adds new records, ``TICK_DTYPE``: of n >= 1 ticks, in each tick one per hand."""
+        count = len(self._are_held)
+        self._last = rows[-count:].copy()
+        rows = rows[::count]  # counted by the first hand
         self._overruns += int(np.count_nonzero(rows["flags"] & TickFlag.OVERRUN))
-        before = -1 if self._last is None else int(self._last["tick"])
-        missing = np.diff(rows["tick"], prepend=before) - 1
+        missing = np.diff(rows["tick"], prepend=self._last_tick) - 1
         is_gap = (rows["flags"] & TickFlag.DROPPED_BEFORE) != 0
         self._dropped += int(missing[is_gap].clip(min=0).sum())
-        self._last = rows[-1].copy()
+        self._last_tick = int(rows["tick"][-1])
 
     def __str__(self) -> str:
         if self._last is None:
             return "waiting for the first tick"
-        row = self._last
-        hand, tool = (
-            float(np.linalg.norm(row[name][:3])) for name in ("wrench_on_device", "wrench_on_tool")
-        )
+        forces, joules = [], []
+        for row, is_held in zip(self._last, self._are_held, strict=True):
+            hand, tool = (
+                float(np.linalg.norm(row[name][:3]))
+                for name in ("wrench_on_device", "wrench_on_tool")
+            )
+            forces.append(format_forces(hand if is_held else None, tool))
+            joules.append(format_energy(float(row["device_energy"])))
+        first = self._last[0]
         parts = [
-            f"{row['deadline_ns'] * 1e-9:.1f} s",
-            format_forces(hand if self._is_held else None, tool),
-            f"environment {format_energy(float(row['environment_energy']))}",
-            f"device {format_energy(float(row['device_energy']))}",
+            f"{first['deadline_ns'] * 1e-9:.1f} s",
+            " | ".join(forces),
+            f"environment {format_energy(float(first['environment_energy']))}",
+            f"device {' | '.join(joules)}",
             f"{self._overruns} overruns",
         ]
         if self._dropped:
@@ -85,8 +93,11 @@ class RunState:
         return "  ".join(parts)
 
 
-def _is_held(metadata: dict[str, str]) -> bool:
-    return not json.loads(metadata.get("device", "{}")).get("is_prescribed", False)
+def _are_held(metadata: dict[str, str]) -> tuple[bool, ...]:
+    return tuple(
+        not json.loads(each.get("device", "{}")).get("is_prescribed", False)
+        for each in (metadata, *(metadata | own for own in further_hands(metadata)))
+    )
 
 
 class _Console(Console):
@@ -102,8 +113,8 @@ class LiveLine:
     After an error the stream is no longer used, and the recording continues.
     """
 
-    def __init__(self, stream: TextIO, *, is_held: bool = True) -> None:
-        self._state = RunState(is_held=is_held)
+    def __init__(self, stream: TextIO, are_held: tuple[bool, ...] = (True,)) -> None:
+        self._state = RunState(are_held)
         self._stream: TextIO | None = stream
         self._drawn = time.monotonic()
         self._is_fresh = False
@@ -181,7 +192,7 @@ class _Session:
         if configuration["live"]:
             # imported here, so that a run without a live line starts without it
 
-            self._live = LiveLine(sys.stderr, is_held=_is_held(configuration["metadata"]))
+            self._live = LiveLine(sys.stderr, _are_held(configuration["metadata"]))
         self._hands = 1 + len(further_hands(configuration["metadata"]))
         self._batch = BATCH // self._hands * self._hands
         self._last_time = 0

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import mujoco
 
 from hapticbridge.arguments import shown
-from hapticbridge.errors import SceneError, choices
+from hapticbridge.errors import SceneError, choices, nearest
 from hapticbridge.scene.checks import (
     check_model,
     check_numbers,
@@ -95,7 +95,8 @@ def scene_path(path_or_name: str | Path) -> Path:
             f"{choices(scene_names())}"
         )
     raise SceneError(
-        f"no scene is called '{name}' and no such file exists; scenes: {choices(scene_names())}"
+        f"no scene is called '{name}' and no such file exists; {nearest(name, scene_names())}"
+        f"scenes: {choices(scene_names())}"
     )
 
 

@@ -47,14 +47,18 @@ LINES = sum(len(names) for _, names in PLOTS)
 
 COLOURS = ("#1a5fb4", "#b3261e", "#2e7d32", "#e66100")
 
+_ROUNDING = 1e-9
+"""Number in the unit of its plot below which it is rounding and drawn as 0."""
+
 _SMALL = {"font": "11px sans-serif", "ticks": {"size": 4}, "gap": 2}
-_AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, **_SMALL})
+_AXES: tuple[dict[str, Any], ...] = ({"size": 22, **_SMALL}, {"size": 52, "space": 18, **_SMALL})
 
 _COLOURS_MEAN = (
     "Blue ghost: the handle. Spring: the coupling, {length}, pale at rest, red at {pull} on the "
-    "tool. Orange arrow: the force on the hand, the longest is {longest}. Turquoise: contacts "
-    "and their forces, the longest is {strongest}."
+    "tool.{hand} Turquoise: contacts and their forces, the longest is {strongest}."
 )
+
+_HAND_MEANS = " Orange arrow: the force on the hand, the longest is {longest}."
 
 _CONTACT = (77, 208, 225)
 """Colour of contacts, red, green and blue of 255."""
@@ -443,7 +447,9 @@ class Page:
         said = _COLOURS_MEAN.format(
             length=f"{times} times as long as it is" if times > 1 else "as long as it is",
             pull=format_si(self.tool_reference, "N"),
-            longest=format_si(self.hand_reference, "N"),
+            hand=_HAND_MEANS.format(longest=format_si(self.hand_reference, "N"))
+            if self._is_held
+            else "",
             strongest=format_si(max(self._strongest, self.tool_reference), "N"),
         )
         if self._words.content != said:
@@ -483,7 +489,8 @@ class Page:
             time: Times in s, (n,), n >= 2.
             lines: One per line of ``PLOTS``, (n,) each, in its unit.
         """
-        rest = iter(lines)
+        # a run at rest is not drawn as noise over the full height
+        rest = (np.where(np.abs(line) < _ROUNDING, 0.0, line) for line in lines)
         for handle, (_, names) in zip(self._plots, PLOTS, strict=True):
             handle.data = (time, *(next(rest) for _ in names))
 

@@ -214,9 +214,9 @@ def run() -> None:
         outlet = Outlet(answers.fileno())
         page = Page(server, live.scenery, live.parameters, dict(run.meta))
         is_alone = not further_hands(run.meta)
-        controls = Controls(server, allowance_of(run.meta), outlet.ask, is_alone=is_alone)
         if job["has_hand"]:
             add_hand(server, live.parameters, live.scenery.extent, outlet.drag)
+        controls = Controls(server, allowance_of(run.meta), outlet.ask, is_alone=is_alone)
         page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)

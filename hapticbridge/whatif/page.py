@@ -73,6 +73,9 @@ def sentences(run: WhatIfRun) -> Iterator[str]:
         yield run.report.reason
     if run.trip:
         yield f"tripped: {run.trip}"
+    kept = run.report.timekeeping
+    if run.report.certified is False and kept is not None:
+        yield kept.device_words(False)
 
 
 def _certified(run: WhatIfRun) -> str:

@@ -42,8 +42,14 @@ from hapticbridge.whatif.settings import UNITS, Settings, Value
 # Result of a what-if
 
 RECORDED, PRESCRIBED, CLOSED = "recorded", "prescribed", "closed loop"
-"""Names of the runs: the recorded one; the recorded motion, and a model hand, through the changed
-bridge."""
+"""Names of the runs."""
+
+RUN_WORDS = {
+    RECORDED: "the run as it was",
+    PRESCRIBED: "the changed run, with the recorded motion whatever the force",
+    CLOSED: "the changed run, with a model of the hand that gives way to the force",
+}
+"""Description of each run."""
 
 
 @dataclass(frozen=True, slots=True)
