@@ -418,7 +418,8 @@ class Session:
         for hand, (each, own) in enumerate(zip(self._setups, self._samples(), strict=True)):
             if each.workspace.absolute:
                 state = self.kernel.state[hand : hand + 1]
-                refuse_stretched_start(state, own, each.limits)
+                grip = each.scene.grip if len(self._setups) > 1 else ""
+                refuse_stretched_start(state, own, each.limits, grip)
 
     def _description(self) -> dict[str, str]:
         found: list[dict[str, str]] = []
