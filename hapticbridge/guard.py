@@ -273,7 +273,8 @@ def refuse_stretched_start(
     force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
         raise DeviceError(
-            f"{_hand_at(grip)}the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
+            f"{_hand_at(grip)}the device's absolute pose puts the handle "
+            f"{1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
             f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
         )
