@@ -147,6 +147,18 @@ def test_a_device_without_news_is_flagged_alone(tmp_path: Path) -> None:
     assert hb.audit(path, in_process=True).resimulation == "bit for bit"
 
 
+def test_a_simulated_hand_waits_until_a_real_device_is_still(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    hands = [
+        hb.Grasp("left", Scripted("real", 0.0, is_real=True)),
+        hb.Grasp("right", Scripted("not real", 0.05)),
+    ]
+    with hb.Bridge(two_handed(BAR), hands, recording=path) as bridge:
+        bridge.run(0.05)
+    moved = hb.read_recording(path, hand=1).ticks["device_position"][:, 0]
+    assert moved[:3] == pytest.approx([0.0, 5e-5, 1e-4])
+
+
 def test_either_device_stops_the_run_and_both_get_zero_force() -> None:
     left, right = Scripted("left one", 0.0), Scripted("right one", 1e-2)
     right.last_tick = 200
