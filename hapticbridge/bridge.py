@@ -285,11 +285,8 @@ class Bridge:
     def _trip_reason(self, code: int, tick: int) -> str:
         """Describes why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
-        reason = trip_reason(code, tick)
-        if not self._others:
-            return reason
-        head, _, text = reason.partition(": ")
-        return f"{head}: hand at '{self.setups[hand].scene.grip}': {text}"
+        grip = self.setups[hand].scene.grip if self._others else ""
+        return trip_reason(code, tick, grip)
 
     def stop(self, by: str = "caller") -> None:
         """Ends the run after the present tick; callable from ``on_tick`` and from any thread.

@@ -15,7 +15,8 @@ from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, Column, TickFlag, columns_of
-from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording import RecordingFile
+from hapticbridge.recording.reader import open_hands
 from hapticbridge.run_description import meta_float
 
 # Result of a comparison
@@ -146,15 +147,29 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
     Ticks are matched by their due time, number times period. Runs at different rates are compared
     at coinciding ticks (1 kHz and 500 Hz: every second tick of the first), and gaps shift nothing.
     Clock times and the flags ``OVERRUN`` and ``DROPPED_BEFORE`` are ignored, because they differ
-    between any two real runs.
+    between any two real runs. Several hands are compared in their order, and a difference names
+    the hand.
 
     Raises:
         RecordingError: One of them cannot be read, has no period, or has ticks out of order.
     """
-    files = open_recording(first), open_recording(second)
+    hands = open_hands(first), open_hands(second)
+    files = hands[0][0], hands[1][0]
     periods = _period(files[0]), _period(files[1])
     found = _Found(periods)
     found.add_all(files)
+    decisive = _meta_differences(files, DECISIVE)
+    of_scene = dict(decisive)
+    if len(hands[0]) != len(hands[1]):
+        decisive["hands"] = str(len(hands[0])), str(len(hands[1]))
+    for pair in zip(hands[0][1:], hands[1][1:], strict=False):
+        name = f" of '{pair[0].meta.get('grip', '')}'"
+        own = _Found(periods, name)
+        own.add_all(pair)
+        found.take(own)
+        for key, values in _meta_differences(pair, DECISIVE).items():
+            if values != of_scene.get(key):
+                decisive[key + name] = values
     return Comparison(
         paths=(files[0].path, files[1].path),
         ticks=(files[0].count, files[1].count),
@@ -163,23 +178,29 @@ def compare(first: str | Path, second: str | Path) -> Comparison:
         alone=(found.shared[0] - found.compared, found.shared[1] - found.compared),
         first=found.first,
         largest=tuple(found.largest.values()),
-        decisive=_meta_differences(files, DECISIVE),
+        decisive=decisive,
         beside=_meta_differences(files, _EXPLANATORY),
         events=_event_differences(files),
-        notes=tuple(note for file in files for note in _notes(file)),
+        notes=tuple(dict.fromkeys(n for each in hands for file in each for n in _notes(file))),
     )
 
 
 class _Found:
-    """Differences collected over matching ticks."""
+    """Differences collected over matching ticks; ``of_hand`` ends the name of each column."""
 
-    def __init__(self, periods: tuple[float, float]) -> None:
-        self._periods = periods
+    def __init__(self, periods: tuple[float, float], of_hand: str = "") -> None:
+        self._periods, self._of_hand = periods, of_hand
         self._steps = round(periods[0] * 1e9), round(periods[1] * 1e9)
         self.compared = 0
         self.shared = [0, 0]
         self.first: Difference | None = None
         self.largest: dict[str, Difference] = {}
+
+    def take(self, other: _Found) -> None:
+        """Takes the differences of a further hand."""
+        if other.first and (self.first is None or other.first.time < self.first.time):
+            self.first = other.first
+        self.largest |= other.largest
 
     def add_all(self, files: tuple[RecordingFile, RecordingFile]) -> None:
         """Compares all records with equal due times, block by block."""
@@ -239,9 +260,9 @@ class _Found:
             if earliest is None or at < earliest[0]:
                 earliest = at, self._difference(column, a, b, at)
             worst = self._difference(column, a, b, int(np.argmax(size)))
-            known = self.largest.get(column.name)
+            known = self.largest.get(worst.column)
             if known is None or worst.size > known.size:
-                self.largest[column.name] = worst
+                self.largest[worst.column] = worst
         if self.first is None and earliest is not None:
             self.first = earliest[1]
 
@@ -251,7 +272,7 @@ class _Found:
         ticks = int(a["tick"][at]), int(b["tick"][at])
         values = _numbers(a, column)[at].item(), _numbers(b, column)[at].item()
         time = ticks[0] * self._periods[0]
-        return Difference(time, ticks, column.name, column.unit, values)
+        return Difference(time, ticks, column.name + self._of_hand, column.unit, values)
 
 
 def _numbers(ticks: NDArray[np.void], column: Column) -> NDArray[np.int64 | np.float64]:

@@ -259,9 +259,11 @@ def refuse_simulated_time(device: DeviceInfo | str, clock: Clock) -> None:
 
 
 def refuse_stretched_start(
-    state: NDArray[np.void], sample: NDArray[np.void], limits: Limits
+    state: NDArray[np.void], sample: NDArray[np.void], limits: Limits, grip: str = ""
 ) -> None:
     """Refuses a start at which the coupling would already exceed the force limit.
+
+    ``grip`` names the hand of several.
 
     Raises:
         DeviceError: The message names the handle's distance from the grip, and the grip's position.
@@ -271,7 +273,8 @@ def refuse_stretched_start(
     force = float(state["coupling"]["stiffness"][0]) * distance
     if force > limits.force:
         raise DeviceError(
-            f"the device's absolute pose puts the handle {1e3 * distance:.3g} mm from the grip, "
+            f"{_hand_at(grip)}the device's absolute pose puts the handle "
+            f"{1e3 * distance:.3g} mm from the grip, "
             f"{force:.3g} N at the start; the limit is {limits.force:g} N: start nearer to "
             f"{np.round(pose['tool_position'], 4).tolist()} m or use relative poses"
         )
@@ -305,12 +308,17 @@ _DIVERGED = (
 )
 
 
-def trip_reason(code: int, tick: int) -> str:
+def trip_reason(code: int, tick: int, grip: str = "") -> str:
     """Describes why the kernel refused a tick.
 
-    ``code`` is a result of a function of ``kernel.tick``, not ``OK``.
+    ``code`` is a result of a function of ``kernel.tick``, not ``OK``; ``grip`` names the hand of
+    several that it is about.
     """
-    return f"tick {tick}: {_REASONS.get(code, _DIVERGED)}"
+    return f"tick {tick}: {_hand_at(grip)}{_REASONS.get(code, _DIVERGED)}"
+
+
+def _hand_at(grip: str) -> str:
+    return f"hand at '{grip}': " if grip else ""
 
 
 def trip_remedy(reason: str, motor_work: float) -> str:

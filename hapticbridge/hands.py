@@ -312,6 +312,13 @@ class DeviceGroup:
         self._reading: list[tuple[int, Any, NDArray[np.int64] | None, Any]] = []
         self._writing: list[tuple[Any, NDArray[np.float64]]] = []
 
+    def real_ones(self) -> tuple[DeviceGroup, list[int]]:
+        """Returns the real devices, of which there must be one, and the numbers of their hands."""
+        parts = zip(self._devices, self._counts, self._parts, strict=True)
+        real = [(device, count, part) for device, count, part in parts if device.info.is_real]
+        hands = [hand for *_, part in real for hand in range(part.start, part.stop)]
+        return DeviceGroup([each[0] for each in real], [each[1] for each in real]), hands
+
     def start(self, period: float) -> NDArray[np.void]:
         """Starts every device; returns their poses, (n,), ``SAMPLE_DTYPE``.
 

@@ -418,7 +418,8 @@ class Session:
         for hand, (each, own) in enumerate(zip(self._setups, self._samples(), strict=True)):
             if each.workspace.absolute:
                 state = self.kernel.state[hand : hand + 1]
-                refuse_stretched_start(state, own, each.limits)
+                grip = each.scene.grip if len(self._setups) > 1 else ""
+                refuse_stretched_start(state, own, each.limits, grip)
 
     def _description(self) -> dict[str, str]:
         found: list[dict[str, str]] = []
@@ -507,13 +508,20 @@ class Session:
         self.event("real_time", **answers)
 
     def start_clock(self) -> None:
-        """Waits until a real device is still, then starts the time of the run.
+        """Waits until the real devices are still, then starts the time of the run.
+
+        A simulated hand beside them is not read meanwhile: its motion begins with the run.
 
         Raises:
             DeviceError: The device keeps moving, or a hand moved one with absolute poses too far.
         """
         setup, waiting, sample = self.setup, self.stop.waiting, self.kernel.sample
-        wait_until_still(self.device, sample, setup.period, self.clock, lambda: waiting)
+        device, hands = self.device, list(range(sample.size))
+        if isinstance(device, DeviceGroup) and device.info.is_real:
+            device, hands = device.real_ones()
+        newest = sample[hands]
+        wait_until_still(device, newest, setup.period, self.clock, lambda: waiting)
+        sample[hands] = newest
         if not self.tick and not waiting:
             self._refuse_stretched_start()
         self.clock.start(round(setup.period * 1e9))

@@ -17,6 +17,7 @@ from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
+from hapticbridge.device import device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
@@ -144,6 +145,18 @@ def test_a_device_without_news_is_flagged_alone(tmp_path: Path) -> None:
     ]
     assert shares == pytest.approx([0.0, 0.9])
     assert hb.audit(path, in_process=True).resimulation == "bit for bit"
+
+
+def test_a_simulated_hand_waits_until_a_real_device_is_still(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    hands = [
+        hb.Grasp("left", Scripted("real", 0.0, is_real=True)),
+        hb.Grasp("right", Scripted("not real", 0.05)),
+    ]
+    with hb.Bridge(two_handed(BAR), hands, recording=path) as bridge:
+        bridge.run(0.05)
+    moved = hb.read_recording(path, hand=1).ticks["device_position"][:, 0]
+    assert moved[:3] == pytest.approx([0.0, 5e-5, 1e-4])
 
 
 def test_either_device_stops_the_run_and_both_get_zero_force() -> None:
@@ -280,8 +293,7 @@ def test_readers_of_one_hand_refuse_a_recording_of_two(tmp_path: Path) -> None:
     table = str(tmp_path / "x.csv")
     for command in (
         ["export", str(path), "--format", "csv", "--out", table],
-        ["audit", str(path), "--what-if", "damping=1"],
-        ["compare", str(path), str(path)],
+        ["export", str(path), "--format", "lerobot", "--out", table],
     ):
         assert main(command) == 2, command
     with pytest.raises(hb.RecordingError, match=r"is a run of 2 hands \('left', 'right'\)"):
@@ -464,7 +476,20 @@ def test_one_hand_that_is_named_is_as_today(
         ),
         (
             ("--hand", "left=simulated", "--hand", "right=simulated", "--dead-man", "0"),
-            "each of several hands has buttons of its own",
+            "--clutch and --dead-man are buttons of a real device, and no hand has one",
+        ),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--grip-axis", "jaw"),
+            "--grip-axis is for one hand; several name it as in --hand left+jaw=simulated",
+        ),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--grip-scale", "3"),
+            "--grip-scale without a grip axis has no effect",
+        ),
+        (("--grip", "left", "--grip-scale", "3"), "--grip-scale without a grip axis"),
+        (
+            ("--hand", "left=simulated", "--hand", "right=simulated", "--absolute"),
+            "hand at 'left': the device's absolute pose puts the handle 100 mm from the grip",
         ),
         (("--hand", "left=falcon", "--hand", "right=simulated"), "leave out --fast"),
     ],
@@ -479,6 +504,28 @@ def test_the_command_refuses_in_one_sentence(
     scene.write_text(BAR)
     assert main(["run", str(scene), "--fast", *arguments]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_gives_each_real_device_its_buttons(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = tmp_path / "bar.xml"
+    scene.write_text(BAR)
+    real = Scripted("real", 0.0, is_real=True, buttons=1)
+    monkeypatch.setattr(
+        "hapticbridge.cli.run.device_for",
+        lambda scene, name, *rest: real if name == "falcon" else device_for(scene, name, *rest),
+    )
+    hands = ["--hand", "left=falcon", "--hand", "right=simulated"]
+    path = tmp_path / "run.mcap"
+    run = ["run", str(scene), *hands, "--duration", "0.3", "--record", str(path)]
+    assert main([*run, "--dead-man", "0"]) in (0, 1)  # 1 where a busy machine misses the rate
+    capsys.readouterr()
+    assert not np.any(real.sent)  # the button was never pressed
+    clutched = [
+        has_flag(hb.read_recording(path, hand=hand).ticks, TickFlag.CLUTCH).all() for hand in (0, 1)
+    ]
+    assert clutched == [True, False]
 
 
 def test_a_simulated_hand_follows_the_path_of_its_grip(tmp_path: Path) -> None:

@@ -154,9 +154,9 @@ class Audit:
     ] = ()
     """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
     rotational_stiffness, rotational_damping, method, rate, substeps, scene_rate, scale,
-    force_scale, contact_stiffness, controller, or a parameter of the scene. Twice: with the
-    recorded motion, and, where the device is known, with a model hand. --plot and --report show all
-    runs side by side (one file only)."""
+    force_scale, contact_stiffness, controller, or a parameter of the scene; GRIP:stiffness and the
+    like for one of several hands. Twice: with the recorded motion, and, where the device is known,
+    with a model hand. --plot and --report show all runs side by side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""

@@ -289,8 +289,8 @@ class Run:
     ] = ()
     """Hold a grip with a device, in place of --grip and --device, once per hand: --hand
     wrench=falcon --hand bolt=spacemouse. Both are named as for those two; GRIP+JOINT names what the
-    device's grip axis moves. Scale, axes, limits and gains apply to every hand. The method is
-    'implicit' or 'compensated'."""
+    device's grip axis moves. Scale, axes, limits and gains apply to every hand, --clutch and
+    --dead-man to every real device. The method is 'implicit' or 'compensated'."""
     duration: float | None = None
     """Duration in s; each missed deadline uses up one period of it. By default the run ends with
     the device's motion, which a missed deadline delays; without an end of it with Ctrl-C, or after
@@ -430,6 +430,8 @@ class Run:
                     else replace(self, substeps=self._own_substeps(source, scene))
                 )
             joint = self._own_grip_axis(scene)
+            if not joint:
+                self._refuse_grip_scale()
             device = device_for(scene, self.device, notify, joint)
             stack.callback(device.close)  # what is refused from here on must not leave it claimed
             if joint and self.grip_axis is None and device.info.grip_axis is None:
@@ -441,6 +443,12 @@ class Run:
                 one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
                 return one._feel(scene, [grasp], clock, stack, window, interrupts)
             return chosen._feel(scene, device, clock, stack, window, interrupts)
+
+    def _refuse_grip_scale(self) -> None:
+        if self.grip_scale is not None:
+            raise HapticBridgeError(
+                "--grip-scale without a grip axis has no effect; name its joint: --grip-axis JOINT"
+            )
 
     def _own_grip_axis(self, scene: Scene) -> str:
         """Returns the joint that a grip axis moves, the user's or the scene's; empty for none."""
@@ -501,7 +509,14 @@ class Run:
             refuse_simulated_time(device, clock)
             if device.partition(":")[0] == "mouse":
                 raise HapticBridgeError("the mouse is for one hand: --device mouse")
+        if self.grip_axis not in (None, "none"):
+            raise HapticBridgeError(
+                f"--grip-axis is for one hand; several name it as in --hand "
+                f"{held[0][0]}+{self.grip_axis}={held[0][2]}"
+            )
         axes = {grip: GripAxis(joint) for grip, joint, _ in held if joint}
+        if not axes:
+            self._refuse_grip_scale()
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
         with err.status("trying the scene …"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
@@ -511,7 +526,22 @@ class Run:
             opened = device_for(own, name, notify, joint)
             stack.callback(opened.close)
             grasps.append(self._grasp(grip, joint, opened))
-        return self._feel(scene, grasps, clock, stack, window, interrupts)
+        one = replace(self, clutch=None, dead_man=None)  # they are those of the grasps
+        return one._feel(scene, self._with_buttons(grasps), clock, stack, window, interrupts)
+
+    def _with_buttons(self, grasps: Sequence[Grasp]) -> list[Grasp]:
+        """Returns the grasps with the buttons of their devices; a simulated hand has none."""
+        if self.clutch is None and self.dead_man is None:
+            return list(grasps)
+        is_real = [not isinstance(g.device, str) and g.device.info.is_real for g in grasps]
+        if not any(is_real):
+            raise HapticBridgeError(
+                "--clutch and --dead-man are buttons of a real device, and no hand has one"
+            )
+        return [
+            replace(grasp, clutch=self.clutch, dead_man=self.dead_man) if is_pressed else grasp
+            for grasp, is_pressed in zip(grasps, is_real, strict=True)
+        ]
 
     def _gains(self) -> dict[str, float]:
         """Returns the gains of the coupling that the user named."""

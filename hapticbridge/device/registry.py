@@ -264,19 +264,23 @@ def device_for(
         return device
     path = scene.path.with_name(f"{scene.name}_{grip_axis}.csv")
     fingers = SimulatedDevice(
-        mass=FINGERS[0],
-        damping=FINGERS[1],
-        hand=Hand(mass=FINGERS[2], stiffness=FINGERS[3], damping=FINGERS[4]),
+        mass=GRIP_AXIS[0],
+        damping=GRIP_AXIS[1],
+        hand=FINGERS_HAND,
         path=path if path.is_file() else None,
-        force_limit=FINGERS[5],
+        force_limit=GRIP_AXIS[2],
         dof=3,
     )
-    return GrippingDevice(device, fingers, FINGERS[6])
+    return GrippingDevice(device, fingers, GRIP_AXIS[3])
 
 
-FINGERS = 0.05, 2.0, 0.02, 1500.0, 8.0, 8.0, 0.03
-"""Grip axis of a simulated device: inertia in kg and damping in N s/m; mass, stiffness and damping
-of the fingers in kg, N/m and N s/m; its largest force in N and travel in m, those of a sigma.7."""
+FINGERS_HAND = Hand(mass=0.02, stiffness=1500.0, damping=8.0)
+"""Fingers that close a grip axis, in kg, N/m and N s/m. Stiffer ones follow their path more
+closely, and yield less to the force."""
+
+GRIP_AXIS = 0.05, 2.0, 8.0, 0.03
+"""Grip axis of a simulated device: inertia in kg, damping in N s/m, and its largest force in N and
+travel in m, those of a sigma.7."""
 
 
 def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:

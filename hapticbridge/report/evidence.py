@@ -128,9 +128,14 @@ def draw_recording(*hands: Recording) -> Figure:
     return figure
 
 
-def _coupling_sentence(recording: Recording) -> str:
+def recorded_coupling(recording: Recording) -> RunCoupling:
+    """Returns the coupling of a run at its start; for a joint, at the fingers.
+
+    Raises:
+        RecordingError: The recording does not describe it.
+    """
     meta, parameters = recording.meta, parameters_of(recording.meta)
-    coupling = RunCoupling.of(
+    return RunCoupling.of(
         method_of(meta),
         parameters.timestep,
         requested_of(meta),
@@ -138,7 +143,10 @@ def _coupling_sentence(recording: Recording) -> str:
         measured=parameters.effective,
         is_always_implicit=was_always_implicit(recording.ticks),
     ).felt_at(parameters.grip, parameters.scale, parameters.force_scale)
-    return coupling.sentences()[0]
+
+
+def _coupling_sentence(recording: Recording) -> str:
+    return recorded_coupling(recording).sentences()[0]
 
 
 def _draw_hand(recording: Recording, panels: NDArray[np.object_], *, is_alone: bool) -> None:

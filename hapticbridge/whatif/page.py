@@ -8,13 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.record import due_times
+from hapticbridge.rendering import RunCoupling
 from hapticbridge.report import DRAWABLE, decimated
-from hapticbridge.report.evidence import BINS, Evidence, finish, is_motion_prescribed
+from hapticbridge.report.evidence import (
+    BINS,
+    Evidence,
+    finish,
+    is_motion_prescribed,
+    recorded_coupling,
+)
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
 from hapticbridge.units import format_si
@@ -34,16 +43,18 @@ Row = tuple[str, tuple[str, ...]]
 def rows(found: WhatIf) -> Iterator[Row]:
     """Yields a name and a text per run, in the order of ``found.runs``."""
     runs = found.runs
-    for name in ("effective", "law", "requested"):
-        couplings = [getattr(run.report.coupling, name, None) for run in runs]
-        if any(couplings):
-            yield (
-                f"{name} K, B",
-                tuple(
-                    f"{c.stiffness:.4g} N/m, {c.damping:.4g} N s/m" if c else "unknown"
-                    for c in couplings
-                ),
-            )
+    for hand, grip in enumerate(runs[0].report.hands or ("",)):
+        of_hand = [_coupling(run, hand) for run in runs]
+        for name in ("effective", "law", "requested"):
+            couplings = [getattr(each, name, None) for each in of_hand]
+            if any(couplings):
+                yield (
+                    f"{name} K, B" + (f" at '{grip}'" if grip else ""),
+                    tuple(
+                        f"{c.stiffness:.4g} N/m, {c.damping:.4g} N s/m" if c else "unknown"
+                        for c in couplings
+                    ),
+                )
     yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
         unit = _PEAK_UNITS[name.split()[0]]
@@ -55,6 +66,11 @@ def rows(found: WhatIf) -> Iterator[Row]:
     yield "slack used", tuple(f"{run.report.slack_share:.0%}" for run in runs)
     yield "device bears it", tuple(map(_certified, runs))
     yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
+
+
+def _coupling(run: WhatIfRun, hand: int) -> RunCoupling | None:
+    """Returns a hand's coupling at the start of a run; for a joint, at the fingers."""
+    return recorded_coupling(run.recordings[hand]) if run.report.hands else run.report.coupling
 
 
 def changes(found: WhatIf) -> Iterator[tuple[str, str, str]]:
@@ -100,19 +116,34 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
     Raises:
         RecordingError: A run holds a number that cannot be drawn.
     """
-    is_held = not is_motion_prescribed(found.runs[0].recording.meta)
+    hands = found.runs[0].report.hands or ("",)
+    figure = new_figure(8 if len(hands) == 1 else 5.5 * len(hands), 11)
+    columns = figure.subplots(4, len(hands), sharex=True, squeeze=False).T
+    for hand, (grip, panels) in enumerate(zip(hands, columns, strict=True)):
+        _draw_hand(found, hand, panels, bins)
+        if grip:
+            panels[0].set_title(printable(grip), fontsize="small", loc="left", parse_math=False)
+    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
+    title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
+    figure.suptitle(printable(title), fontsize="medium", parse_math=False, wrap=True)
+    return figure
+
+
+def _draw_hand(found: WhatIf, hand: int, panels: NDArray[np.object_], bins: int) -> None:
+    before = found.runs[0].recordings[hand]
+    is_held = not is_motion_prescribed(before.meta)
+    is_joint = before.meta.get("grip", "").startswith(JOINT)
     wrench = "wrench_on_device" if is_held else "wrench_on_tool"
-    figure = new_figure(8, 11)
-    panels = figure.subplots(4, 1, sharex=True)
-    origin = found.runs[0].ticks["handle_position"][0]
+    unit = 1.0 if is_joint else 1e3
+    origin = before.ticks["handle_position"][0]
     for run, (colour, line, width) in zip(found.runs, _STYLES, strict=False):
-        ticks = run.ticks
+        ticks = run.recordings[hand].ticks
         if not len(ticks):
             continue
         time = due_times(ticks, run.period)
         drawn = (
             np.linalg.norm(ticks[wrench][:, :3], axis=1),
-            1e3 * np.linalg.norm(ticks["handle_position"] - origin, axis=1),
+            unit * np.linalg.norm(ticks["handle_position"] - origin, axis=1),
             1e3 * ticks["environment_energy"],
             1e3 * ticks["device_energy"],
         )
@@ -124,7 +155,7 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
             )
     labels = (
         "force on the hand (N)" if is_held else "force on the tool (N)",
-        "handle's distance from its start (mm)",
+        f"handle's distance from its start ({'m or rad' if is_joint else 'mm'})",
         "energy that the environment\ncreated (+) or dissipated (−) (mJ)",
         "energy that the device was\ngiven (+) or gave (−) (mJ)",
     )
@@ -136,10 +167,6 @@ def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
         axes.axhline(0.0, color="black", lw=0.6)
     panels[-1].set_xlabel("time (s)")
     finish(panels[0])
-    changed = ", ".join(f"{name} {old} → {new}" for name, old, new in changes(found))
-    title = f"{found.path.name}, what if {changed or 'nothing is changed'}"
-    figure.suptitle(printable(title), fontsize="medium", parse_math=False, wrap=True)
-    return figure
 
 
 def draw_what_if(found: WhatIf, path: Path) -> None:

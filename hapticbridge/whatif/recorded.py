@@ -1,9 +1,9 @@
-"""A recorded run, taken apart for repetition with changes."""
+"""A recorded run, taken apart for repetition with changes; of several hands, each of them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def invert_exactly(wanted: float, function: Callable[[float], float], guess: flo
 
 @dataclass(frozen=True, slots=True)
 class RecordedRun:
-    """Description of a run from its recording.
+    """Description of a run from its recording; of one hand, if several hold the scene.
 
     Attributes:
         recording: The recording with its ticks.
@@ -79,14 +79,19 @@ class RecordedRun:
     scene_file: Path
 
     @classmethod
-    def of(cls, recording: Recording, folder: Path) -> RecordedRun:
-        """Takes a recording apart.
+    def of(cls, hands: Sequence[Recording], folder: Path) -> tuple[RecordedRun, ...]:
+        """Takes a recording apart, into a run per hand.
 
         The scene's files are unpacked to ``folder``.
 
         Raises:
             RecordingError: The recording does not describe its run, or carries no scene.
         """
+        scene_file = unpack_scene(hands[0], folder)
+        return tuple(cls._of_hand(recording, scene_file) for recording in hands)
+
+    @classmethod
+    def _of_hand(cls, recording: Recording, scene_file: Path) -> RecordedRun:
         parameters = parameters_of(recording.meta)
         method = method_of(recording.meta)
         try:
@@ -106,7 +111,7 @@ class RecordedRun:
             scene=recorded_values(recording.meta),
             controller=_controller(info, parameters, method),
         )
-        return cls(recording, parameters, info, settings, unpack_scene(recording, folder))
+        return cls(recording, parameters, info, settings, scene_file)
 
     @property
     def ticks(self) -> NDArray[np.void]:
@@ -170,15 +175,16 @@ class RecordedRun:
         trips = [e for e in self.recording.events if e.get("event") == "trip"]
         return str(trips[0].get("reason", "unknown")) if trips else ""
 
-    def scene(self, settings: Settings) -> Scene:
-        """Loads the scene with the parameters of some settings.
 
-        Raises:
-            SceneError: A parameter is out of range, or the scene cannot be loaded.
-        """
-        return load_unpacked(
-            self.scene_file, self.parameters.grip, settings.scene, self.recording.meta
-        )
+def scene_of(hands: Sequence[RecordedRun], settings: Settings) -> Scene:
+    """Loads the scene of a run with the parameters of some settings, and a handle per hand.
+
+    Raises:
+        SceneError: A parameter is out of range, or the scene cannot be loaded.
+    """
+    first, grips = hands[0], tuple(hand.parameters.grip for hand in hands)
+    grip = grips if len(grips) > 1 else grips[0]
+    return load_unpacked(first.scene_file, grip, settings.scene, first.recording.meta)
 
 
 def _requested_hold(hold: float, load: float) -> float:

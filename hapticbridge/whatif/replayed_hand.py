@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import cache
@@ -26,11 +26,11 @@ from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import trip_reason
+from hapticbridge.hands import Grasp
 from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
 from hapticbridge.options import Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.scene import load_scene
-from hapticbridge.whatif.recorded import RecordedRun
+from hapticbridge.whatif.recorded import RecordedRun, scene_of
 from hapticbridge.whatif.settings import GAINS, Settings
 
 # Recorded motion as a device, and recorded times as a clock
@@ -289,7 +289,7 @@ Event = Mapping[str, Any]
 
 
 @cache
-def load_bridge_code(method: str, contact: str, is_slow: bool) -> None:
+def load_bridge_code(method: str, contact: str, is_slow: bool, is_of_hands: bool) -> None:
     """Loads the machine code of a bridge, which is first compiled and kept on disk if missing.
 
     A child process may not write it (``recorded_scene.load_machine_code``).
@@ -297,55 +297,35 @@ def load_bridge_code(method: str, contact: str, is_slow: bool) -> None:
     options: dict[str, Any] = {"method": method, "contact": contact, "clock": SimulatedClock()}
     if is_slow:
         options["scene_rate"] = 500.0
+    scene = "plug_and_socket" if is_of_hands else "point_mass"
+    devices = [Grasp("plug"), Grasp("socket")] if is_of_hands else "simulated"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with Bridge(load_scene("point_mass"), i_know=True, **options) as bridge:
+        with Bridge(scene, devices, i_know=True, **options) as bridge:
             bridge.run(4e-3)
 
 
 class Repetition:
-    """One repetition of a run with given settings.
+    """One repetition of a run with given settings, one per hand.
 
     Attributes:
-        settings: Settings of the bridge.
+        settings: Settings of the bridge, with the coupling of the first hand.
         warned: Warnings about the scene, one sentence each.
     """
 
-    def __init__(self, run: RecordedRun, settings: Settings) -> None:
-        self._run, self.settings = run, settings
+    def __init__(self, hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> None:
+        self._hands, self._settings = tuple(hands), tuple(settings)
+        self._run, self.settings = self._hands[0], self._settings[0]
         self._per_tick = 1.0
         self.warned: tuple[str, ...] = ()
 
-    def into(self, path: Path, device: Device, clock: Clock) -> tuple[float, str]:
+    def into(self, path: Path, devices: Sequence[Device], clock: Clock) -> tuple[float, str]:
         """Runs into a file; returns the period in s, and the reason of the guard's stop or empty.
 
         Raises:
             HapticBridgeError: The changed bridge is refused; the message names the reason.
         """
-        run, settings = self._run, self.settings
-        bridge = Bridge(
-            run.scene(settings),
-            device,
-            settings.coupling,
-            rate=settings.rate,
-            substeps=settings.substeps,
-            scene_rate=settings.scene_rate,
-            method=settings.method.name,
-            contact=settings.method.contact,
-            contact_stiffness=settings.contact_stiffness,
-            recording=path,
-            clock=clock,
-            workspace=Workspace(
-                scale=settings.scale,
-                force_scale=settings.force_scale,
-                axes=run.parameters.axes,
-                absolute=run.is_absolute,
-            ),
-            limits=run.limits,
-            controller=settings.controller,
-            clutch=run.clutch,
-            dead_man=run.dead_man,
-        )
+        run, bridge = self._run, self._bridge(path, devices, clock)
         self._per_tick = run.period / bridge.period
         trip = ""
         with warnings.catch_warnings(record=True) as caught, ExitStack() as stack:
@@ -359,6 +339,46 @@ class Repetition:
         messages = [str(each.message).replace(str(run.scene_file), "") for each in caught]
         self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
         return bridge.period, trip
+
+    def _bridge(self, path: Path, devices: Sequence[Device], clock: Clock) -> Bridge:
+        """Returns the changed bridge; a grip axis is a hand with a device of its own."""
+        settings = self.settings
+        common: dict[str, Any] = {
+            "rate": settings.rate,
+            "substeps": settings.substeps,
+            "scene_rate": settings.scene_rate,
+            "method": settings.method.name,
+            "contact": settings.method.contact,
+            "contact_stiffness": settings.contact_stiffness,
+            # one choice for all hands, and None for one whose default it is
+            "controller": next((s.controller for s in self._settings if s.controller), None),
+            "recording": path,
+            "clock": clock,
+        }
+        own: list[dict[str, Any]] = [
+            {
+                "workspace": Workspace(
+                    scale=each.scale,
+                    force_scale=each.force_scale,
+                    axes=hand.parameters.axes,
+                    absolute=hand.is_absolute,
+                ),
+                "limits": hand.limits,
+                "clutch": hand.clutch,
+                "dead_man": hand.dead_man,
+            }
+            for hand, each in zip(self._hands, self._settings, strict=True)
+        ]
+        scene = scene_of(self._hands, settings)
+        if len(self._hands) == 1:
+            return Bridge(scene, devices[0], settings.coupling, **common, **own[0])
+        grasps = [
+            Grasp(hand.parameters.grip, device, coupling=each.coupling, **chosen)
+            for hand, device, each, chosen in zip(
+                self._hands, devices, self._settings, own, strict=True
+            )
+        ]
+        return Bridge(scene, grasps, **common)
 
     def _repeat(self, bridge: Bridge) -> None:
         due = deque(
@@ -395,7 +415,10 @@ class Repetition:
 
     def _was_tripped_by_state(self) -> bool:
         last = len(self._run.ticks)
-        return self._run.trip in [trip_reason(code, last) for code in _BY_STATE]
+        grips = [hand.parameters.grip for hand in self._hands] if len(self._hands) > 1 else [""]
+        return self._run.trip in [
+            trip_reason(code, last, grip) for code in _BY_STATE for grip in grips
+        ]
 
     def _action_for(self, event: Event) -> Event | None:
         """Returns the action that repeats a recorded event under these settings, or None."""

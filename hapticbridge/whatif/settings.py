@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.guard import CONTROLLERS
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.rendering import CONTACTS, Method, method_named, method_names
 
 UNITS = {
@@ -30,6 +31,9 @@ UNITS = {
 
 GAINS = tuple(field.name for field in fields(Coupling))
 """Names of K and B of translation, then of rotation."""
+
+OF_HAND = (*GAINS, "scale", "force_scale")
+"""Settings that each of several hands has for itself."""
 
 Value = float | int | str
 
@@ -126,6 +130,48 @@ class Settings:
             scene={name: float(values.get(name, was)) for name, was in self.scene.items()},
             controller=None if controller is None else str(controller),
         )
+
+
+def changed_of_hands(
+    hands: Mapping[str, Settings], changes: Mapping[str, Value]
+) -> tuple[dict[str, Settings], tuple[tuple[str, str, Value | None, Value | None], ...]]:
+    """Returns the changed settings of each hand, and each change with unit, old and new value.
+
+    Args:
+        hands: Settings by grip, in the order of the hands.
+        changes: As for ``Settings.changed``. Of several hands, ``OF_HAND`` change every hand but
+            those on a joint, whose gains have other units; ``GRIP:NAME`` changes one hand.
+
+    Raises:
+        HapticBridgeError: As for ``Settings.changed``, or no hand has that grip.
+    """
+    if len(hands) == 1:
+        [(grip, old)] = hands.items()
+        new = old.changed(changes)
+        told = [(name, UNITS.get(name, ""), old.value(name), new.value(name)) for name in changes]
+        return {grip: new}, tuple(told)
+    chosen: dict[str, dict[str, Value]] = {grip: {} for grip in hands}
+    for name, value in sorted(changes.items(), key=lambda each: ":" in each[0]):
+        grip, is_named, setting = name.rpartition(":")
+        if is_named and (grip not in hands or setting not in OF_HAND):
+            raise RecordingError(
+                f"'{name:.60}' cannot be changed; write GRIP:NAME with a grip of {choices(hands)} "
+                f"and a name of {choices(OF_HAND)}, or the name alone for all"
+            )
+        for each in [grip] if is_named else hands:
+            if is_named or name not in OF_HAND or not each.startswith(JOINT):
+                chosen[each][setting] = value
+    news = {grip: old.changed(chosen[grip]) for grip, old in hands.items()}
+    told = []
+    for number, (grip, own) in enumerate(chosen.items()):
+        old, new = hands[grip], news[grip]
+        for name in own:
+            unit = "" if grip.startswith(JOINT) else UNITS.get(name, "")
+            if name in OF_HAND:
+                told.append((f"{name} at '{grip}'", unit, old.value(name), new.value(name)))
+            elif number == 0:
+                told.append((name, unit, old.value(name), new.value(name)))
+    return news, tuple(told)
 
 
 def changes_from(words: Iterable[str]) -> dict[str, Value]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,17 @@ from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.compare import compare
 from hapticbridge.confinement import Work, Worker, in_bounds
 from hapticbridge.device import Device
+from hapticbridge.device.registry import FINGERS_HAND
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
+from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
-from hapticbridge.recording import Recording, read_recording
+from hapticbridge.recording import Recording
+from hapticbridge.recording.reader import read_hands
 from hapticbridge.scene import Scene
-from hapticbridge.whatif.recorded import RecordedRun
+from hapticbridge.whatif.recorded import RecordedRun, scene_of
 from hapticbridge.whatif.replayed_hand import (
     IdentifiedDevice,
     RecordedClock,
@@ -37,7 +40,7 @@ from hapticbridge.whatif.replayed_hand import (
     load_bridge_code,
     missing_for_closed_loop,
 )
-from hapticbridge.whatif.settings import UNITS, Settings, Value
+from hapticbridge.whatif.settings import Settings, Value, changed_of_hands
 
 # Result of a what-if
 
@@ -63,7 +66,7 @@ class WhatIfRun:
             handle and tool in m, by name. Those on the hand are left out for a prescribed motion.
         trip: Reason of the guard's stop, or empty.
         period: T in s.
-        recording: Its recording; that of a changed run exists in memory only.
+        recordings: Its recording, once per hand; that of a changed run exists in memory only.
     """
 
     name: str
@@ -71,11 +74,16 @@ class WhatIfRun:
     peaks: dict[str, float]
     trip: str
     period: float
-    recording: Recording
+    recordings: tuple[Recording, ...]
+
+    @property
+    def recording(self) -> Recording:
+        """The recording; of several hands, the first's."""
+        return self.recordings[0]
 
     @property
     def ticks(self) -> NDArray[np.void]:
-        """Records, ``TICK_DTYPE``."""
+        """Records, ``TICK_DTYPE``; of several hands, the first's."""
         return self.recording.ticks
 
 
@@ -88,7 +96,8 @@ class WhatIf:
         changes: Name, unit, and the value before and after.
         runs: Recorded, prescribed and, for a known device, closed loop.
         hand_error: RMS distance in m of the model hand from the recorded motion with unchanged
-            settings: the accuracy of the closed loop. NaN without closed loop.
+            settings: the accuracy of the closed loop; of several hands, the largest. NaN without
+            closed loop.
         notes: Notes on the runs, one sentence each.
     """
 
@@ -159,16 +168,16 @@ def what_if(
     report = judge(path)
     if report.verdict == "invalid":
         raise RecordingError(f"an invalid recording cannot be simulated again: {report.reason}")
-    recording = read_recording(path)
+    recordings = read_hands(path)
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
-        run = RecordedRun.of(recording, folder / "scene")
-        if len(run.ticks) < 3:
+        hands = RecordedRun.of(recordings, folder / "scene")
+        if len(hands[0].ticks) < 3:
             raise RecordingError(
-                f"'{recording.path}' has {len(run.ticks)} ticks; a what-if needs 3"
+                f"'{recordings[0].path}' has {len(hands[0].ticks)} ticks; a what-if needs 3"
             )
         file = folder / "run.mcap"
-        return _Experiment(run, report, file, progress, judge, in_process).changed(changes)
+        return _Experiment(hands, report, file, progress, judge, in_process).changed(changes)
 
 
 START_TIME, MOST_TIMES = 40.0, 100.0
@@ -180,7 +189,7 @@ largest work of a changed run relative to the recorded one."""
 class _Experiment:
     """Repetitions of one recorded run, judged in its report, into a file at a path."""
 
-    run: RecordedRun
+    hands: tuple[RecordedRun, ...]
     report: AuditReport
     path: Path
     progress: Callable[[int, int, str], None]
@@ -188,10 +197,17 @@ class _Experiment:
     in_process: bool
     concerns: dict[str, None] = field(default_factory=dict)
 
+    @property
+    def run(self) -> RecordedRun:
+        """The recorded run; of several hands, the first's."""
+        return self.hands[0]
+
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
         """Runs all repetitions and returns the result."""
-        run, settings = self.run, self.run.settings
-        new = settings.changed(changes)
+        run, settings = self.run, [hand.settings for hand in self.hands]
+        grips = [hand.parameters.grip for hand in self.hands]
+        by_grip, changed_values = changed_of_hands(dict(zip(grips, settings, strict=True)), changes)
+        new = list(by_grip.values())
         is_changed = new != settings
         notes = []
         if not self._is_scene_as_recorded():
@@ -199,87 +215,105 @@ class _Experiment:
                 "the attached scene does not compile to the recorded model: a program changed it "
                 "after loading, or it was compiled elsewhere; these runs lack that change"
             )
-        peaks = self._peaks(run.ticks)
-        recorded = WhatIfRun(RECORDED, self.report, peaks, run.trip, run.period, run.recording)
+        recordings = tuple(hand.recording for hand in self.hands)
+        peaks = self._peaks(recordings)
+        recorded = WhatIfRun(RECORDED, self.report, peaks, run.trip, run.period, recordings)
         runs = [recorded]
         self.progress(1, 4, "the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
-        notes.extend(_missing_parts(run, Repetition(run, new)))
+        notes.extend(_missing_parts(run, Repetition(self.hands, new)))
         if runs[0].trip:
             notes.append("the recorded run ends in a trip, so these runs end there too")
         hand_error = math.nan
-        if missing := missing_for_closed_loop(run.info):
+        if missing := self._missing_for_closed_loop():
             notes.append(f"no closed loop: {missing}")
         else:
             self.progress(2, 4, "the model hand, nothing changed")
             same = self._closed(settings)
-            count = min(len(same.ticks), len(run.ticks))
-            off = same.ticks["device_position"][:count] - run.ticks["device_position"][:count]
-            hand_error = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+            hand_error = max(map(_distance, same.recordings, recordings))
             self.progress(3, 4, "the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
                 "recorded motion (root mean square); its response to changed forces is assumed"
             )
-        changed_values = tuple(
-            (name, UNITS.get(name, ""), settings.value(name), new.value(name)) for name in changes
-        )
         return WhatIf(
             run.recording.path, changed_values, tuple(runs), hand_error, (*notes, *self.concerns)
         )
 
-    def _peaks(self, ticks: NDArray[np.void]) -> dict[str, float]:
-        return _peaks(ticks, is_held=not self.run.info.is_prescribed)
+    def _missing_for_closed_loop(self) -> str:
+        for hand in self.hands:
+            if missing := missing_for_closed_loop(hand.info):
+                return f"{missing} (hand{self._at(hand)})" if self._at(hand) else missing
+        return ""
 
-    def _prescribed(self, settings: Settings) -> WhatIfRun:
+    def _at(self, hand: RecordedRun) -> str:
+        return f" at '{hand.parameters.grip}'" if len(self.hands) > 1 else ""
+
+    def _peaks(self, recordings: Sequence[Recording]) -> dict[str, float]:
+        return {
+            name + self._at(hand): peak
+            for hand, recording in zip(self.hands, recordings, strict=True)
+            for name, peak in _peaks(recording.ticks, is_held=not hand.info.is_prescribed).items()
+        }
+
+    def _prescribed(self, settings: Sequence[Settings]) -> WhatIfRun:
         run = self.run
-        if settings.rate == run.settings.rate:
+        if settings[0].rate == run.settings.rate:
             clock = RecordedClock(run.ticks, run.period)
-            device = RecordedMotion(run, clock)
-            return self._simulated(PRESCRIBED, lambda _: device, clock, settings)
-        resampled = ResampledMotion(run)
+            devices: list[Device] = [RecordedMotion(hand, clock) for hand in self.hands]
+            return self._simulated(PRESCRIBED, lambda _: devices, clock, settings)
+        resampled = [ResampledMotion(hand) for hand in self.hands]
         return self._simulated(PRESCRIBED, lambda _: resampled, SimulatedClock(), settings)
 
-    def _closed(self, settings: Settings) -> WhatIfRun:
-        def device(scene: Scene) -> Device:
-            return IdentifiedDevice(self.run, scene_hand(scene.model, scene.path))
+    def _closed(self, settings: Sequence[Settings]) -> WhatIfRun:
+        def devices(scene: Scene) -> list[Device]:
+            hand = scene_hand(scene.model, scene.path)
+            is_joint = [run.parameters.grip.startswith(JOINT) for run in self.hands]
+            return [
+                IdentifiedDevice(run, FINGERS_HAND if is_finger else hand)
+                for run, is_finger in zip(self.hands, is_joint, strict=True)
+            ]
 
-        return self._simulated(CLOSED, device, SimulatedClock(), settings)
+        return self._simulated(CLOSED, devices, SimulatedClock(), settings)
 
     def _simulated(
-        self, name: str, device_in: Callable[[Scene], Device], clock: Clock, settings: Settings
+        self,
+        name: str,
+        devices_in: Callable[[Scene], Sequence[Device]],
+        clock: Clock,
+        settings: Sequence[Settings],
     ) -> WhatIfRun:
-        run, path = self.run, self.path
+        run, path, new = self.run, self.path, settings[0]
 
         def work(worker: Worker) -> object:
-            scene = run.scene(settings)
+            scene = scene_of(self.hands, new)
             worker.allow_run()
-            repetition = Repetition(run, settings)
-            period, trip = repetition.into(path, device_in(scene), clock)
+            repetition = Repetition(self.hands, settings)
+            period, trip = repetition.into(path, devices_in(scene), clock)
             return period, trip, repetition.warned
 
         load_bridge_code(
-            settings.method.name, settings.method.contact, settings.scene_rate < settings.rate
+            new.method.name, new.method.contact, new.scene_rate < new.rate, len(self.hands) > 1
         )
         old = run.settings
-        steps = settings.rate * settings.substeps / (old.rate * old.substeps)
+        steps = new.rate * new.substeps / (old.rate * old.substeps)
         period, trip, warned = self._in_bounds(work, max(1.0, steps))
-        if settings != run.settings:
+        if any(own != hand.settings for own, hand in zip(settings, self.hands, strict=True)):
             self.concerns |= dict.fromkeys(map(str, warned))
-        recording = read_recording(path)
+        recordings = read_hands(path)
         report = self.judge(path)
         return WhatIfRun(
-            name, report, self._peaks(recording.ticks), str(trip), float(period), recording
+            name, report, self._peaks(recordings), str(trip), float(period), recordings
         )
 
     def _is_scene_as_recorded(self) -> bool:
-        recording, parameters = self.run.recording, self.run.parameters
+        recording, parameters = self.run.recording, [hand.parameters for hand in self.hands]
         return bool(
             self._in_bounds(
-                lambda _: is_as_recorded(compile_recorded(recording, parameters), recording)
+                lambda _: is_as_recorded(compile_recorded(recording, *parameters), recording)
             )
         )
 
@@ -334,6 +368,13 @@ def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
             "the recorded motion is linear between its samples: at another rate its speed changes "
             "in steps"
         )
+
+
+def _distance(recording: Recording, other: Recording) -> float:
+    """Returns the RMS distance in m of two motions of a device, over the ticks of both."""
+    count = min(len(recording.ticks), len(other.ticks))
+    off = recording.ticks["device_position"][:count] - other.ticks["device_position"][:count]
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
 def _peaks(ticks: NDArray[np.void], *, is_held: bool) -> dict[str, float]:
