@@ -260,10 +260,10 @@ class Bridge:
                 elif code == HALF_DONE:
                     second_half(model, data)
                 else:
-                    return self._trip_reason(code, session.tick)
+                    return self._reason_with_hand(code, session.tick)
                 code = answer(state, row, substep)
             if code != OK:
-                return self._trip_reason(code, session.tick)
+                return self._reason_with_hand(code, session.tick)
             write_device(wrench)
             write = now()
             if mark is not None:
@@ -282,7 +282,7 @@ class Bridge:
             session.tick += 1
         return ""
 
-    def _trip_reason(self, code: int, tick: int) -> str:
+    def _reason_with_hand(self, code: int, tick: int) -> str:
         """Describes why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
         grip = self.setups[hand].scene.grip if self._others else ""
@@ -324,7 +324,7 @@ class Bridge:
         if isinstance(command, Stop):
             self.stop(by)
             return
-        self._refuse_several("commands")
+        self._refuse_several()
         if self._session is None or not self._session.is_open:
             raise CommandError(_NOT_OPEN)
         self._session.commands.offer(command, by)
@@ -338,12 +338,12 @@ class Bridge:
         Args:
             events: Events of the recording (``commands.CHANGES``), in order.
         """
-        self._refuse_several("commands")
+        self._refuse_several()
         self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
 
-    def _refuse_several(self, what: str) -> None:
-        if len(self.setups) > 1:
-            raise CommandError(f"a run of several hands takes no {what} but to stop")
+    def _refuse_several(self) -> None:
+        if self._others:
+            raise CommandError("a run of several hands takes no commands but to stop")
 
     def set_input(
         self,
@@ -433,8 +433,15 @@ class Bridge:
         return self.session.stream.latest(count)
 
     def conditions(self) -> tuple[str, ...]:
-        """Returns the conditions on device and method as sentences, once the bridge is open."""
-        return condition_sentences(self.device.info, self.session.parameters, self.setup.method)
+        """Returns the conditions on device and method as sentences, once the bridge is open.
+
+        Those of several hands begin with the hand's grip.
+        """
+        return tuple(
+            f"{setup.scene.grip}: {sentence}" if self._others else sentence
+            for setup, own in zip(self.setups, self.session.hand_parameters, strict=True)
+            for sentence in condition_sentences(setup.info, own, setup.method)
+        )
 
     def summary(self) -> Summary:
         """Returns the summary of the run so far."""

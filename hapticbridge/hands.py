@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,18 +84,8 @@ class GripAxis:
 _SAME, _REVERSED = np.eye(3), np.diag([-1.0, 1.0, -1.0])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Choices:
-    coupling: Coupling | Mapping[str, float] | None = None
-    workspace: Workspace | None = None
-    limits: Limits | None = None
-    clutch: int | None = None
-    dead_man: int | None = None
-    grip_axis: GripAxis | None = None
-
-
 @dataclass(frozen=True, slots=True)
-class Grasp(_Choices):
+class Grasp:
     """A grip of the scene that one of several hands holds, with its own device.
 
     Attributes:
@@ -116,6 +106,13 @@ class Grasp(_Choices):
 
     grip: str
     device: Device | str = "simulated"
+    _: KW_ONLY
+    coupling: Coupling | Mapping[str, float] | None = None
+    workspace: Workspace | None = None
+    limits: Limits | None = None
+    clutch: int | None = None
+    dead_man: int | None = None
+    grip_axis: GripAxis | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grip, str) or not self.grip:
@@ -357,12 +354,10 @@ class DeviceGroup:
         """
         if wrench is not self._wrench:
             self._wrench = wrench
+            each = np.broadcast_to(wrench, (self._parts[-1].stop, 6))
             # a device with one hand gets its wrench, (6,)
             self._writing = [
-                (
-                    write,
-                    wrench if wrench.ndim == 1 else wrench[part if count > 1 else part.start],
-                )
+                (write, each[part if count > 1 else part.start])
                 for write, part, count in zip(self._writes, self._parts, self._counts, strict=True)
             ]
         failed: DeviceError | None = None

@@ -450,10 +450,12 @@ class RunSetup:
             scale=scales[0],
             controller=options.controller,
         )
-        for button, purpose in ((options.clutch, "--clutch"), (options.dead_man, "--dead-man")):
+        for name in ("clutch", "dead_man", "mark"):
+            button = getattr(options, name)
             if button is not None and info.buttons is not None and button >= info.buttons:
                 raise DeviceError(
-                    f"{purpose} {button}: the device '{info.name}' has {info.buttons} buttons"
+                    f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
+                    f"has {info.buttons} buttons, numbered from 0"
                 )
         guard = replace(
             guard,

@@ -23,7 +23,7 @@ class TickFlag(IntFlag):
         FORCE_LIMITED: Force or torque was scaled down to its limit.
         RAMPING: The device gets less than the whole wrench, and the handle follows it in part.
         CONTROLLER_ACTIVE: The passivity controller injected damping.
-        CONTACT: MuJoCo found at least one contact in the scene.
+        CONTACT: At least one contact acted.
         CLUTCH: The device moves without the handle.
         STALE_SAMPLE: The device had no new sample since the previous tick.
         TRIP: The guard stopped the run in this tick and sent zero wrench. A tick that is not finite
@@ -108,9 +108,12 @@ To add a field:
 1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; its name in
    ``LATER_FIELDS``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
 2. in ``kernel.tick``: a line of ``_record`` that writes it, after the module that computes it has
-   put it into the tick's state (``kernel.state`` has the table of writers);
+   put it into the tick's state (``kernel.state`` has the table of writers). What the sample alone
+   gives is written by ``_record_sample``;
 3. in the audit: a second computation from other fields, in ``audit.energy`` or
-   ``audit.wrench_limits``. The re-simulation compares every field by itself, to the bit.
+   ``audit.wrench_limits``. The re-simulation compares every field by itself, to the bit. If all
+   hands must have equal values, its name in ``_SHARED`` of ``audit.verdict``;
+4. in ``guide/recording_format.md``: its line in the table.
 
 Ring, recording, export and comparison take the field from ``TICK_DTYPE``.
 """

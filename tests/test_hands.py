@@ -21,6 +21,7 @@ from hapticbridge.device import device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
+from hapticbridge.hands import DeviceGroup
 from hapticbridge.record import TickFlag, has_flag
 from hapticbridge.recording.format import MAX_HANDS
 
@@ -130,6 +131,27 @@ def test_scales_and_limits_are_each_hands_own() -> None:
     assert max(abs(sent[0]) for sent in still.sent) <= 1.0 + 1e-9
     # the bar rests under 1 N from the left, so the right holds 1 N, and its device half of it
     assert moving.sent[-3][0] == pytest.approx(-0.5, abs=0.01)
+
+
+def test_conditions_are_those_of_each_hands_own_device() -> None:
+    hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3")]
+    with hb.Bridge(two_handed(BAR), hands, clock=clocked()) as bridge:
+        conditions = bridge.conditions()
+    translations = [text for text in conditions if "translation" in text]
+    assert [text.partition(":")[0] for text in translations] == ["left", "right"]
+    assert "damping 2 >=" in translations[0]
+    assert "damping 3 >=" in translations[1]
+
+
+def test_a_device_with_a_grip_axis_gets_a_row_for_each_of_its_hands_at_zero_force_too() -> None:
+    one, gripper = Scripted("one", 0.0), Scripted("gripper", 0.0)
+    group = DeviceGroup([one, gripper], [1, 2])
+    zero, wrenches = np.zeros(6), np.arange(18.0).reshape(3, 6)
+    group.write(zero)
+    group.write(wrenches)
+    zero_sent, sent = zip(one.sent, gripper.sent, strict=True)
+    assert [each.shape for each in (*zero_sent, *sent)] == [(6,), (2, 6)] * 2
+    assert np.array_equal(sent[1], wrenches[1:])
 
 
 def test_a_device_without_news_is_flagged_alone(tmp_path: Path) -> None:

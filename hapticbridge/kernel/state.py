@@ -13,7 +13,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | pose        | poses of device, handle and tool, and their steps | handle                        |
 | loop        | results that a stage of a tick hands to the next  | tick                          |
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
-| guard       | thresholds, ramp, fade, limited wrench            | tick_guard                    |
+| guard       | thresholds, ramp, fade, buttons                   | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
 | watch       | late force, sign of the force, greatest share      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
