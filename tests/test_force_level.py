@@ -86,9 +86,7 @@ STRETCHING = 100
 def test_at_the_level_no_slack_hides_what_a_scene_creates(tmp_path: Path) -> None:
     # the tool runs away at 1 m/s whatever the coupling does: the scene creates 1 W at 1 N
     path = tmp_path / "run.mcap"
-    limits = hb.Limits(
-        force=1.0, torque=0.5, hold_force=100.0, energy=math.inf, stretch=math.inf
-    )
+    limits = hb.Limits(force=1.0, torque=0.5, hold_force=100.0, energy=math.inf, stretch=math.inf)
     with hb.Bridge(
         "point_mass",
         Yielding(),
