@@ -279,8 +279,8 @@ class Timekeeping:
             )
         else:
             found = (
-                f"late samples and forces may have given the hand {format_si(self.delay_energy, 'J')}, "
-                f"more than {format_si(INSTANT, 'J')}"
+                "late samples and forces may have given the hand "
+                f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
         return f"{NOT_KEPT}: {found}; try {self.remedy}"
 
