@@ -51,11 +51,15 @@ def test_a_limit_on_the_device_alone_is_seen_to_fail() -> None:
     assert worst > 0.05
 
 
+STRETCHING, DAMPING = 100, 2.0
+"""Ticks for which ``Yielding`` stretches the spring, and the damping of its device in N s/m."""
+
+
 class Yielding:
     """A hand that stretches the spring, then yields at the speed that gets most of a held force."""
 
     info = hb.DeviceInfo(
-        name="yielding", axes=("x",), force_limit=1.0, damping=2.0, delay=0.0, is_real=False
+        name="yielding", axes=("x",), force_limit=1.0, damping=DAMPING, delay=0.0, is_real=False
     )
 
     def start(self, period: float) -> NDArray[np.void]:
@@ -65,7 +69,7 @@ class Yielding:
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
-        yielding = self.force / (2.0 * self.info.damping) * self.period
+        yielding = self.force / (2.0 * DAMPING) * self.period
         self.position += 1e-4 if 0 < self.tick < STRETCHING else yielding
         self.tick += 1
         sample["position"][0] = self.position, 0.0, 0.0
@@ -77,10 +81,6 @@ class Yielding:
 
     def close(self) -> None:
         self.force = 0.0
-
-
-STRETCHING = 100
-"""Ticks for which ``Yielding`` stretches the spring."""
 
 
 def test_at_the_level_no_slack_hides_what_a_scene_creates(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_at_the_level_no_slack_hides_what_a_scene_creates(tmp_path: Path) -> Non
     recording = hb.read_recording(path)
     ticks = recording.ticks
     moved = np.diff(ticks["device_position"][:, 0])
-    work = ticks["wrench_on_device"][:-1, 0] * moved - Yielding.info.damping * moved**2 / 1e-3
+    work = ticks["wrench_on_device"][:-1, 0] * moved - DAMPING * moved**2 / 1e-3
     assert work.sum() > 0.05  # the hand got it
     created = ticks["environment_energy"][-1]
     # ½ (K + B'/T) ‖δx‖² would cover all of it
