@@ -27,7 +27,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
 from hapticbridge.timekeeping import RunTimes, Timekeeping
-from hapticbridge.units import format_energy, format_si, format_wrenches
+from hapticbridge.units import format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
 
@@ -70,7 +70,8 @@ class Ledger:
 
     E_k = S_k − S_{k−1} − (works of all ports in tick k). The environment has released no more
     energy than it received while Σ E_k <= 0, eq. (14) of Brown & Colgate (1997). The device stays
-    safe while Σ E_k stays below the slack, Σ ½ (K + B'/T) ‖δx_k‖² and its rotational counterpart.
+    safe while Σ E_k stays below the slack, Σ ½ (K + B'/T) ‖δx_k‖² and its rotational counterpart,
+    both over the ticks below the force level.
 
     Attributes:
         kinetic: Present kinetic energy.
@@ -297,7 +298,7 @@ class Summary:
 
     def _verdict_lines(self) -> Iterator[str]:
         tick, port = self.fault or (0, "")
-        used = f", {self.slack_share:.0%} of the slack used" if self.slack_share else ""
+        used = f", {format_share(self.slack_share)} of the slack used" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
         yield f"{judged}{self.verdict} ({port or self.environment}){since}{used}"

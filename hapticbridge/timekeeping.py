@@ -13,10 +13,11 @@ once. A run certifies its device only if it kept its time, which means two thing
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
    (``kernel.timing``, and again ``audit.timing``).
 
-It is safe, because a late sample gives nothing by itself: the handle slips until the springs hold
-less by what it may have put in (``kernel.law.charge_lateness``). The first part is therefore more
-than safety needs; it keeps a run at a fifth of its rate from being called certified for the whole
-rate. The second bounds what a delay gave, for any hand.
+It is safe, because the handle slips after a late sample until the springs hold less by what the
+sample may have put in (``kernel.law.charge_lateness``). The first part is therefore more than
+safety needs; it keeps a run at a fifth of its rate from being called certified for the whole rate.
+The second bounds what delays gave, for any hand: also by a force that was held for so long that the
+springs cannot pay for it.
 """
 
 from __future__ import annotations
@@ -278,8 +279,8 @@ class Timekeeping:
             )
         else:
             found = (
-                f"forces sent late may have given the hand {format_si(self.delay_energy, 'J')}, "
-                f"more than {format_si(INSTANT, 'J')}"
+                "late samples and forces may have given the hand "
+                f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
         return f"{NOT_KEPT}: {found}; try {self.remedy}"
 

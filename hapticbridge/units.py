@@ -55,6 +55,11 @@ def format_wrenches(
     return f"{texts[0]} on the hand; {texts[1]} on the tool"
 
 
+def format_share(share: float) -> str:
+    """Formats a share in percent; from ten times the whole on, only that it is more."""
+    return f"{share:.0%}" if share < 10.0 else "more than 1000%"
+
+
 def format_energy(joules: float) -> str:
     """Formats an energy; below 1 pJ is the rounding of the sums, which counts as 0."""
     return format_si(joules if abs(joules) >= ROUNDING else 0.0, "J")

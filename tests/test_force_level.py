@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from adversary import UNPAID, Attack
+from audit_cases import balance_of
 from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.errors import DeviceError
 from hapticbridge.kernel.codes import OK
+from hapticbridge.run_description import parameters_of
 
 ATTACKS = 300
 
@@ -46,6 +49,72 @@ def test_a_limit_on_the_device_alone_is_seen_to_fail() -> None:
         for seed, scene, ticks in ((52, "point_mass", 8000), (68, "peg_in_hole", 2000))
     )
     assert worst > 0.05
+
+
+STRETCHING, DAMPING = 100, 2.0
+"""Ticks for which ``Yielding`` stretches the spring, and the damping of its device in N s/m."""
+
+
+class Yielding:
+    """A hand that stretches the spring, then yields at the speed that gets most of a held force."""
+
+    info = hb.DeviceInfo(
+        name="yielding", axes=("x",), force_limit=1.0, damping=DAMPING, delay=0.0, is_real=False
+    )
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.period, self.tick, self.position, self.force = period, 0, 0.0, 0.0
+        sample = np.zeros(1, hb.SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        yielding = self.force / (2.0 * DAMPING) * self.period
+        self.position += 1e-4 if 0 < self.tick < STRETCHING else yielding
+        self.tick += 1
+        sample["position"][0] = self.position, 0.0, 0.0
+        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.force = float(wrench[0])
+
+    def close(self) -> None:
+        self.force = 0.0
+
+
+def test_at_the_level_no_slack_hides_what_a_scene_creates(tmp_path: Path) -> None:
+    # the tool runs away at 1 m/s whatever the coupling does: the scene creates 1 W at 1 N
+    path = tmp_path / "run.mcap"
+    limits = hb.Limits(force=1.0, torque=0.5, hold_force=100.0, energy=math.inf, stretch=math.inf)
+    with hb.Bridge(
+        "point_mass",
+        Yielding(),
+        method="implicit",
+        controller="off",
+        limits=limits,
+        clock=hb.SimulatedClock(),
+        recording=path,
+    ) as bridge:
+
+        def push(tick: int) -> None:
+            if tick >= STRETCHING:
+                bridge.scene.data.qvel[0] = -1.0
+
+        summary = bridge.run(1.0, on_tick=push)
+    recording = hb.read_recording(path)
+    ticks = recording.ticks
+    moved = np.diff(ticks["device_position"][:, 0])
+    work = ticks["wrench_on_device"][:-1, 0] * moved - DAMPING * moved**2 / 1e-3
+    assert work.sum() > 0.05  # the hand got it
+    created = ticks["environment_energy"][-1]
+    # ½ (K + B'/T) ‖δx‖² would cover all of it
+    whole = 0.5 * (2400.0 + 0.5 / 1e-3) * np.sum(np.diff(ticks["tool_position"][:, 0]) ** 2)
+    assert 0.5 < created < whole
+    assert (summary.environment, summary.verdict) == ("active", "active")
+    audited = balance_of(recording, parameters_of(recording.meta))[1]
+    assert audited.slack[-1] < 1e-3
+    assert audited.slack[-1] == pytest.approx(summary.energies["slack"], rel=1e-9)
 
 
 WRENCH = """

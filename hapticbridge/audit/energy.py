@@ -146,7 +146,7 @@ class EnergyBalance:
         device_energy: Cumulative energy given to the device by the recorded wrenches, (n,) in J.
         device_throughput: Cumulative sum of that energy's absolute values, (n,) in J.
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
-        slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖², (n,) in J.
+        slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖² below the force level, (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation, the energy
             released by scene and coupling, and the unfelt work (``unfelt_work``), (n,) in J. Zero
             for an unknown damping or several laws per tick. With a coupling law, energy created by
@@ -195,8 +195,10 @@ class EnergyBalance:
             # lent to the scene: what it took and the hand has not given
             created = created - np.maximum(-(ticks["scene_tank"] + discarded), 0.0)
         linear, angular = _slack_gains(parameters, gains)
-        slack = 0.5 * linear * np.sum(motion.tool_step**2, axis=1)
-        slack += 0.5 * angular * np.sum(motion.tool_turn**2, axis=1)
+        force, torque = limits_on_tool(parameters)
+        evaluations = parameters.law_evaluations
+        slack = _slack(linear, motion.tool_step, wrench[:, :3], force, evaluations)
+        slack += _slack(angular, motion.tool_turn, wrench[:, 3:], torque, evaluations)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
         totals["discarded"] = discarded
         totals |= _device_energies(block, events, delay)
@@ -337,6 +339,22 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
     linear = gains[:, 0] / n + gains[:, 1] / parameters.period
     angular = gains[:, 2] / n + gains[:, 3] / parameters.period
     return share * linear, share * angular
+
+
+def _slack(gain: Array, motion: Array, wrench: Array, level: float, evaluations: int) -> Array:
+    """Returns ½ g ‖δx‖², (n,) in J, and 0 where the law passes its level between u + g δx and u.
+
+    Args:
+        gain: g of each tick, (n,); with several evaluations per tick, half of that of one.
+        motion: δx of the tool, (n, 3) in m or rad.
+        wrench: Limited u on the tool, (n, 3) in N or N m.
+        level: Its level in N or N m.
+        evaluations: Evaluations of the law per tick.
+    """
+    square = np.sum(motion**2, axis=1)
+    change = gain * np.sqrt(square) * (1.0 if evaluations == 1 else 1.0 / SLACK_SHARE)
+    is_below = np.sqrt(np.sum(wrench**2, axis=1)) + change <= level
+    return np.asarray(np.where(is_below, 0.5 * gain * square, 0.0))
 
 
 def energy_balances(

@@ -122,6 +122,18 @@ class Motion:
         """Change of stretch and twist in each tick."""
         return self.handle_step - self.tool_step, self.handle_turn - self.tool_turn
 
+    def pulled(self, evaluations: int) -> tuple[Array, Array]:
+        """Returns stretch and twist between the handle before a slip and the tool before its step.
+
+        With several evaluations of the law per tick, after the first of the handle's steps.
+        """
+        share = 1.0 / evaluations
+        position = self.handle_before[:, :3] + share * self.handle_step
+        turn = quaternion_of(share * self.handle_turn)
+        orientation = quaternion_product(turn, self.handle_before[:, 3:])
+        tool = self.tool_before
+        return position - tool[:, :3], turn_between(tool[:, 3:], orientation)
+
 
 def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
     """Returns the coupling's wrench on the tool, (n, 6) in N and N m.

@@ -6,7 +6,9 @@ device and N = K T/2 + B', the energy of each kind of axis is
 
     A_k = max(0, A_{k−1} + 3 (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
 
-p is what the device's damping burned beyond N, less what it paid for late samples.
+p is what the device's damping burned beyond N, less what it paid for late samples. To it comes what
+late samples cost and the springs could not pay, C_k = max(0, C_{k−1} + c_k − V_k), up to what the
+wrenches gave the hand beyond what b burned; V is the energy of the springs after the sample.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.motion import Array
-from hapticbridge.audit.wrench_limits import AuditedBlock
+from hapticbridge.audit.motion import Array, turn_between
+from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag, has_flag
 
@@ -50,6 +52,8 @@ class TimingTally:
         lent: Energies in J that late samples cost and b has not burned yet, by kind of axis.
         uncovered: Energies A in J by kind of axis.
         last_square: Squared motions of the last tick, by kind of axis.
+        owed: Energies C in J by kind of axis.
+        burned: Energy in J that the device's damping has burned at least.
     """
 
     parameters: RunParameters
@@ -67,6 +71,8 @@ class TimingTally:
     lent: Array = field(default_factory=_no_energy)
     uncovered: Array = field(default_factory=_no_energy)
     last_square: Array = field(default_factory=_no_energy)
+    owed: Array = field(default_factory=_no_energy)
+    burned: float = 0.0
 
     def add(self, block: AuditedBlock, events: RunEvents) -> None:
         """Adds consecutive records, at least one."""
@@ -89,7 +95,9 @@ class TimingTally:
         elapsed = np.maximum(1e-9 * np.diff(rows["read_ns"]), parameters.period)
         scale, force_scale = parameters.scale, parameters.force_scale
         linear, angular = parameters.device_damping, parameters.device_rotational_damping
-        motion, total = block.motion, np.zeros(len(ticks))
+        motion, total, owed = block.motion, np.zeros(len(ticks)), np.zeros(len(ticks))
+        levels = limits_on_tool(parameters)
+        pulled = motion.pulled(parameters.law_evaluations)
         for kind, steps, b in (
             (0, motion.handle_step, (linear or 0.0) / (force_scale * scale)),
             (1, motion.handle_turn, (angular or 0.0) * scale / force_scale),
@@ -106,10 +114,25 @@ class TimingTally:
             cost = np.where(block.is_first, 0.0, cost)
             energy = _drained(cost + np.minimum(lent[:-1] + late, 0.0), self.uncovered[kind])
             total += energy
+            length = np.linalg.norm(pulled[kind], axis=1)
+            paid = spring_energy(gains[:, 0], length, levels[kind])
+            debt = _drained(np.where(gains[:, 0] > 0, late - paid, 0.0), self.owed[kind])
+            owed += debt
             self.lent[kind], self.uncovered[kind] = lent[-1], energy[-1]
-            self.last_square[kind] = square[-1]
-        most = force_scale / scale * float(np.max(total))
-        self.most_uncovered = max(self.most_uncovered, most)
+            self.last_square[kind], self.owed[kind] = square[-1], debt[-1]
+        ratio = force_scale / scale
+        held = np.minimum(ratio * owed, np.maximum(ticks["device_energy"] - self._burn(block), 0.0))
+        self.most_uncovered = max(self.most_uncovered, float(np.max(ratio * total + held)))
+
+    def _burn(self, block: AuditedBlock) -> Array:
+        """Returns the energy that the device's damping has burned at least by each tick, (n,)."""
+        rows, guarding = np.concatenate([block.state.row, block.ticks]), self.parameters.guarding
+        turned = turn_between(rows["device_quaternion"][:-1], rows["device_quaternion"][1:])
+        power = guarding.assumed_damping * np.sum(np.diff(rows["device_position"], axis=0) ** 2, 1)
+        power += guarding.assumed_rotational_damping * np.sum(turned**2, axis=1)
+        burned = self.burned + np.cumsum(np.where(block.is_first, 0.0, power / block.interval))
+        self.burned = float(burned[-1])
+        return np.asarray(burned)
 
     def _add_results(self, ticks: NDArray[np.void]) -> None:
         is_new = np.diff(ticks["scene_step"], prepend=self.scene_steps) > 0

@@ -198,11 +198,9 @@ def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Devia
     gains, before = events.gains(ticks["tick"]), events.gains(ticks["tick"] - 1)
     tool = motion.tool_before
     # with n laws per tick the spring is compared after the first of the handle's n steps
-    share = 1.0 / parameters.law_evaluations
-    pulled = position - (1.0 - share) * moved - tool[:, :3]
+    pulled, pulled_turn = motion.pulled(parameters.law_evaluations)
     slipped = pulled + ticks["handle_position"] - position
-    back = quaternion_of(-(1.0 - share) * turned)
-    pulled_turn = turn_between(tool[:, 3:], quaternion_product(back, orientation))
+    back = quaternion_of((1.0 / parameters.law_evaluations - 1.0) * turned)
     slipped_turn = turn_between(tool[:, 3:], quaternion_product(back, ticks["handle_quaternion"]))
     for column, limit, name, amount, lengths, unit in (
         (0, 0, "handle_position", off, (pulled, slipped), "m"),

@@ -12,7 +12,7 @@ The accounts of energy, all in J; q = force_scale / scale:
 | account                       | formula                                | used by         |
 |-------------------------------|----------------------------------------|-----------------|
 | ``environment_energy``        | Σ E_k                                  | verdict         |
-| ``slack``                     | Σ ½ g ‖δx‖² + ½ g_r ‖δφ‖²              | verdict         |
+| ``slack``                     | Σ ½ g ‖δx‖² + ½ g_r ‖δφ‖² below level  | verdict         |
 | ``device_energy``             | Σ w·δp, given to the device            | summary         |
 | device without a law          | Σ w·δp − b ‖δp‖²/t + q (S − S_0 − W)   | verdict         |
 | observer, ``observed_energy`` | as above less W_u, with credit capped  | ``damper``      |
@@ -528,7 +528,7 @@ def close_balance(s: State) -> bool:
         slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
 
     g in N/m and g_r in N m/rad are those of ``law.slack_gains``: K + B'/T and K_r + B'_r/T with
-    one evaluation of the law per tick.
+    one evaluation of the law per tick. A tick at the force level has no slack (``_slack``).
 
     Returns:
         True if the balance is finite.
@@ -540,10 +540,30 @@ def close_balance(s: State) -> bool:
 @compiled
 def add_slack(s: State) -> None:
     """Adds the slack of the tick, of one coupling."""
-    energy = s.energy
-    moved, turned = vector_of(s.loop.motion), vector_of(s.loop.motion[3:6])
-    energy.slack += 0.5 * s.coupling.slack_stiffness * dot(moved, moved)
-    energy.slack += 0.5 * s.coupling.slack_rotational_stiffness * dot(turned, turned)
+    loop, k = s.loop, s.coupling
+    s.energy.slack += _slack(s, 0, k.slack_stiffness, loop.motion, loop.wrench_on_tool)
+    s.energy.slack += _slack(
+        s, 1, k.slack_rotational_stiffness, loop.motion[3:6], loop.wrench_on_tool[3:6]
+    )
+
+
+@compiled
+def _slack(
+    s: State, kind: int, gain: float, motion: NDArray[np.float64], wrench: NDArray[np.float64]
+) -> float:
+    """Returns the slack in J of translation (0) or rotation (1), 0 at the force level.
+
+    The tool's step takes the law from u + g δx to u. Between them the potential is quadratic, and
+    ½ g ‖δx‖² is left over, only if both are below the level. Where it is linear nothing is left.
+    """
+    moved, u = vector_of(motion), vector_of(wrench)
+    square = dot(moved, moved)
+    change = gain * math.sqrt(square)
+    if s.run.law_evaluations > 1:  # ``gain`` is half of that of one evaluation
+        change *= 2.0
+    if math.sqrt(dot(u, u)) + change > s.level.level[kind]:
+        return 0.0
+    return float(0.5 * gain * square)
 
 
 @compiled

@@ -108,7 +108,7 @@ from hapticbridge.kernel.tick_guard import (
     refusal,
     send_within,
 )
-from hapticbridge.kernel.timing import meter_delay, note_delay, skip_delay
+from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
 from hapticbridge.pose import (
     Quaternion,
     Vector,
@@ -213,7 +213,8 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
     move_handle(pose, handle, orientation)
     advance_share(s, position, buttons, elapsed)
     max_stretch = max_twist = np.inf
-    if s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick:
+    is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
+    if is_timed:
         charge_lateness(s, interval)
         meter_delay(s, max(elapsed, s.run.period), interval)
     else:
@@ -224,6 +225,8 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
         max_stretch, max_twist = retune(s)
         s.loop.has_positions = 0  # it was computed with the old gains
     has_slipped = slip(s, max_stretch, max_twist)
+    if is_timed:
+        meter_debt(s)
     if has_slipped and s.run.scheme == Scheme.MIDPOINT:
         note_slip(s)
     if has_slipped or (share < 1.0 and (moved != _AT_REST or turned != _AT_REST)):

@@ -22,7 +22,9 @@ upper bound, found by comparison with the largest value of a quadratic form at a
 Its last term is what b burns at least, if η is not the even share β d. It must never be positive.
 
 The first term of b_k beyond N is paid by ``law.charge_lateness``: after a late sample the handle
-slips. The second is not, so it is summed here, for translation and rotation each, as
+slips. What the springs cannot pay at once stays owed; the hand may have it, up to what the wrenches
+gave it beyond what b burned. The second term is not paid, so it is summed here, for translation and
+rotation each, as
 
     A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
 
@@ -48,7 +50,7 @@ TIMING_DTYPE = np.dtype(
         ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
         ("uncovered", "<f8", 2),  # A
         ("last_square", "<f8", 2),  # d² of the last tick in m² and rad²
-        ("most_uncovered", "<f8"),  # largest sum of A so far, in J at the hand
+        ("most_uncovered", "<f8"),  # largest sum of A and of what is owed so far, in J at the hand
     ]
 )
 """Sub-record ``timing``, written by this module alone."""
@@ -76,7 +78,7 @@ def meter_delay(s: State, elapsed: float, interval: float) -> None:
         elapsed: Time since the last sample in s, at least T.
         interval: Time since the last sample that was new, in s.
     """
-    t, total = s.timing, 0.0
+    t = s.timing
     for kind in range(2):
         stiffness, needed, lacking, square = lateness(s, kind, interval)
         late = lacking * square
@@ -89,8 +91,14 @@ def meter_delay(s: State, elapsed: float, interval: float) -> None:
         cost *= max(square, t.last_square[kind])
         t.uncovered[kind] = max(t.uncovered[kind] + cost + paying, 0.0)
         t.last_square[kind] = square
-        total += t.uncovered[kind]
-    t.most_uncovered = max(t.most_uncovered, s.run.force_scale / s.run.scale * total)
+
+
+@compiled
+def meter_debt(s: State) -> None:
+    """Notes the most that delays may have given, once the springs have paid for a late sample."""
+    t, owed, ratio = s.timing, s.coupling.owed, s.run.force_scale / s.run.scale
+    held = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
+    t.most_uncovered = max(t.most_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + held)
 
 
 @compiled

@@ -16,7 +16,7 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.units import format_si, format_wrenches
+from hapticbridge.units import format_share, format_si, format_wrenches
 
 Facts = list[tuple[str, str]]
 
@@ -179,7 +179,7 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     if kept is not None and kept.remark:
         facts.append(("time kept", kept.remark))
     if report.slack_share:
-        facts.append(("slack used", f"{report.slack_share:.0%}"))
+        facts.append(("slack used", format_share(report.slack_share)))
     return [*facts, ("simulated again", report.resimulation or "not reached")]
 
 

@@ -228,7 +228,7 @@ def z_width(
     lines = [_passive_line(loop, damping, passive_damping)]
     if allowed is not None:
         stiffness = np.maximum(0.0, 2 * (allowed - damping) / loop.period)
-        because = "f_c >= K Δ/2 + B' Δ/T"
+        because = "f_c >= K Δ/2 + B_law Δ/T"
         lines.append(LimitLine(NO_LIMIT_CYCLES, because, stiffness, allowed, is_kept))
     if mass is not None:
         heft = scalar("mass", mass, "kg", positive=True)
@@ -257,7 +257,7 @@ def z_width(
 
 
 def _passive_line(loop: PassiveLine, damping: _Array, largest: float) -> LimitLine:
-    reason = "b > K T/2 + B' T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B'"
+    reason = "b > K T/2 + B_law T/(T + 2τ)" if loop.filter_time else "b > K T/2 + B_law"
     name = ANY_HAND
     if loop.delay:
         name, reason = WALL, "at the worst frequency"

@@ -26,7 +26,7 @@ from hapticbridge.report.evidence import (
 )
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
-from hapticbridge.units import format_si
+from hapticbridge.units import format_share, format_si
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def rows(found: WhatIf) -> Iterator[Row]:
         joules = [run.report.energies.get(name, 0.0) for run in runs]
         if any(joules):
             yield name.replace("_", " "), tuple(format_si(e, "J") for e in joules)
-    yield "slack used", tuple(f"{run.report.slack_share:.0%}" for run in runs)
+    yield "slack used", tuple(format_share(run.report.slack_share) for run in runs)
     yield "device bears it", tuple(map(_certified, runs))
     yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
 
