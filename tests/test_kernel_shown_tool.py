@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,16 +53,18 @@ def rms(values: NDArray[np.float64]) -> float:
 class Loop:
     """The ticks of a loop in front of a slower scene, or of one that steps in every tick (0)."""
 
-    def __init__(self, scene: str, ticks: int, law: Coupling = LAW, **values: Any) -> None:
+    def __init__(
+        self, scene: str | Path, ticks: int, law: Coupling = LAW, substeps: int = 1, **values: Any
+    ) -> None:
         self.ticks, self.scene = ticks, load_scene(scene, **values)
-        method = method_named("lossless").with_contact(None)
-        prepare(self.scene, law, max(ticks, 1) * T, 1, method, warns=False)
-        self.scene.set_gains(*method.gains(law, max(ticks, 1) * T))
+        method = method_named("lossless" if substeps == 1 else "implicit").with_contact(None)
+        prepare(self.scene, law, max(ticks, 1) * T, substeps, method, warns=False)
+        self.scene.set_gains(*method.gains(law, max(ticks, 1) * T / substeps))
         self.scene.reset()
         parameters = RunParameters(
             grip=self.scene.grip,
             period=T,
-            substeps=1,
+            substeps=substeps,
             coupling=law,
             force_limit=10.0,
             torque_limit=0.5,
@@ -142,6 +145,45 @@ def test_a_tap_on_a_wall_is_felt_at_once() -> None:
         errors.append(rms(force - exact))
     assert np.abs(exact).max() > 2.0
     assert errors[0] < 0.5 * errors[1]
+
+
+def tap(speed: float, to: float) -> NDArray[np.float64]:
+    """A motion from 10 cm before the start to beyond it, along x in m, at a speed in m/s."""
+    back = -0.1 * np.minimum(np.arange(600) / 400.0, 1.0)
+    forth = np.minimum(-0.1 + speed * T * np.arange(900), to)
+    motion = np.zeros((1500, 3))
+    motion[:, 0] = np.concatenate([back, forth])
+    return motion
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+@pytest.mark.parametrize(("ticks", "substeps"), [(10, 1), (10, 4), (20, 1), (50, 1)])
+def test_a_wall_stops_a_fast_tool_between_the_steps_of_a_slow_scene(
+    speed: float, ticks: int, substeps: int
+) -> None:
+    """The wall of ``virtual_wall`` is 1 cm away; the tool has 50 g."""
+    law = Coupling(0.8 * 0.05 / (ticks * T) ** 2, 0.5, 0.8, 5e-4)
+    rows = Loop("virtual_wall", ticks, law, substeps).run(tap(speed, 0.015))
+    assert rows["tool_position"][:, 0].max() < 0.01005
+    assert rows["wrench_on_tool"][-1, 0] == pytest.approx(0.005 * law.stiffness, rel=0.01)
+
+
+def test_the_nearest_of_many_surfaces_stop_the_tool(tmp_path: Path) -> None:
+    """The wall, the last geom, is behind 18 of which each is seen, but passed by."""
+    beside = "".join(
+        f'<geom size="0.002" pos="0 {y:.3f} {z:.3f}"/>'
+        for y in (-0.02, 0.02)
+        for z in np.linspace(-0.016, 0.016, 9)
+    )
+    scene = tmp_path / "passage.xml"
+    scene.write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body name="tool"><freejoint/>'
+        '<geom size="0.01" mass="0.05"/><site name="grip"/></body>'
+        f'{beside}<geom type="box" size="0.01 0.1 0.1" pos="0.03 0 0"/></worldbody></mujoco>'
+    )
+    law = Coupling(100.0, 0.5, 0.8, 5e-4)
+    rows = Loop(scene, 20, law).run(tap(0.2, 0.015))
+    assert rows["tool_position"][:, 0].max() < 0.01005
 
 
 def energy_given(rows: NDArray[np.void]) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
-from hapticbridge.kernel.handle import note_tool
+from hapticbridge.kernel.handle import grip_pose, note_tool
 from hapticbridge.kernel.law import law_wrench, spring_energy, spring_length, within
 from hapticbridge.kernel.ledger import take_scene_energies
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
@@ -84,6 +84,7 @@ FASTEST, FASTEST_TURN = 1.0, 10.0
 SHOWN_DTYPE = np.dtype(
     [
         ("is_shown", "<i8"),
+        ("is_beside", "<i8"),
         ("has_failed", "<i8"),
         ("waits", "<i8"),
         ("scene_step", "<i8"),
@@ -94,6 +95,7 @@ SHOWN_DTYPE = np.dtype(
         ("contacts", "<i8"),
         ("planes", "<i8"),
         ("scene_period", "<f8"),
+        ("timestep", "<f8"),
         ("lead", "<f8"),
         ("tank", "<f8"),
         ("passing", "<f8"),
@@ -109,14 +111,15 @@ SHOWN_DTYPE = np.dtype(
         ("speeds", "<f8", PLANES),
     ]
 )
-"""Sub-record ``shown``, written by this module alone. ``waits`` is 1 while the scene has a handle,
+"""Sub-record ``shown``, written by this module alone. ``is_beside`` is 1 in the
+scene's own loop, which writes ``before`` alone. ``waits`` is 1 while the scene has a handle,
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
 newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
 ``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are
-the tool's poses before and after the newest step; a plane has a normal away from the surface, the
-arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed against
-its normal in m/s."""
+the tool's poses before and after MuJoCo's newest step; a plane has a normal away from the surface,
+the arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed
+against its normal in m/s."""
 
 
 def bind_shown(shown: Part, parameters: RunParameters) -> None:
@@ -125,11 +128,13 @@ def bind_shown(shown: Part, parameters: RunParameters) -> None:
     The energy ``passing`` while a result is under way is 2 (F v + F_r ω) T_s, at v = 1 m/s and
     ω = 10 rad/s.
     """
+    shown["is_beside"] = parameters.is_beside
     if not parameters.scene_ticks:
         return
     of_scene = parameters.of_scene
     power = of_scene.force_limit * FASTEST + of_scene.torque_limit * FASTEST_TURN
     shown["is_shown"], shown["scene_period"] = 1, of_scene.period
+    shown["timestep"] = of_scene.period / of_scene.substeps
     shown["passing"] = 2.0 * power * of_scene.period
 
 
@@ -214,7 +219,7 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
         shown.acceleration[i] = rate * (velocity - shown.velocity[i]) if is_free else 0.0
         shown.velocity[i] = velocity
     for i in range(7):
-        shown.before[i] = shown.newest[i]
+        shown.before[i] = scene.shown.before[i]
     store_vector(shown.newest[0:3], vector_of(scene.pose.tool_position))
     store_quaternion(shown.newest[3:7], quaternion_of(scene.pose.tool_quaternion))
     shown.contacts = scene.loop.active_contacts
@@ -228,9 +233,20 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
 
 
 @compiled
+def note_contacts(s: State) -> None:
+    """Notes the tool's pose at the start of MuJoCo's newest step, at which contacts were found.
+
+    Must run in the scene's own loop before the kinematics are refreshed.
+    """
+    position, orientation = grip_pose(s.mj)
+    store_vector(s.shown.before[0:3], position)
+    store_quaternion(s.shown.before[3:7], orientation)
+
+
+@compiled
 def _take_planes(s: State, scene: State) -> None:
-    """Notes the surfaces near the tool, from the contacts of the step's start."""
-    mj, shown = scene.mj, s.shown
+    """Notes the nearest surfaces to the tool, from the contacts of the step's start."""
+    mj, shown, timestep = scene.mj, s.shown, scene.run.timestep
     is_tool = ints(mj.geom_is_tool, mj.ngeom)
     grip = vector_of(shown.before)
     moved = subtract(vector_of(shown.newest), grip)
@@ -239,7 +255,7 @@ def _take_planes(s: State, scene: State) -> None:
     for c in range(ints(mj.ncon, 1)[0]):
         contact = pointer_at(mj.contact) + c * mj.contact_size
         geoms = ints(contact + mj.contact_geoms, 2)
-        if count == PLANES or geoms[0] < 0 or geoms[1] < 0:
+        if geoms[0] < 0 or geoms[1] < 0:
             continue
         side = is_tool[geoms[1]] - is_tool[geoms[0]]
         if side == 0:
@@ -248,12 +264,18 @@ def _take_planes(s: State, scene: State) -> None:
         normal = scaled(float(side), vector_of(floats(contact + mj.contact_frame, 3)))
         arm = subtract(vector_of(floats(contact + mj.contact_point, 3)), grip)
         gap = max(floats(contact + mj.contact_distance, 1)[0], 0.0)
+        place = count
+        if count < PLANES:
+            count += 1
+        else:
+            place = int(np.argmax(shown.gaps))
+            if shown.gaps[place] <= gap:
+                continue
         pushed = max(-gap - dot(normal, add(moved, cross(turn, arm))), 0.0)
-        store_vector(shown.normals[3 * count : 3 * count + 3], normal)
-        store_vector(shown.arms[3 * count : 3 * count + 3], arm)
-        shown.gaps[count] = gap
-        shown.speeds[count] = pushed / shown.scene_period
-        count += 1
+        store_vector(shown.normals[3 * place : 3 * place + 3], normal)
+        store_vector(shown.arms[3 * place : 3 * place + 3], arm)
+        shown.gaps[place] = gap
+        shown.speeds[place] = pushed / timestep
     shown.planes = count
 
 
@@ -271,7 +293,7 @@ def _foreseen(s: State) -> tuple[Vector, Quaternion]:
     orientation = product(quaternion_exp(turn), quaternion_of(shown.newest[3:7]))
     position = add(vector_of(shown.newest), step)
     if shown.planes > 0:
-        position = _outside(shown, position, orientation, q + shown.scene_period)
+        position = _outside(shown, position, orientation, q + shown.timestep)
     return position, canonical(orientation)
 
 
