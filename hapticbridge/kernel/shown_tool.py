@@ -75,8 +75,9 @@ LONGEST = 3.0
 """Time beyond the handle of the newest result, in scene periods, for which the tool's motion is
 foreseen. If the next result is later than that, the tool stays where it is shown."""
 
-HALVINGS = 24
-"""Halvings in the search for the largest motion that the tank pays for; 1e-7 of the motion."""
+TRIALS, NEAR = 8, 1.0 - 1e-6
+"""Largest number of motions that are tried for the largest one that the tank pays for, and share of
+the root of a parabola that is tried. Two or three are enough unless the force is at its level."""
 
 FASTEST, FASTEST_TURN = 1.0, 10.0
 """Speeds in m/s and rad/s up to which the tool passes on the coupling's whole wrench in time."""
@@ -357,6 +358,39 @@ def _given(s: State, before: float, share: float, step: Vector, turn: Vector) ->
 
 
 @compiled
+def _paid_share(
+    s: State, before: float, motion: tuple[Vector, Vector], ends: tuple[float, float]
+) -> tuple[float, float]:
+    """Returns a share of a motion that the tank pays for, and its P in J.
+
+    Below the force level P is a parabola of the share, a r − c r², so P/r is a line. Where the
+    line's root cannot be, smaller shares are tried. ``ends`` has P of the whole motion and the
+    least P.
+    """
+    step, turn = motion
+    last_given, least = ends
+    share, work, high, last, trial = 0.0, 0.0, 1.0, 1.0, 0.5
+    for _ in range(TRIALS):
+        given = _given(s, before, trial, step, turn)
+        if given < least:
+            high = trial
+        else:
+            share, work = trial, given
+        curve = (given / trial - last_given / last) / (last - trial)
+        slope = given / trial + curve * trial
+        last, last_given, trial = trial, given, 0.5 * (share + high)
+        if share == 0.0:
+            trial = high / 16.0
+        if curve > 0.0:
+            root = NEAR * (slope + np.sqrt(slope * slope - 4.0 * curve * least)) / (2.0 * curve)
+            if share > 0.0 and abs(root - share) <= (1.0 - NEAR) * share:
+                break
+            if share < root < high:
+                trial = root
+    return share, work
+
+
+@compiled
 def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     """Shows the tool in the present tick.
 
@@ -373,14 +407,7 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     work = _given(s, before, share, step, turn)
     if work < least:
         shown.held_back += 1
-        high, share, work = 1.0, 0.0, 0.0
-        for _ in range(HALVINGS):
-            middle = 0.5 * (share + high)
-            given = _given(s, before, middle, step, turn)
-            if given < least:
-                high = middle
-            else:
-                share, work = middle, given
+        share, work = _paid_share(s, before, (step, turn), (work, least))
     shown.work = work
     shown.tank += work
     if shown.age > 0:
