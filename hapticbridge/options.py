@@ -311,6 +311,27 @@ def steady_stiffness(
     return STEADY / (period * period * (1.0 / tool + scale * force_scale / hand))
 
 
+STEADY_TURN = 0.4
+"""Largest K_r T_s²/I_hand of the usual coupling to a slower scene, without unit. The tool's inertia
+does not count. Above 0.8 that lets a tool in a lightly damped hand shake, passively."""
+
+
+def steady_rotational_stiffness(
+    info: DeviceInfo, period: float, scale: float, force_scale: float
+) -> float:
+    """Returns the largest rotational stiffness in N m/rad that a slower scene shows steadily.
+
+        K_r = STEADY_TURN I_hand / (T_s² s_f/s)
+
+    I_hand is the rotational inertia of hand and device in kg m²; the rest as in
+    ``steady_stiffness``. It is infinite if the device turns nothing.
+    """
+    if not set(AXES[3:]) & set(info.axes):
+        return math.inf
+    hand = DEFAULT_HAND.rotational_inertia + (info.rotational_inertia or 0.0)
+    return STEADY_TURN * hand * scale / (period * period * force_scale)
+
+
 PRESCRIBED_MOTION = DeviceInfo(
     name="prescribed motion", axes=AXES, force_limit=0.0, is_prescribed=True, is_real=False
 )
@@ -436,8 +457,9 @@ class RunSetup:
                 law = method.law_coupling(requested, period)
                 most = steady_stiffness(scene, info, ticks * period, *scales)
                 share = min(most / law.stiffness, 1.0)
-                springs = ("stiffness", "rotational_stiffness")
-                law = replace(law, **{name: share * getattr(law, name) for name in springs})
+                most_turned = steady_rotational_stiffness(info, ticks * period, *scales)
+                turned = min(share * law.rotational_stiffness, most_turned)
+                law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)
                 requested = method.requested_coupling(law, timestep)
             requested = replace(requested, **(coupling or {}))
         law = method.law_coupling(requested, timestep)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,13 @@ from kernel_runs import IDENTITY, T
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import AXES, DEFAULT_HAND, DeviceInfo
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, take_result, whole_tick
+from hapticbridge.options import steady_rotational_stiffness
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.rendering import method_named, prepare
 from hapticbridge.scene import load_scene
@@ -52,16 +55,18 @@ def rms(values: NDArray[np.float64]) -> float:
 class Loop:
     """The ticks of a loop in front of a slower scene, or of one that steps in every tick (0)."""
 
-    def __init__(self, scene: str, ticks: int, law: Coupling = LAW, **values: Any) -> None:
+    def __init__(
+        self, scene: str | Path, ticks: int, law: Coupling = LAW, substeps: int = 1, **values: Any
+    ) -> None:
         self.ticks, self.scene = ticks, load_scene(scene, **values)
-        method = method_named("lossless").with_contact(None)
-        prepare(self.scene, law, max(ticks, 1) * T, 1, method, warns=False)
-        self.scene.set_gains(*method.gains(law, max(ticks, 1) * T))
+        method = method_named("lossless" if substeps == 1 else "implicit").with_contact(None)
+        prepare(self.scene, law, max(ticks, 1) * T, substeps, method, warns=False)
+        self.scene.set_gains(*method.gains(law, max(ticks, 1) * T / substeps))
         self.scene.reset()
         parameters = RunParameters(
             grip=self.scene.grip,
             period=T,
-            substeps=1,
+            substeps=substeps,
             coupling=law,
             force_limit=10.0,
             torque_limit=0.5,
@@ -77,26 +82,31 @@ class Loop:
         self.fast = self.slow = BoundKernel(model, data, parameters)
         if ticks:
             self.slow = BoundKernel(model, data, parameters.of_scene, self.fast)
-        self.given = np.zeros(1, SAMPLE_DTYPE)
+        self.given, self.count = np.zeros(1, SAMPLE_DTYPE), 0
+
+    def tick(self, sample: NDArray[np.void]) -> NDArray[np.void]:
+        """Runs a tick with a device sample; returns its record, as a view."""
+        state, row = self.fast.state, self.fast.row
+        if not self.ticks:
+            assert whole_tick(state, sample, row, T)
+            return row
+        assert before_step(state, sample, row, 0, T) == OK
+        if self.count % self.ticks == 0:
+            if self.count:
+                period = self.ticks * T
+                assert whole_tick(self.slow.state, self.given, self.slow.row, period)
+            take_result(state, self.slow.state, self.given)
+        assert after_step(state, row, 0) == OK
+        self.count += 1
+        return row
 
     def run(self, motion: NDArray[np.float64]) -> NDArray[np.void]:
         """Returns the records of a motion of the handle from the start, (n, 3) in m."""
         rows, sample = np.zeros(len(motion), TICK_DTYPE), np.zeros(1, SAMPLE_DTYPE)
         sample["quaternion"][0, 0] = 1.0
-        state, row = self.fast.state, self.fast.row
         for k, position in enumerate(motion):
             sample["position"] = position
-            if not self.ticks:
-                assert whole_tick(state, sample, row, T)
-            else:
-                assert before_step(state, sample, row, 0, T) == OK
-                if k % self.ticks == 0:
-                    if k:
-                        period = self.ticks * T
-                        assert whole_tick(self.slow.state, self.given, self.slow.row, period)
-                    take_result(state, self.slow.state, self.given)
-                assert after_step(state, row, 0) == OK
-            rows[k] = row[0]
+            rows[k] = self.tick(sample)[0]
         return rows
 
 
@@ -142,6 +152,75 @@ def test_a_tap_on_a_wall_is_felt_at_once() -> None:
         errors.append(rms(force - exact))
     assert np.abs(exact).max() > 2.0
     assert errors[0] < 0.5 * errors[1]
+
+
+def tap(speed: float, to: float) -> NDArray[np.float64]:
+    """A motion from 10 cm before the start to beyond it, along x in m, at a speed in m/s."""
+    back = -0.1 * np.minimum(np.arange(600) / 400.0, 1.0)
+    forth = np.minimum(-0.1 + speed * T * np.arange(900), to)
+    motion = np.zeros((1500, 3))
+    motion[:, 0] = np.concatenate([back, forth])
+    return motion
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+@pytest.mark.parametrize(("ticks", "substeps"), [(10, 1), (10, 4), (20, 1), (50, 1)])
+def test_a_wall_stops_a_fast_tool_between_the_steps_of_a_slow_scene(
+    speed: float, ticks: int, substeps: int
+) -> None:
+    """The wall of ``virtual_wall`` is 1 cm away; the tool has 50 g."""
+    law = Coupling(0.8 * 0.05 / (ticks * T) ** 2, 0.5, 0.8, 5e-4)
+    rows = Loop("virtual_wall", ticks, law, substeps).run(tap(speed, 0.015))
+    assert rows["tool_position"][:, 0].max() < 0.01005
+    assert rows["wrench_on_tool"][-1, 0] == pytest.approx(0.005 * law.stiffness, rel=0.01)
+
+
+def test_the_nearest_of_many_surfaces_stop_the_tool(tmp_path: Path) -> None:
+    """The wall, the last geom, is behind 18 of which each is seen, but passed by."""
+    beside = "".join(
+        f'<geom size="0.002" pos="0 {y:.3f} {z:.3f}"/>'
+        for y in (-0.02, 0.02)
+        for z in np.linspace(-0.016, 0.016, 9)
+    )
+    scene = tmp_path / "passage.xml"
+    scene.write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body name="tool"><freejoint/>'
+        '<geom size="0.01" mass="0.05"/><site name="grip"/></body>'
+        f'{beside}<geom type="box" size="0.01 0.1 0.1" pos="0.03 0 0"/></worldbody></mujoco>'
+    )
+    law = Coupling(100.0, 0.5, 0.8, 5e-4)
+    rows = Loop(scene, 20, law).run(tap(0.2, 0.015))
+    assert rows["tool_position"][:, 0].max() < 0.01005
+
+
+def shake(ticks: int, rotational_stiffness: float) -> float:
+    """Range in N m of the torque on a turned hand, long after it was let go at 0.05 rad.
+
+    It is the usual hand on the usual device, 1.1e-3 kg m², on an axis of its own.
+    """
+    law = Coupling(50.0, 0.5, rotational_stiffness, 5e-4)
+    loop, sample = Loop("point_mass", ticks, law), np.zeros(1, SAMPLE_DTYPE)
+    hand, angle, speed, torques = DEFAULT_HAND, 0.05, 0.0, [0.0]
+    inertia, damping = hand.rotational_inertia + 1e-4, hand.rotational_damping + 2e-3
+    for _ in range(1500):
+        resistance = inertia + T * damping + T * T * hand.rotational_stiffness
+        push = torques[-1] - hand.rotational_stiffness * angle
+        speed = (inertia * speed + T * push) / resistance
+        angle += T * speed
+        sample["quaternion"] = np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)
+        torques.append(-float(loop.tick(sample)["wrench_on_tool"][0, 5]))
+    return float(np.ptp(torques[-200:]))
+
+
+@pytest.mark.parametrize("ticks", [10, 20])
+def test_a_turned_tool_is_steady_up_to_twice_the_usual_stiffness(ticks: int) -> None:
+    info = DeviceInfo(
+        name="usual", axes=AXES, force_limit=10.0, torque_limit=0.5, rotational_inertia=1e-4
+    )
+    most = steady_rotational_stiffness(info, ticks * T, 1.0, 1.0)
+    assert most == pytest.approx(0.4 * 1.1e-3 / (ticks * T) ** 2)
+    assert shake(ticks, 2.0 * most) < 2e-4
+    assert shake(ticks, 4.0 * most) > 5e-4
 
 
 def energy_given(rows: NDArray[np.void]) -> NDArray[np.float64]:

@@ -506,10 +506,21 @@ def test_the_command_line_names_the_rate(call: Called, tmp_path: Path) -> None:
     assert code == 0
     assert "the scene steps at 100 Hz beside the loop" in err
     assert "the tool may shake above about" in err
+    assert "N m/rad" not in err.split("shake above", 1)[1]
     assert "the scene at 100 Hz and 100 % of its speed" in " ".join(out.split())
     code, out, _ = call("audit", path)
     assert code == 0
     assert "the scene at 100 Hz and 100 % of its speed" in out
+
+
+def test_the_command_line_warns_of_a_stiffness_that_lets_the_tool_shake_in_turns(
+    call: Called,
+) -> None:
+    run = ("run", "peg_in_hole", "--fast", "--duration", 0.1, "--rotational-stiffness", 2.4)
+    for rate, warns in ((50, True), (100, False)):
+        code, _, err = call(*run, "--scene-rate", rate)
+        assert code == 0
+        assert ("may shake above about 2.2 N m/rad" in " ".join(err.split())) == warns
 
 
 def test_a_scene_beside_the_loop_that_is_still_too_slow_is_warned_of(

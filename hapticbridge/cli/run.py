@@ -44,6 +44,7 @@ from hapticbridge.options import (
     BridgeOptions,
     RunSetup,
     Workspace,
+    steady_rotational_stiffness,
     steady_stiffness,
 )
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
@@ -137,6 +138,12 @@ def _announce_slow(setup: RunSetup) -> None:
         err.print(
             "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
             f"{most:.2g} N/m: lower --stiffness, or raise --scene-rate"
+        )
+    most = steady_rotational_stiffness(setup.info, setup.scene_period, *scales)
+    if setup.coupling.rotational_stiffness > 2.0 * most:
+        err.print(
+            "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
+            f"{2.0 * most:.2g} N m/rad: lower --rotational-stiffness, or raise --scene-rate"
         )
 
 

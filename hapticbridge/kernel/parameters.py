@@ -275,7 +275,7 @@ class RunParameters:
             scene.
         scene_ticks: Ticks per ``substeps`` of a scene that is slower than the loop
             (``kernel.shown_tool``); 0 for a scene that steps in every tick.
-        steps_ahead: Steps for which rigid contacts are seen ahead.
+        is_beside: True for a slower scene's own loop (``of_scene``).
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -302,7 +302,7 @@ class RunParameters:
     guarding: GuardParameters = UNGUARDED
     is_rigid: bool = False
     scene_ticks: int = 0
-    steps_ahead: int = 1
+    is_beside: bool = False
 
     def __post_init__(self) -> None:
         checked_substeps(self.substeps)
@@ -356,7 +356,7 @@ class RunParameters:
             self,
             period=self.scene_period,
             scene_ticks=0,
-            steps_ahead=3,
+            is_beside=True,
             scale=1.0,
             force_scale=1.0,
             axes=_SAME_AXES,

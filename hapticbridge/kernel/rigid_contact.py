@@ -60,7 +60,7 @@ from hapticbridge.kernel.codes import EQUALITY, LIMIT_JOINT, LIMIT_TENDON, Part,
 from hapticbridge.kernel.ledger import mocap_work, opened_by_mocap
 from hapticbridge.kernel.mujoco_c import floats, ints, mj_mul_jac, pointer_at, struct_of
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.pose import add, cross, norm, subtract, vector_of
+from hapticbridge.pose import Vector, add, cross, norm, subtract, vector_of
 
 SOFTNESS = 1e-3
 """Regularisation R over the inverse inertia of a contact, without unit. A steady force F on a mass
@@ -82,8 +82,18 @@ before they touch. It covers the speed that a body gains within a step. A larger
 contacts without force."""
 
 LARGEST_MARGIN = 5e-3
-"""Largest margin in m that a geom's speed adds, that of 5 m/s at 1 ms. A faster geom may be first
-seen in penetration, which the tank then pays for."""
+"""Largest margin in m that a geom's speed adds in steps of up to 1 ms, that of 5 m/s at 1 ms. A
+faster geom may be first seen in penetration, which the tank then pays for."""
+
+
+def largest_margin(time: float) -> float:
+    """Returns the largest margin in m for steps, or periods of a scene beside the loop, in s."""
+    return max(LARGEST_MARGIN, 1e3 * LARGEST_MARGIN * time)
+
+
+RESULTS_AHEAD = 3
+"""Periods of a scene beside the loop for which its contacts are seen ahead. Its tool is shown for
+two of them after the newest result, and contacts are those of the start of its last one."""
 
 SUNK = 5e-6
 """Depth in m by which a sliding contact may sink in a step before the step is repeated. A smaller
@@ -155,6 +165,7 @@ RIGID_DTYPE = np.dtype(
         ("is_aimed", "<i8"),
         ("corrections", "<i8"),
         ("is_shifted", "<i8"),
+        ("leads", "<i8"),
         ("solver", "<i8"),
         ("own_solver", "<i8"),
         ("statistics", "<i8"),
@@ -169,6 +180,7 @@ RIGID_DTYPE = np.dtype(
         ("last_energy", "<f8"),
         ("lift", "<f8"),
         ("ahead", "<f8"),
+        ("largest_margin", "<f8"),
         ("stalled", "<f8"),
     ]
 )
@@ -177,21 +189,25 @@ RIGID_DTYPE = np.dtype(
 force; ``share`` σ of the last step; ``tank`` D and ``cap`` in J; ``last_energy`` Σ E_k in J at the
 last tick. ``is_aimed`` is 1 from the edit to the end of the step, ``corrections`` counts its
 repetitions for sliding, and ``lift`` is the largest velocity in m/s subtracted for it; ``ahead``
-the time in s for which margins reach ahead. ``is_shifted`` is 1 if the step was repeated without −h
-J̇v. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene; ``stalled`` is
-``STALLED``. Of limits and equality constraints: largest count of rows (0 if there are none), and
-addresses of the model's parameters, of copies, of the rows' own positions, of the velocities taken
-from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of pairs, and of the
-bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
+the time in s for which margins reach ahead, and ``largest_margin`` their largest in m. ``leads`` is
+1 if the tool's margins follow the handle's speed, too. ``is_shifted`` is 1 if the step was repeated
+without −h J̇v. ``solver`` is the address of MuJoCo's choice, ``own_solver`` that of the scene;
+``stalled`` is ``STALLED``. Of limits and equality constraints: largest count of rows (0 if there
+are none), and addresses of the model's parameters, of copies, of the rows' own positions, of the
+velocities taken from ŵ and of J v⁺. Of margins: addresses and counts of the geoms that move, of
+pairs, and of the bodies' velocities; ``leashes`` is 1 for spatial tendons of no least length."""
 
 
 def bind_contact(
     contact: Part, model: mujoco.MjModel, data: mujoco.MjData, parameters: RunParameters
 ) -> dict[str, NDArray[np.generic]]:
     """Fills in the sub-record, with an empty tank; returns arrays that must outlive the state."""
+    timestep = float(model.opt.timestep)
     contact["is_rigid"] = parameters.is_rigid
     contact["cap"] = parameters.tank_cap
-    contact["ahead"] = parameters.steps_ahead * model.opt.timestep
+    contact["leads"] = parameters.is_beside
+    step, steps = (parameters.period, RESULTS_AHEAD) if parameters.is_beside else (timestep, 1)
+    contact["ahead"], contact["largest_margin"] = steps * step, largest_margin(step)
     contact["solver"], contact["own_solver"] = model._address + _SOLVER, model.opt.solver
     contact["statistics"] = data._address + struct_of("mjData").solver.offset
     contact["warmstart"] = data.qacc_warmstart.ctypes.data
@@ -526,11 +542,13 @@ def follow_speed(s: State) -> None:
     """Widens each geom's margin for the next collisions by the way that it goes in a step.
 
     The way is t (|v| + |ω| r), with the velocity v of the geom's centre and the radius r of its
-    bounding sphere, at most ``LARGEST_MARGIN``. t is the time step, or three of them where a tool
-    is shown until two after the newest. Positions are those at the start of the last step. Limits
-    of joints and tendons follow their speeds.
+    bounding sphere, at most ``largest_margin``. t is the time step, or ``RESULTS_AHEAD`` periods of
+    a scene beside the loop. There the speed of the handle is added to that of the tool, which may
+    reach it within a step. Positions are those at the start of the last step. Limits of joints and
+    tendons follow their speeds.
     """
     contact, mj, ahead = s.contact, s.mj, s.contact.ahead
+    widest = contact.largest_margin
     _move_bodies(s)
     velocities, centres = floats(contact.body_velocity, 6 * mj.nbody), contact.geom_xpos
     bodies, roots = ints(mj.geom_bodyid, mj.ngeom), ints(contact.body_rootid, mj.nbody)
@@ -547,7 +565,9 @@ def follow_speed(s: State) -> None:
         velocity = vector_of(velocities[6 * body + 3 : 6 * body + 6])
         velocity = add(velocity, cross(turn, subtract(centre, origin)))
         way = ahead * (norm(velocity) + radii[geom] * norm(turn))
-        margins[geom] = at_rest[geom] + (way if way < LARGEST_MARGIN else LARGEST_MARGIN)
+        if contact.leads and ints(mj.geom_is_tool, mj.ngeom)[geom]:
+            way += RESULTS_AHEAD * _handle_way(s, centre, radii[geom])
+        margins[geom] = at_rest[geom] + (way if way < widest else widest)
     for pair in range(contact.pair_count):
         way = 0.0
         for geoms in (contact.pair_geom1, contact.pair_geom2):
@@ -557,6 +577,14 @@ def follow_speed(s: State) -> None:
         floats(contact.pair_margin + 8 * pair, 1)[0] = at_rest_here + way
     if contact.row_capacity > 0:
         _follow_limits(s)
+
+
+@compiled
+def _handle_way(s: State, centre: Vector, radius: float) -> float:
+    """Returns the way in m by which the handle's motion of this tick would move a geom."""
+    turn = vector_of(s.pose.handle_turn)
+    arm = subtract(centre, vector_of(s.pose.tool_position))
+    return norm(add(vector_of(s.pose.handle_step), cross(turn, arm))) + radius * norm(turn)
 
 
 @compiled

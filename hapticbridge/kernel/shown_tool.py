@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
-from hapticbridge.kernel.handle import note_tool
+from hapticbridge.kernel.handle import grip_pose, note_tool
 from hapticbridge.kernel.law import law_wrench, spring_energy, spring_length, within
 from hapticbridge.kernel.ledger import take_scene_energies
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
@@ -75,8 +75,9 @@ LONGEST = 3.0
 """Time beyond the handle of the newest result, in scene periods, for which the tool's motion is
 foreseen. If the next result is later than that, the tool stays where it is shown."""
 
-HALVINGS = 24
-"""Halvings in the search for the largest motion that the tank pays for; 1e-7 of the motion."""
+TRIALS, NEAR = 8, 1.0 - 1e-6
+"""Largest number of motions that are tried for the largest one that the tank pays for, and share of
+the root of a parabola that is tried. Two or three are enough unless the force is at its level."""
 
 FASTEST, FASTEST_TURN = 1.0, 10.0
 """Speeds in m/s and rad/s up to which the tool passes on the coupling's whole wrench in time."""
@@ -84,6 +85,7 @@ FASTEST, FASTEST_TURN = 1.0, 10.0
 SHOWN_DTYPE = np.dtype(
     [
         ("is_shown", "<i8"),
+        ("is_beside", "<i8"),
         ("has_failed", "<i8"),
         ("waits", "<i8"),
         ("scene_step", "<i8"),
@@ -94,6 +96,7 @@ SHOWN_DTYPE = np.dtype(
         ("contacts", "<i8"),
         ("planes", "<i8"),
         ("scene_period", "<f8"),
+        ("timestep", "<f8"),
         ("lead", "<f8"),
         ("tank", "<f8"),
         ("passing", "<f8"),
@@ -109,14 +112,15 @@ SHOWN_DTYPE = np.dtype(
         ("speeds", "<f8", PLANES),
     ]
 )
-"""Sub-record ``shown``, written by this module alone. ``waits`` is 1 while the scene has a handle,
+"""Sub-record ``shown``, written by this module alone. ``is_beside`` is 1 in the
+scene's own loop, which writes ``before`` alone. ``waits`` is 1 while the scene has a handle,
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
 newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
 ``passing``, ``work`` P of the present tick and ``scene_work`` W in J. ``before`` and ``newest`` are
-the tool's poses before and after the newest step; a plane has a normal away from the surface, the
-arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed against
-its normal in m/s."""
+the tool's poses before and after MuJoCo's newest step; a plane has a normal away from the surface,
+the arm from the grip to the contact point, the gap at the pose ``before`` in m, and the speed
+against its normal in m/s."""
 
 
 def bind_shown(shown: Part, parameters: RunParameters) -> None:
@@ -125,11 +129,13 @@ def bind_shown(shown: Part, parameters: RunParameters) -> None:
     The energy ``passing`` while a result is under way is 2 (F v + F_r ω) T_s, at v = 1 m/s and
     ω = 10 rad/s.
     """
+    shown["is_beside"] = parameters.is_beside
     if not parameters.scene_ticks:
         return
     of_scene = parameters.of_scene
     power = of_scene.force_limit * FASTEST + of_scene.torque_limit * FASTEST_TURN
     shown["is_shown"], shown["scene_period"] = 1, of_scene.period
+    shown["timestep"] = of_scene.period / of_scene.substeps
     shown["passing"] = 2.0 * power * of_scene.period
 
 
@@ -214,7 +220,7 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
         shown.acceleration[i] = rate * (velocity - shown.velocity[i]) if is_free else 0.0
         shown.velocity[i] = velocity
     for i in range(7):
-        shown.before[i] = shown.newest[i]
+        shown.before[i] = scene.shown.before[i]
     store_vector(shown.newest[0:3], vector_of(scene.pose.tool_position))
     store_quaternion(shown.newest[3:7], quaternion_of(scene.pose.tool_quaternion))
     shown.contacts = scene.loop.active_contacts
@@ -228,9 +234,20 @@ def take_over(state: NDArray[np.void], scene_state: NDArray[np.void]) -> None:
 
 
 @compiled
+def note_contacts(s: State) -> None:
+    """Notes the tool's pose at the start of MuJoCo's newest step, at which contacts were found.
+
+    Must run in the scene's own loop before the kinematics are refreshed.
+    """
+    position, orientation = grip_pose(s.mj)
+    store_vector(s.shown.before[0:3], position)
+    store_quaternion(s.shown.before[3:7], orientation)
+
+
+@compiled
 def _take_planes(s: State, scene: State) -> None:
-    """Notes the surfaces near the tool, from the contacts of the step's start."""
-    mj, shown = scene.mj, s.shown
+    """Notes the nearest surfaces to the tool, from the contacts of the step's start."""
+    mj, shown, timestep = scene.mj, s.shown, scene.run.timestep
     is_tool = ints(mj.geom_is_tool, mj.ngeom)
     grip = vector_of(shown.before)
     moved = subtract(vector_of(shown.newest), grip)
@@ -239,7 +256,7 @@ def _take_planes(s: State, scene: State) -> None:
     for c in range(ints(mj.ncon, 1)[0]):
         contact = pointer_at(mj.contact) + c * mj.contact_size
         geoms = ints(contact + mj.contact_geoms, 2)
-        if count == PLANES or geoms[0] < 0 or geoms[1] < 0:
+        if geoms[0] < 0 or geoms[1] < 0:
             continue
         side = is_tool[geoms[1]] - is_tool[geoms[0]]
         if side == 0:
@@ -248,12 +265,18 @@ def _take_planes(s: State, scene: State) -> None:
         normal = scaled(float(side), vector_of(floats(contact + mj.contact_frame, 3)))
         arm = subtract(vector_of(floats(contact + mj.contact_point, 3)), grip)
         gap = max(floats(contact + mj.contact_distance, 1)[0], 0.0)
+        place = count
+        if count < PLANES:
+            count += 1
+        else:
+            place = int(np.argmax(shown.gaps))
+            if shown.gaps[place] <= gap:
+                continue
         pushed = max(-gap - dot(normal, add(moved, cross(turn, arm))), 0.0)
-        store_vector(shown.normals[3 * count : 3 * count + 3], normal)
-        store_vector(shown.arms[3 * count : 3 * count + 3], arm)
-        shown.gaps[count] = gap
-        shown.speeds[count] = pushed / shown.scene_period
-        count += 1
+        store_vector(shown.normals[3 * place : 3 * place + 3], normal)
+        store_vector(shown.arms[3 * place : 3 * place + 3], arm)
+        shown.gaps[place] = gap
+        shown.speeds[place] = pushed / timestep
     shown.planes = count
 
 
@@ -271,7 +294,7 @@ def _foreseen(s: State) -> tuple[Vector, Quaternion]:
     orientation = product(quaternion_exp(turn), quaternion_of(shown.newest[3:7]))
     position = add(vector_of(shown.newest), step)
     if shown.planes > 0:
-        position = _outside(shown, position, orientation, q + shown.scene_period)
+        position = _outside(shown, position, orientation, q + shown.timestep)
     return position, canonical(orientation)
 
 
@@ -335,6 +358,39 @@ def _given(s: State, before: float, share: float, step: Vector, turn: Vector) ->
 
 
 @compiled
+def _paid_share(
+    s: State, before: float, motion: tuple[Vector, Vector], ends: tuple[float, float]
+) -> tuple[float, float]:
+    """Returns a share of a motion that the tank pays for, and its P in J.
+
+    Below the force level P is a parabola of the share, a r − c r², so P/r is a line. Where the
+    line's root cannot be, smaller shares are tried. ``ends`` has P of the whole motion and the
+    least P.
+    """
+    step, turn = motion
+    last_given, least = ends
+    share, work, high, last, trial = 0.0, 0.0, 1.0, 1.0, 0.5
+    for _ in range(TRIALS):
+        given = _given(s, before, trial, step, turn)
+        if given < least:
+            high = trial
+        else:
+            share, work = trial, given
+        curve = (given / trial - last_given / last) / (last - trial)
+        slope = given / trial + curve * trial
+        last, last_given, trial = trial, given, 0.5 * (share + high)
+        if share == 0.0:
+            trial = high / 16.0
+        if curve > 0.0:
+            root = NEAR * (slope + np.sqrt(slope * slope - 4.0 * curve * least)) / (2.0 * curve)
+            if share > 0.0 and abs(root - share) <= (1.0 - NEAR) * share:
+                break
+            if share < root < high:
+                trial = root
+    return share, work
+
+
+@compiled
 def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     """Shows the tool in the present tick.
 
@@ -351,14 +407,7 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     work = _given(s, before, share, step, turn)
     if work < least:
         shown.held_back += 1
-        high, share, work = 1.0, 0.0, 0.0
-        for _ in range(HALVINGS):
-            middle = 0.5 * (share + high)
-            given = _given(s, before, middle, step, turn)
-            if given < least:
-                high = middle
-            else:
-                share, work = middle, given
+        share, work = _paid_share(s, before, (step, turn), (work, least))
     shown.work = work
     shown.tank += work
     if shown.age > 0:

@@ -98,7 +98,7 @@ from hapticbridge.kernel.passivity_controller import (
     within_energy_limit,
 )
 from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
-from hapticbridge.kernel.shown_tool import hand_over, shown_wrench, take_over
+from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
 from hapticbridge.kernel.springs import restore_springs
 from hapticbridge.kernel.swing_watch import watch_device
 from hapticbridge.kernel.tick_guard import (
@@ -436,6 +436,8 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     if count == 1 and not is_last:
         end_mocap_moves(s)
         return OK
+    if s.shown.is_beside:
+        note_contacts(s)
     force, torque, moved, turned = _evaluate(s, is_last)
     end_mocap_moves(s)
     if s.contact.is_rigid:

@@ -13,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids, held_body, held_joint
 from hapticbridge.kernel.colliders import use_exact_points
-from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN
+from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
@@ -95,6 +95,7 @@ class Scene:
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False
     _reach: float = 0.0
+    _period: float = 0.0
     _own_contact: dict[str, Any] = field(default_factory=dict)
 
     def claim(self) -> None:
@@ -154,7 +155,7 @@ class Scene:
             raise SceneError(f"period is {period!r} s; it must be finite and > 0")
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
-        self.model.opt.timestep = period / substeps
+        self.model.opt.timestep, self._period = period / substeps, period
 
     def set_reach(self, distance: float) -> None:
         """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.
@@ -205,7 +206,8 @@ class Scene:
             getattr(self.model, name)[:] = margin
         for name in _LIMIT_MARGINS if self._own_contact else ():
             getattr(self.model, name)[:] = self._own_contact[name]
-        _widen_bodies(self.model, LARGEST_MARGIN if self._own_contact else 0.0)
+        widest = largest_margin(self._period) if self._own_contact else 0.0
+        _widen_bodies(self.model, widest)
 
     def _restore_contact(self, model: mujoco.MjModel) -> None:
         for name, value in self._own_contact.items():
