@@ -286,8 +286,8 @@ class OptionChanges(TypedDict, total=False):
 
 STEADY = 0.8
 """Largest K T_s² (1/m_tool + 1/m_hand) of the usual coupling to a slower scene, without unit. The
-tool is shown by what was foreseen up to 2 T_s ago; above 1.6 that lets it shake, by up to 10 N,
-though passively."""
+shown pose is foreseen from data up to 2 T_s old. Above 1.6 the tool shakes by up to 10 N, still
+passively."""
 
 
 def steady_stiffness(

@@ -331,7 +331,7 @@ class Session:
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)
-        # before the recorder and the scene are waited for, which may stand still
+        # first, because waiting for the recorder or the scene may take long
         resources.callback(self.device.close)
         sample[:] = self.device.start(setup.period)[: sample.size]
         for each, own in zip(self._setups, self._samples(), strict=True):
@@ -554,7 +554,7 @@ class Session:
         return self.tick + self._chore_ticks
 
     def _look_after(self, slow: SlowScene) -> None:
-        """Lets the force go while a step of the scene does not end, and warns without force.
+        """Fades the force out while a step of the scene is overdue; warns once it is zero.
 
         While a reset waits for the step, the force is off.
         """

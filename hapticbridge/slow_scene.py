@@ -46,45 +46,42 @@ class SlowScene:
     """Loop of a scene that steps once in n ticks of the bridge.
 
     Args:
-        loop: The bridge's bound kernel, which shows the tool.
+        front: The bridge's bound kernel, which shows the tool.
         model: The prepared scene.
         data: Its data, at the start.
         parameters: Parameters of the run, with ``scene_ticks`` n >= 2.
 
     Attributes:
         bound: The scene's own bound kernel.
-        late: Results so far that were not there when they were due.
-        is_waited_for: True if the bridge waits for a result that is due, as in simulated time.
     """
 
     def __init__(
         self,
-        loop: BoundKernel,
+        front: BoundKernel,
         model: mujoco.MjModel,
         data: mujoco.MjData,
         parameters: RunParameters,
     ) -> None:
-        self.bound = BoundKernel(model, data, parameters.of_scene, loop)
-        self.late, self.is_waited_for = 0, True
-        self._loop, self._model, self._data = loop, model, data
-        self._ticks, self._substeps = parameters.scene_ticks, range(parameters.substeps)
-        self._period, self._tick = parameters.of_scene.period, parameters.period
+        self.bound = BoundKernel(model, data, parameters.of_scene, front)
+        self._front, self._model, self._data = front, model, data
+        self._scene_ticks, self._substeps = parameters.scene_ticks, range(parameters.substeps)
+        self._scene_period, self._loop_period = parameters.of_scene.period, parameters.period
         self._given = np.zeros(1, SAMPLE_DTYPE)
         self._changes: deque[Callable[[], None]] = deque()
         self._publish: Callable[[BoundKernel], None] | None = None
-        shown = loop.state["shown"]
+        shown = front.state["shown"]
         self._age, self._waits = shown["age"], shown["waits"]
         state, row = self.bound.state, self.bound.row
-        self._take_result = direct(take_result, loop.state, state, self._given)
+        self._take_result = direct(take_result, front.state, state, self._given)
         self._before = direct(before_step, state, self._given, row, 0, 0.0)
         self._end = direct(after_step, state, row, 0)
         self.step = self.bound.step
         self._thread: threading.Thread | None = None
         self._wake, self._done = threading.Semaphore(0), threading.Event()
-        self._is_closed, self._is_sound, self._is_late = False, True, False
+        self._is_closed, self._is_sound = False, True
         self._error: Exception | None = None
 
-    def change(self, apply: Callable[[], None]) -> None:
+    def queue_change(self, apply: Callable[[], None]) -> None:
         """Applies a change of the scene before its next step, when no step is under way."""
         self._changes.append(apply)
 
@@ -98,9 +95,9 @@ class SlowScene:
             HapticBridgeError: The step takes longer than ``LONGEST_WAIT``.
         """
         if self._waits[0]:
-            self._wait_for_result()
+            self._finish_step()
             if not self._is_sound:
-                fail_scene(self._loop.state["shown"])
+                fail_scene(self._front.state["shown"])
         self._apply_changes()
 
     @property
@@ -111,7 +108,10 @@ class SlowScene:
     @property
     def is_missing(self) -> bool:
         """True if a result is overdue by more than ``LONGEST_WAIT``."""
-        return not self.is_idle and self._age[0] * self._tick > self._period + LONGEST_WAIT
+        return (
+            not self.is_idle
+            and self._age[0] * self._loop_period > self._scene_period + LONGEST_WAIT
+        )
 
     @property
     def is_running(self) -> bool:
@@ -130,7 +130,6 @@ class SlowScene:
 
     def start(self) -> None:
         """Starts the thread; without it every step is done when its result is due."""
-        self.is_waited_for = False
         # a long step must not hold the interpreter lock, which the loop needs
         self._end = direct(end_scene_step, self.bound.state, self.bound.row, 0)
         self._thread = threading.Thread(target=self._work, name="scene", daemon=True)
@@ -145,18 +144,15 @@ class SlowScene:
             Exception: MuJoCo's, from the scene's step.
         """
         if self._waits[0]:
-            if self._age[0] < self._ticks:
+            if self._age[0] < self._scene_ticks:
                 return
-            if not self.is_waited_for and not self._done.is_set():
-                self.late += not self._is_late
-                self._is_late = True
+            if not self.is_idle:  # late; the shown pose stays
                 return
-            self._wait_for_result()
+            self._finish_step()
             if not self._is_sound:
-                fail_scene(self._loop.state["shown"])
+                fail_scene(self._front.state["shown"])
                 return
-        self._is_late = False
-        self._take_result(self._loop.state, self.bound.state, self._given)
+        self._take_result(self._front.state, self.bound.state, self._given)
         self._apply_changes()
         if self._publish is not None:
             self._publish(self.bound)
@@ -165,7 +161,7 @@ class SlowScene:
             self._done.clear()
             self._wake.release()
 
-    def _wait_for_result(self) -> None:
+    def _finish_step(self) -> None:
         if self._thread is None:
             self._is_sound = self._do_step()
         elif not self._done.wait(LONGEST_WAIT):
@@ -187,7 +183,7 @@ class SlowScene:
 
     def _do_step(self) -> bool:
         """Runs one tick of the scene; returns False if its result is not usable."""
-        state, row, period = self.bound.state, self.bound.row, self._period
+        state, row, period = self.bound.state, self.bound.row, self._scene_period
         for substep in self._substeps:
             if self._before(state, self._given, row, substep, period) != OK:
                 return False
@@ -223,16 +219,15 @@ class SlowScene:
 
         Changes are applied after the next result, as in the live loop.
         """
-        states = self._loop.state, self.bound.state
-        own = self._loop.row, self.bound.row, self._given
-        step, done = self._loop.state["shown"]["scene_step"], 0
+        states = self._front.state, self.bound.state
+        own = self._front.row, self.bound.row, self._given
+        step, done = self._front.state["shown"]["scene_step"], 0
         while done < len(samples):
-            end = len(samples)
-            is_taken = False
-            if self._changes:
-                taken = np.flatnonzero(scene_steps[done:] > step[0])
-                first = 0 if not self._waits[0] else int(taken[0]) if taken.size else end
-                is_taken, end = done + first < end, min(done + first + 1, end)
+            end, is_taken = len(samples), False
+            if self._changes:  # up to the tick that takes over the next result
+                risen = scene_steps[done:] > step[0] if self._waits[0] else np.ones(1, np.bool_)
+                if is_taken := bool(risen.any()):
+                    end = done + int(np.argmax(risen)) + 1
             part = slice(done, end)
             count = simulate_shown(
                 states,

@@ -351,7 +351,7 @@ def test_a_step_that_diverged_before_a_reset_trips_as_its_result_would() -> None
         assert slow is not None
         if tick == 95:
             usual, slow.step = slow.step, spoils
-            slow.change(lambda: setattr(slow, "step", usual))  # after the step under way
+            slow.queue_change(lambda: setattr(slow, "step", usual))  # after the step under way
             bridge.session.executor.later.append((tick, "test"))
 
     with pytest.raises(SafetyTrip, match=r"not finite|unstable|diverge"), bridge:

@@ -488,7 +488,7 @@ def _requested(recording: RecordingFile) -> Coupling | None:
     try:
         return requested_of(recording.meta)
     except RecordingError:
-        return None  # a fault, named after those that may have caused it
+        return None  # a fault too, but what may have caused it is reported first
 
 
 def _time_facts(

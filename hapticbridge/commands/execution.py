@@ -111,7 +111,7 @@ class EventApplier:
             if self._slow is not None:
                 of_scene = goal.of_scene
                 tune = partial(self._slow.bound.tune, of_scene, gains)
-                self._slow.change(partial(tune, tuning_ticks(of_scene.period)))
+                self._slow.queue_change(partial(tune, tuning_ticks(of_scene.period)))
         elif kind == "switch":
             self._binding.command(bits_in(event))
         elif kind == "reset":
@@ -142,7 +142,7 @@ class EventApplier:
         if self._slow is None:
             apply()
         else:
-            self._slow.change(apply)
+            self._slow.queue_change(apply)
 
 
 MAX_WAITING = 8

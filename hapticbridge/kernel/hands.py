@@ -9,11 +9,11 @@ and has its rigid contacts and their tank. With n hands
 and the slack is the sum of the hands' slacks. MuJoCo solves all couplings in one step, so two hands
 may hold one body. A hand that reaches its force level changes the step of the others; therefore no
 wrench is evaluated before the levels of all hands are settled (``force_level.settle_levels``). For
-each device, the other hands are ports of the scene: what they put in may come out here.
+each device, the other hands are ports of the scene: energy that another hand put in may reach it.
 
 Valid for a coupling that MuJoCo solves whole, with one step per tick (``Scheme.IMPLICIT``). The
-stages take the arguments of their like in ``kernel.tick``, so that the loop calls either alike; the
-number of the substep is 0, and no positions are computed ahead.
+stages have the signatures of the stages in ``kernel.tick``, because one loop calls both. The number
+of the substep is 0, and no positions are computed ahead.
 """
 
 from __future__ import annotations

@@ -568,7 +568,9 @@ def _slack(
 
 @compiled
 def judge_balance(s: State) -> bool:
-    """Does the rest of ``close_balance``, once the slack is added.
+    """Compares the created energy with zero, with the slack, and at the device.
+
+    The slack of the tick is added before.
 
     The works and the slack are those of all hands, so every hand's account judges one environment.
     """
@@ -576,7 +578,7 @@ def judge_balance(s: State) -> bool:
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
     created -= energy.others_work
-    if s.run.scheme == Scheme.SHOWN:  # lent to the scene, which gives it back first
+    if s.run.scheme == Scheme.SHOWN:  # work that the hand still owes is not created
         created -= max(s.shown.scene_work - energy.coupling_work, 0.0)
     energy.environment_energy = created
     allowed = ENERGY_TOLERANCE * (1.0 + energy.throughput + energy.others_throughput)

@@ -180,7 +180,7 @@ def _credit(s: State) -> float:
 
 @compiled
 def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
-    """Gives the scene's next step the handle of now, as its sample.
+    """Gives the scene's next step the present handle pose, as its sample.
 
     The handle is drawn toward the scene's tool where their springs hold more than the credit and
     the tank allow.

@@ -850,7 +850,7 @@ def end_scene_step(state: NDArray[np.void], row: NDArray[np.void], substep: int)
 
 @compiled
 def take_result(state: NDArray[np.void], scene: NDArray[np.void], given: NDArray[np.void]) -> None:
-    """Takes over the step that a slower scene has done, and gives it the handle of now."""
+    """Takes over the step that a slower scene has done, and gives it the present handle pose."""
     if state[0].shown.waits:
         take_over(state, scene)
     hand_over(state, given)
