@@ -540,7 +540,7 @@ def test_a_bridge_in_a_child_finds_its_machine_code_loaded(monkeypatch: pytest.M
     for each in every:
         monkeypatch.setattr(each, "_direct", {})
     load_bridge_code.cache_clear()
-    load_bridge_code("lossless", "rigid", True)
+    load_bridge_code("lossless", "rigid", True, False)
 
     def missing(self: Any, *_: object) -> bytes:
         raise AssertionError(f"{self.source.__name__} is not loaded")
