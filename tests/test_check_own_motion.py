@@ -7,7 +7,14 @@ from pathlib import Path
 from cli_cases import Called
 
 from hapticbridge.check.observe import Setting
-from hapticbridge.check.own_motion import NO_HAND, OwnMotion, own_motion, own_substeps
+from hapticbridge.check.own_motion import (
+    NO_HAND,
+    NOTABLE_ENERGY,
+    OwnMotion,
+    own_motion,
+    own_substeps,
+)
+from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.scene import SceneSource, compile_scene, read_scene
 
 PERIOD = 1e-3
@@ -115,12 +122,23 @@ SPINNING = """<mujoco><option gravity="0 0 0"/><worldbody>
 """An arm of two joints without friction beside the tool."""
 
 
-def test_energy_that_fast_joints_create_is_told_with_its_size(tmp_path: Path) -> None:
-    created = []
+def test_fast_joints_create_no_energy(tmp_path: Path) -> None:
     for substeps in (1, 2, 4):
         found = moved(scene(tmp_path, SPINNING.format(8, 20)), substeps)
-        assert "fast joints" in found.creation
-        created.append(found.created)
-    assert 1.8 < created[0] / created[1] < 2.2  # in proportion to the step
-    assert 1.8 < created[1] / created[2] < 2.2
-    assert not moved(scene(tmp_path, SPINNING.format(0, 0.5))).creation
+        assert found.created <= ENERGY_TOLERANCE
+        assert not found.creation
+
+
+def test_energy_that_fast_joints_create_beside_contacts_of_the_scene_is_told(
+    tmp_path: Path,
+) -> None:
+    pressed = """<body pos="0 -1 0"><joint type="slide" range="0 1" limited="true" stiffness="10"
+        springref="-.5"/><geom size=".02" mass=".1"/></body>"""
+    text = SPINNING.format(8, 20).replace("</worldbody>", pressed + "</worldbody>")
+    source = scene(tmp_path, text.replace("0 0 0 0 0 0", 7 * "0 ").replace("1 0 0 0", "1 0 0 0 0"))
+    setting = Setting(NO_HAND, PERIOD, contact="scene")
+    found = own_motion(source, compile_scene(source), setting)
+    assert found is not None
+    assert found.created > NOTABLE_ENERGY
+    assert "--contact rigid takes it back" in found.creation
+    assert not moved(source).creation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -21,7 +22,7 @@ from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.rendering import prepare
+from hapticbridge.rendering import prepare, unguarded_parameters
 from hapticbridge.scene import Scene, load_scene, scene_path
 from hapticbridge.summary import Ledger
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
@@ -99,6 +100,40 @@ def test_energy_that_turning_creates_is_given_back() -> None:
     finer, _ = led(scene, "lossless", asked, circling(T / 2, 3.0), T / 2)
     lost = [-part["environment_energy"].min() for part in (rows, finer)]
     assert 0 < lost[1] < lost[0] / 2.5
+
+
+THIN_PEG = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body><freejoint/>
+      <geom type="capsule" size="0.005" fromto="0 0 -0.03 0 0 0.03" mass="0.1"/>
+      <site name="grip" pos="0.005 0 0.015"/>
+    </body>
+  </worldbody>
+  <keyframe><key name="home" qvel="0 0 0 {0}"/></keyframe>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("method", ["implicit", "compensated", "lossless"])
+@pytest.mark.parametrize("speed", [100.0, 200.0])
+def test_a_thin_peg_that_spins_at_the_force_level_creates_no_energy(
+    method: str, speed: float
+) -> None:
+    chosen, asked = METHODS[method].with_contact("rigid"), Coupling(3000.0, 1.0, 0.0, 0.0)
+    for axis in ((1.0, 0.0, 0.3), (0.2, 1.0, 0.8), (0.0, 0.3, 1.0)):
+        turn = speed * np.array(axis) / np.linalg.norm(axis)
+        scene = load(THIN_PEG.format(" ".join(map(str, turn))))
+        parameters = unguarded_parameters(scene, asked, T, 1, chosen)
+        limited = replace(parameters, force_limit=2.0, torque_limit=0.05)
+        kernel = BoundKernel(scene.model, scene.data, limited)
+        samples = np.zeros(800, SAMPLE_DTYPE)
+        samples["position"] = circling(T, 3.0)[:800]
+        samples["quaternion"][:, 0] = 1.0
+        rows = np.zeros(800, TICK_DTYPE)
+        assert simulate(kernel.state, samples, kernel.row, rows) == 800
+        assert (rows["flags"] & TickFlag.FORCE_LIMITED).any()
+        assert Ledger.of(kernel.state).environment == "strict"
 
 
 # --- what is rendered, and what the device needs --------------------------------------------------

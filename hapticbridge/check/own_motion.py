@@ -86,17 +86,17 @@ class OwnMotion:
 
     @property
     def creation(self) -> str:
-        """Sentence on energy that fast joints create; empty if there is hardly any.
+        """Sentence on energy that the scene creates; empty if there is hardly any.
 
-        MuJoCo takes Coriolis and gyroscopic forces at the start of a step, so that chains and
-        bodies that spin gain energy in proportion to the step.
+        Fast joints create it in MuJoCo's steps. It is taken back (``kernel.ledger``) unless
+        contacts of the scene's own act.
         """
         if not NOTABLE_ENERGY < self.created < math.inf:
             return ""
         return (
             f"without a hand, the scene creates {format_si(self.created, 'J')} within "
             f"{self.seconds:.2g} s, as fast joints do in MuJoCo's steps, and the audit may call it "
-            "active; more --substeps create less, twice as many half of it"
+            "active; --contact rigid takes it back, and more --substeps create less"
         )
 
     def remedy(self, setting: Setting) -> str:

@@ -74,7 +74,7 @@ def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     if found is not None and found.jnd > 1.0:
         yield Fault("own motion", place, str(found), found.remedy(case.setting))
     if found is not None and found.creation:
-        yield Fault("own motion", place, found.creation, "--substeps, or slower joints")
+        yield Fault("own motion", place, found.creation, "--contact rigid or --substeps")
 
 
 def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:

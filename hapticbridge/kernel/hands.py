@@ -39,6 +39,7 @@ from hapticbridge.kernel.ledger import (
     judge_balance,
     meter_ports,
     refresh_energies,
+    take_back,
 )
 from hapticbridge.kernel.mujoco_c import release_fence
 from hapticbridge.kernel.rigid_contact import fill_tank, finish_contacts, follow_speed
@@ -131,6 +132,8 @@ def close_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
         add_coupling_work(states[i].energy, states[i].loop.law_work)
         add_slack(states[i])
     add_up_hands(states)
+    if take_back(states[0], states[0].mj.qvel, 0.0):
+        add_up_hands(states)
     is_finite = True
     for i in range(states.size):
         is_finite = judge_balance(states[i]) and is_finite

@@ -49,15 +49,18 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
-from hapticbridge.kernel.ledger import add_body_wrenches, set_kinetic_energy
+from hapticbridge.kernel.ledger import (
+    add_body_wrenches,
+    set_kinetic_energy,
+    take_back,
+    write_bias,
+)
 from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
     mj_apply_ft,
-    mj_com_vel,
     mj_factor_m,
     mj_mul_m,
-    mj_rne,
     mj_solve_m,
     pointer_at,
 )
@@ -138,24 +141,6 @@ MAX_SHARE_BACK = 1e-3
 """Largest share of the tool's kinetic energy that a tick takes back; no unit. It changes the speed
 by 0.05 %, hundreds of times the need of free motion. A larger share would be felt in slow
 motion."""
-
-
-@compiled
-def write_bias(s: State, velocity: int, result: int) -> None:
-    """Writes c(q_k, v) for a velocity at an address; MuJoCo's own velocity is left unchanged."""
-    mj = s.mj
-    qvel, other, saved = (
-        floats(mj.qvel, mj.nv),
-        floats(velocity, mj.nv),
-        floats(s.lossless.work_buffer, mj.nv),
-    )
-    for i in range(mj.nv):
-        saved[i] = qvel[i]
-        qvel[i] = other[i]
-    mj_com_vel(mj.model, mj.data)
-    mj_rne(mj.model, mj.data, np.int32(0), result)
-    for i in range(mj.nv):
-        qvel[i] = saved[i]
 
 
 @compiled
@@ -257,6 +242,8 @@ def balance(s: State) -> None:
         others += energy * (1 - in_tree[i])
     kinetic = own + others
     set_kinetic_energy(s.energy, kinetic - _take_back(s, kinetic, own))
+    if take_back(s, lossless.velocity, s.loop.law_work):
+        write_bias(s, mj.qvel, lossless.bias_at_u)
 
 
 @compiled
@@ -742,12 +729,14 @@ def finish_lossless(s: State) -> bool:
         rest = subtract(force, vector_of(lossless.applied_half))
         carry(s, rest, subtract(torque, vector_of(lossless.applied_half[3:6])))
         balance_midpoint(s)
-    elif not lossless.is_constrained:
-        # free, but not lossless at present: the balance holds to first order only
-        v, u = floats(lossless.velocity, mj.nv), floats(mj.qvel, mj.nv)
-        for i in range(mj.nv):
-            v[i] = u[i]
-        balance(s)
+    else:
+        take_back(s, mj.qvel, s.loop.law_work)
+        if not lossless.is_constrained:
+            # free, but not lossless at present: the balance holds to first order only
+            v, u = floats(lossless.velocity, mj.nv), floats(mj.qvel, mj.nv)
+            for i in range(mj.nv):
+                v[i] = u[i]
+            balance(s)
     lossless.holdoff = HOLDOFF if lossless.is_near else max(lossless.holdoff - 1, 0)
     if lossless.was_midpoint and lossless.is_near:
         _leave(s)

@@ -249,6 +249,7 @@ _DATA_ARRAYS = (
     "ten_length",
     "qfrc_actuator",
     "qfrc_applied",
+    "qfrc_constraint",
     "qfrc_gravcomp",
     "xfrc_applied",
     "actuator_force",
@@ -291,9 +292,25 @@ _OWNED = (
     "tendon_before",
     "outadr",
     "outnum",
+    "tree_dofadr",
+    "tree_dofnum",
+    "tree_mass",
+    "dof_turns",
 )
 _MASSLESS = ("tool_map", "tool_qpos", "geom_is_tool")
-_SIZES = ("nq", "nv", "na", "nhistory", "njnt", "nbody", "ngeom", "nmocap", "ntendon", "nsensor")
+_SIZES = (
+    "nq",
+    "nv",
+    "na",
+    "nhistory",
+    "njnt",
+    "nbody",
+    "ngeom",
+    "nmocap",
+    "ntendon",
+    "nsensor",
+    "ntree",
+)
 _CONTACT = (
     "size",
     "distance",
@@ -327,6 +344,7 @@ _FACTS = (
     "has_actuators",
     "has_gravity_compensation",
     "has_tendons_or_flexes",
+    "is_discrete",
 )
 
 MJ_DTYPE = np.dtype(
@@ -374,6 +392,7 @@ def model_addresses(
     values |= {f"contact_{name}": value for name, value in contact_layout().items()}
     values["has_gravity_compensation"] = bool(np.any(model.body_gravcomp))
     values["has_tendons_or_flexes"] = model.ntendon > 0 or model.nflex > 0
+    values["is_discrete"] = model.opt.integrator == mujoco.mjtIntegrator.mjINT_DISCRETE
     # a flex may take more rows than 6 per equality, as many as it has now
     values["equality_capacity"] = max(6 * model.neq, data.ne)
 
@@ -385,12 +404,34 @@ def model_addresses(
         "body_mocap": np.ascontiguousarray(model.body_mocapid[model.body_rootid], dtype=np.int32),
         "geom_bodyid": np.ascontiguousarray(model.geom_bodyid, dtype=np.int32),
         "tendon_range": np.ascontiguousarray(model.tendon_range, dtype=np.float64),
-        "scratch": np.zeros(max(model.nv, 1)),
+        "scratch": np.zeros((4, max(model.nv, 1))),
         "mocap_previous": np.zeros((max(model.nmocap, 1), 7)),
         "mocap_shift": np.zeros((max(model.nmocap, 1), 6)),
         "equality_before": np.zeros(max(values["equality_capacity"], 1)),
         "tendon_before": np.zeros(max(model.ntendon, 1)),
         "outadr": np.ascontiguousarray(model.actuator_outadr, dtype=np.int32),
         "outnum": np.ascontiguousarray(model.actuator_outnum, dtype=np.int32),
+        "tree_dofadr": np.ascontiguousarray(model.tree_dofadr, dtype=np.int32),
+        "tree_dofnum": np.ascontiguousarray(model.tree_dofnum, dtype=np.int32),
+        "tree_mass": _masses_of_free_trees(model),
+        "dof_turns": _turning_dofs(model),
     }
     return values, owned
+
+
+def _masses_of_free_trees(model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Returns the mass in kg of each kinematic tree that begins with a free joint, 0 for others."""
+    first = model.tree_dofadr
+    is_free = model.jnt_type[model.dof_jntid[first]] == mujoco.mjtJoint.mjJNT_FREE
+    armature = np.array([np.any(model.dof_armature[dof : dof + 3]) for dof in first], bool)
+    masses = model.body_subtreemass[model.dof_bodyid[first]]
+    return np.ascontiguousarray(np.where(is_free & ~armature, masses, 0.0), dtype=np.float64)
+
+
+def _turning_dofs(model: mujoco.MjModel) -> NDArray[np.int32]:
+    """Returns 1 for each degree of freedom that is a rotation, 0 for others."""
+    kinds, dofs = model.jnt_type[model.dof_jntid], np.arange(model.nv)
+    is_shift = kinds == mujoco.mjtJoint.mjJNT_SLIDE
+    is_free = kinds == mujoco.mjtJoint.mjJNT_FREE
+    is_shift |= is_free & (dofs - model.jnt_dofadr[model.dof_jntid] < 3)
+    return np.ascontiguousarray(~is_shift, dtype=np.int32)

@@ -66,6 +66,8 @@ from hapticbridge.kernel.ledger import (
     meter_ports,
     note_moved_mocap_bodies,
     refresh_energies,
+    take_back,
+    take_mean_bias_in_substep,
 )
 from hapticbridge.kernel.lossless import (
     apply_carried,
@@ -458,6 +460,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     store_vector(loop.wrench_on_tool[3:6], torque)
     if not is_last:
         add_coupling_work(s.energy, loop.law_work)
+        take_mean_bias_in_substep(s)
         return OK
     return send_wrench(s, row, active_contacts(s))
 
@@ -552,6 +555,8 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
         loop.has_positions = 0  # it was computed with the springs of the other form
     add_coupling_work(s.energy, loop.law_work)
+    if s.run.scheme == Scheme.IMPLICIT:
+        take_back(s, s.mj.qvel, 0.0)
     if not close_balance(s):
         return refuse_tick(s)
     fill_tank(s)
