@@ -60,7 +60,7 @@ from hapticbridge.scene import (
 )
 from hapticbridge.scene.compile import custom_text
 from hapticbridge.signals import Interrupts, StopSignal, interrupting_on_signals
-from hapticbridge.summary import WELD, coarse_spring, is_always_implicit
+from hapticbridge.summary import WELD, Summary, coarse_spring, is_always_implicit
 from hapticbridge.units import format_si
 
 if TYPE_CHECKING:
@@ -618,14 +618,18 @@ class Run:
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
-        if self.as_json:
-            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
-        else:
-            out.print(plain(str(summary)))
-            if window is not None and self.record is not None:
-                notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
+        self._print(summary, is_viewed=window is not None)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
+
+    def _print(self, summary: Summary, *, is_viewed: bool) -> None:
+        if self.as_json:
+            print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
+            return
+        for line in str(summary).splitlines():
+            out.print(plain(line))
+        if is_viewed and self.record is not None:
+            notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 
     def _duration(self, info: DeviceInfo) -> float | None:
         """Returns the duration of the run in s; None until it is stopped."""
