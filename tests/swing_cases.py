@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice
@@ -74,3 +78,70 @@ def watch_flags(name: str, motion: Motion | None, grip: Hand | None) -> int:
         summary = bridge.run(None if motion is None else motion.duration)
         flags = bridge.latest_records(summary.ticks)["flags"]
     return int(np.bitwise_or.reduce(flags))
+
+
+class LateInBunches:
+    """Simulated device whose samples are late and come several at a time, as over a network.
+
+    Args:
+        device: The device itself.
+        delay: Age in ticks of the newest sample that is known.
+        most: The samples of 1 to 2 ``most`` − 1 ticks come at once; no new one comes between.
+        begin: Tick from which on this is so.
+    """
+
+    def __init__(self, device: SimulatedDevice, delay: int, most: int, begin: int = 0) -> None:
+        self.device, self.info = device, replace(device.info, delay=0.0)
+        self._delay, self._most, self._begin = delay, most, begin
+        self._chance = np.random.default_rng(0)
+        self._waiting: deque[NDArray[np.void]] = deque()
+        self._next, self._known = 0, np.zeros(1, hb.SAMPLE_DTYPE)
+        self._places: list[NDArray[np.float64]] = []
+        self._forces: list[NDArray[np.float64]] = [np.zeros(3)]
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self.period = period
+        self._known = self.device.start(period)
+        return self._known.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self.device.read(sample)
+        self._places.append(sample["position"][0].copy())
+        self._waiting.append(sample.copy())
+        tick = len(self._places)
+        if tick < self._begin:
+            self._known = self._waiting.popleft()
+            return 0
+        is_new = False
+        if tick >= self._next:
+            self._next = tick + int(self._chance.integers(1, 2 * self._most))
+            while len(self._waiting) > self._delay:
+                self._known, is_new = self._waiting.popleft(), True
+        sample[:] = self._known
+        return 0 if is_new else int(TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._forces.append(wrench[:3].copy())
+        self.device.write(wrench)
+
+    def close(self) -> None:
+        self.device.close()
+
+    def most_given(self) -> float:
+        """Returns the largest energy in J that the hand had got beyond what the damping burnt."""
+        moved = np.diff(self._places, axis=0)
+        work = np.einsum("ki,ki->k", self._forces[1 : len(moved) + 1], moved)
+        burnt = (self.device.info.damping or 0.0) / self.period * np.einsum("ki,ki->k", moved, moved)
+        return float(np.cumsum(work - burnt).max(initial=0.0))
+
+
+def bunched(
+    name: str, motion: Motion, device: SimulatedDevice, delay: int, most: int, begin: int = 0
+) -> tuple[int, float]:
+    """Runs a hand whose samples come in bunches; returns the alarms as flags, and joules given."""
+    late = LateInBunches(device, delay, most, begin)
+    with hb.Bridge(name, late, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(motion.duration)
+        flags = bridge.latest_records(summary.ticks)["flags"]
+    found = int(np.bitwise_or.reduce(flags)) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
+    return found, late.most_given()

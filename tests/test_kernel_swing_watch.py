@@ -11,7 +11,7 @@ from faults.catalogue import FINGERS
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from random_hands import random_motion
-from swing_cases import GRIPS, VERY_FIRM, alarms, shakes, taps
+from swing_cases import GRIPS, VERY_FIRM, alarms, bunched, shakes, taps
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -140,6 +140,31 @@ def pressed(path: Path, *, is_watched: bool) -> hb.Summary:
         bridge.setup = replace(bridge.setup, guard=guard)
     with bridge:
         return bridge.run(1.5)
+
+
+def sways(amplitude: float, duration: float) -> Motion:
+    """Returns a hand that goes about in a plane, in m and s, and so into ``virtual_wall``."""
+    times = np.arange(0.0, duration + 0.005, 0.002)
+    x, y = np.sin(5.0 * times), 1.0 - np.cos(4.0 * times)
+    rise = amplitude * np.clip(times - 1.0, 0.0, 1.0)
+    return Motion(times, np.stack([rise * x, rise * y, 0.0 * times], axis=1))
+
+
+@pytest.mark.parametrize(("delay", "most"), [(10, 2), (20, 2), (20, 4)])
+def test_a_late_device_is_found_if_its_samples_come_in_bunches(delay: int, most: int) -> None:
+    motion = sways(0.03, 8.0)
+    device = SimulatedDevice(path=motion, mass=0.15, damping=1.2, force_limit=6.0)
+    found, joules = bunched("virtual_wall", motion, device, delay, most, begin=2000)
+    assert found & TickFlag.SWINGING
+    assert joules <= 0.3  # 0.7 J and 2.9 J where a block ended between two samples
+
+
+@pytest.mark.parametrize("grip", GRIPS)
+@pytest.mark.parametrize("most", [2, 5])
+def test_samples_in_bunches_alone_are_no_alarm(most: int, grip: str) -> None:
+    motion = taps(8.0, 4e-3)
+    device = SimulatedDevice(path=motion, hand=GRIPS[grip])
+    assert bunched("virtual_wall", motion, device, 0, most) == (0, pytest.approx(0.0, abs=1e-6))
 
 
 def test_summary_and_audit_say_what_the_watch_did(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ exchanged x = 1. The answer to the wrench that was sent s earlier, for six s of 
 
     c_s = Σ W_{k−s}·A_k/√(Σ W²_{k−s} Σ A_k²)
 
-A motor that holds is answered late. A rattling tool and coarse steps of an encoder move regardless
+A block of a device whose samples come in bunches lasts until its next new sample, and counts with
+its mean speed. A motor that holds is answered late. A rattling tool and coarse steps of an encoder move regardless
 of any wrench, so all c_s are near 0. Slow forces are judged by the work of a force that is s late,
 above 4 Hz, over 0.3 s, with b the device's damping and δp the motion in a block of t = 4 ms:
 
@@ -67,6 +68,11 @@ from hapticbridge.pose import Vector, norm
 BLOCK = 0.004
 """Length of a block in s, over which wrench and velocity are averaged. Longer blocks miss swings of
 60 Hz; shorter ones cost time and see the steps of an encoder."""
+
+LONGEST_BLOCK = 4
+"""Most that a block is longer than ``BLOCK`` while it waits for a new sample, as a ratio. A block
+ends with a new sample, so that its motion belongs to its time: samples that come in bunches would
+else look like fast motion of no cause. The force fades before the block is longer."""
 
 FAST = 20.0
 """Corner in Hz of the high-pass of fourth order. It leaves 3 % of a hand's shaking at 8 Hz; a lower
@@ -238,7 +244,8 @@ def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
     if s.loop.tick > s.guard.start_tick:
         wrench, motion, w = watch.wrench, watch.motion, s.loop.wrench_on_device
         # after a long wait only the mean speed is known
-        part = 1.0 if interval <= watch.block else watch.block / interval
+        longest = max(watch.block_ticks, watch.ticks + 1) * s.run.period
+        part = 1.0 if interval <= longest else longest / interval
         for i in range(3):
             wrench[i] += w[i]
             wrench[3 + i] += w[3 + i]
@@ -248,9 +255,10 @@ def watch_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
     _count_step(s, 0, moved, interval, force_scale * scale * s.coupling.stiffness)
     _count_step(s, 1, turned, interval, force_scale / scale * s.coupling.rotational_stiffness)
     watch.ticks += 1
-    if watch.ticks == watch.block_ticks:
-        watch.ticks = 0
+    is_stale = s.loop.external_flags & STALE_SAMPLE != 0
+    if watch.ticks >= watch.block_ticks * (LONGEST_BLOCK if is_stale else 1):
         _close_block(s)
+        watch.ticks = 0
 
 
 @compiled
@@ -334,7 +342,7 @@ def _add_block(s: State, kind: int) -> None:
     watch, block, ring = s.watch, s.watch.block, s.watch.ring
     kept, kept_work = watch.kept[0], watch.kept[1]
     b = s.observer.assumed_damping if kind == 0 else s.observer.assumed_rotational_damping
-    first = 3 * kind
+    first, whole = 3 * kind, watch.block_ticks / watch.ticks
     square = against = change = burnt = 0.0
     for d in range(len(LAGS)):
         watch.delayed[len(LAGS) * kind + d] *= kept_work
@@ -343,7 +351,8 @@ def _add_block(s: State, kind: int) -> None:
     wrench_square = speed_square = change_square = whole_square = power = along = 0.0
     for i in range(3):
         at = first + i
-        wrench, speed = watch.wrench[at] / watch.block_ticks, watch.motion[at] / block
+        wrench, moved = watch.wrench[at] / watch.ticks, whole * watch.motion[at]
+        speed = moved / block
         faster = speed - watch.speed[at]
         watch.speed[at] = speed
         square += wrench * wrench
@@ -352,7 +361,7 @@ def _add_block(s: State, kind: int) -> None:
         whole_square += faster * faster
         # the work of a late wrench
         slow_wrench = _without_slow(watch, at, wrench)
-        motion = _without_slow(watch, 6 + at, watch.motion[at])
+        motion = _without_slow(watch, 6 + at, moved)
         ring[6 * (watch.blocks % RING) + at] = slow_wrench
         burnt += b * motion * motion / block
         watch.believed[kind] += slow_wrench * motion
