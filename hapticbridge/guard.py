@@ -291,7 +291,7 @@ _REASONS = {
     GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
 }
 _REMEDIES = {
-    JUMPED: "check the motion's unit (m) and its times (s)",
+    JUMPED: "check the unit (m) and the times (s) of what it reports, and that no sample is late",
     STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
     TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",

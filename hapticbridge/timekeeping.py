@@ -218,7 +218,8 @@ class Timekeeping:
             late += f", the scene at {self.scene_rate:.4g} Hz and {speed}"
             if self.scene_silence * self.scene_rate > SILENT_PERIODS:
                 late += f", once without a result for {format_si(self.scene_silence, 's')}"
-        return f"{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
+        of_what = "new samples at " if lost else ""
+        return f"{of_what}{self.rate:.4g} Hz, {self._percent} of the deadlines kept{lost}{late}"
 
     @property
     def remark(self) -> str:

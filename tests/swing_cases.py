@@ -131,7 +131,9 @@ class LateInBunches:
         """Returns the largest energy in J that the hand had got beyond what the damping burnt."""
         moved = np.diff(self._places, axis=0)
         work = np.einsum("ki,ki->k", self._forces[1 : len(moved) + 1], moved)
-        burnt = (self.device.info.damping or 0.0) / self.period * np.einsum("ki,ki->k", moved, moved)
+        burnt = (
+            (self.device.info.damping or 0.0) / self.period * np.einsum("ki,ki->k", moved, moved)
+        )
         return float(np.cumsum(work - burnt).max(initial=0.0))
 
 

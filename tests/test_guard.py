@@ -23,6 +23,7 @@ from faults.rig import Outcome, Rig
 from numpy.typing import NDArray
 from report_runs import ANVIL
 
+import hapticbridge as hb
 from hapticbridge import guard as start_module
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
@@ -196,6 +197,48 @@ def test_a_hand_that_moves_while_it_gets_no_force_finds_the_coupling_unstretched
         rows = bridge.latest_records(10)
     assert rows["flags"][0] & REANCHORED
     assert np.abs(rows["wrench_on_tool"][:, :3]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("silent", "is_refused"), [(200, False), (0, True)])
+def test_a_device_catches_up_after_a_silence_and_jumps_at_no_other_time(
+    silent: int, is_refused: bool
+) -> None:
+    begin = 100
+
+    class Link:
+        """Device at 0.1 m/s whose link is silent, then gives what waited in it, then the newest."""
+
+        info = hb.DeviceInfo(name="link", axes=("x",), force_limit=5.0, damping=2.0, is_real=False)
+        tick = 0
+
+        def start(self, period: float) -> NDArray[np.void]:
+            sample = np.zeros(1, hb.SAMPLE_DTYPE)
+            sample["quaternion"][0, 0] = 1.0
+            return sample
+
+        def read(self, sample: NDArray[np.void]) -> int:
+            self.tick += 1
+            is_silent = begin < self.tick <= begin + silent
+            waited = begin + 1 if self.tick == begin + silent + 1 else self.tick
+            jump = 0.02 if self.tick > begin + silent + 1 else 0.0
+            sample["position"][0] = 1e-4 * (begin if is_silent else waited) + jump, 0.0, 0.0
+            sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+            return int(hb.TickFlag.STALE_SAMPLE) if is_silent else 0
+
+        def write(self, wrench: NDArray[np.float64]) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    with hb.Bridge("point_mass", Link(), clock=hb.SimulatedClock()) as bridge:
+        if is_refused:
+            with pytest.raises(hb.SafetyTrip, match="jumped farther"):
+                bridge.run(0.5)
+        else:
+            assert bridge.run(0.5).ticks == 500
+            after = bridge.latest_records(500)[begin + silent : begin + silent + 10]
+            assert np.linalg.norm(after["wrench_on_device"], axis=1).max() < 0.5
 
 
 class Moving:

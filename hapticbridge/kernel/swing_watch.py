@@ -11,10 +11,11 @@ exchanged x = 1. The answer to the wrench that was sent s earlier, for six s of 
 
     c_s = Σ W_{k−s}·A_k/√(Σ W²_{k−s} Σ A_k²)
 
-A block of a device whose samples come in bunches lasts until its next new sample, and counts with
-its mean speed. A motor that holds is answered late. A rattling tool and coarse steps of an encoder move regardless
-of any wrench, so all c_s are near 0. Slow forces are judged by the work of a force that is s late,
-above 4 Hz, over 0.3 s, with b the device's damping and δp the motion in a block of t = 4 ms:
+A motor that holds is answered late. A rattling tool and coarse steps of an encoder move regardless
+of any wrench, so all c_s are near 0. A block of t = 4 ms gives one W and V; if samples come in
+bunches, it lasts until the next new one and counts with its mean speed. Slow forces are judged by
+the work of a force that is s late, above 4 Hz, over 0.3 s, with b the device's damping and δp the
+motion in a block:
 
     E_s = Σ (w_{k−s}·δp_k − b ‖δp_k‖²/t),    E_0 = Σ w_k·δp_k
 

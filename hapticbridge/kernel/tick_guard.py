@@ -69,6 +69,7 @@ GUARD_DTYPE = np.dtype(
         ("consecutive_stale", "<i8"),
         ("fresh", "<i8"),
         ("time_since_sample", "<f8"),
+        ("silence", "<f8"),
         ("start_tick", "<i8"),
         ("rise_ticks", "<i8"),
         ("share", "<f8"),
@@ -78,13 +79,19 @@ GUARD_DTYPE = np.dtype(
 
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
-``time_since_sample`` in s; ``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
+``time_since_sample`` and ``silence`` in s, the latter of the last silence of the device until the
+force has come back; ``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
 of the lever between device and handle;
 ``rise_ticks`` its time from 0 to 1."""
 
 FARTHEST = 2.0
 """Largest plausible distance in m of a device from the origin of its frame, where its data sheet
 names no reach. No desk is larger."""
+
+CATCH_UP = 0.1
+"""Greatest ratio r at which a new sample may still belong to the silence before it; no unit. After
+a silence a link first delivers what had waited in it, and the newest sample follows within a tick
+or two. At a larger r such a jump would move the tool."""
 
 DEVICE_BUTTONS = 2**32 - 1
 """Bits of a record's ``buttons`` that belong to the device; bits above them are commands."""
@@ -130,8 +137,10 @@ def refusal(s: State, moved: Vector, turned: Vector, elapsed: float) -> int:
     is_first = s.loop.tick == guard.start_tick
     if elapsed < 0.0 and not is_first:
         return BACKWARDS
-    # the device moves on while its samples are old
+    # the device moves on while its samples are old, and catches up after a silence
     time = max(elapsed, s.run.period) + guard.time_since_sample
+    if guard.share <= CATCH_UP:
+        time += guard.silence
     is_fast = norm(moved) > guard.max_speed * time or norm(turned) > guard.max_turn_speed * time
     # between a start and the first tick the device moves for an unknown time
     is_astray = bool(guard.has_hand) and norm(moved) > FARTHEST
@@ -166,6 +175,8 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     guard.fresh += 0 if is_stale else 1
     guard.consecutive_stale = guard.consecutive_stale + 1 if is_stale else 0
     waited = guard.time_since_sample + max(elapsed, s.run.period)
+    if not is_stale and guard.time_since_sample > 0.0:
+        guard.silence = guard.time_since_sample
     guard.time_since_sample = waited if is_stale else 0.0
     is_clutched = (buttons & (guard.clutch | CLUTCHED)) != 0
     is_clutched = is_clutched or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
@@ -185,6 +196,8 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     elif guard.share < s.watch.max_share:
         rise = guard.fade_ticks if s.watch.flags & PROBED else guard.rise_ticks + 1.0
         guard.share = min(guard.share + 1.0 / rise, s.watch.max_share)
+    if guard.share > CATCH_UP:
+        guard.silence = 0.0
     if guard.share < 1.0:
         guard.flags |= RAMPING
 
