@@ -200,7 +200,8 @@ def test_ticks_that_come_late_in_turn_are_said_and_count(tmp_path: Path) -> None
     assert report.timekeeping.remark == words
     summary, _ = felt(tmp_path / "late.mcap", NOT_IN_TIME["10 % late in turn at the bound"])
     assert (
-        "at 1000 Hz (sample times vary by 50 µs) it needs 2.05 N s/m" in summary.timekeeping.fault
+        "at 1000 Hz (sample times vary by 50 µs) it would need 2.05 N s/m"
+        in summary.timekeeping.fault
     )
     summary, _ = felt(tmp_path / "force.mcap", IN_TIME["force 5 % of a period after the sample"])
     assert summary.timekeeping.remark.endswith("kept, forces follow 50 µs after the sample")
