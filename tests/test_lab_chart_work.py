@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import astuple
 from itertools import count
 from pathlib import Path
@@ -14,7 +13,6 @@ from scipy.spatial import ConvexHull
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import work
-from hapticbridge.scene import load_scene
 
 
 def test_floating_bodies_are_as_many_as_asked_and_touch_nothing() -> None:
@@ -95,38 +93,3 @@ def test_work_refuses_what_it_would_not_heed(
     assert main(["chart", "work", *option, "--out", str(tmp_path)]) == 2
     assert "it takes neither --methods nor" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_slower_scene_feels_more_different_and_its_chart_is_written(tmp_path: Path) -> None:
-    points = work.measure_scene_rates(load_scene("virtual_wall"), duration=3.0)
-    assert [each.rate for each in points] == pytest.approx([1000, 500, 200, 100, 50])
-    assert {each.environment for each in points} == {"strict"}
-    errors = [each.jnd for each in points]
-    # the same run twice is the same; half as often differs least, every 20 ms most
-    assert errors[0] == 0.0
-    assert 0.0 < errors[1] < 0.3 * errors[4]
-    assert max(errors) == errors[4]
-    assert points[4].step > 0.0
-    paths = {ending: tmp_path / f"wall.{ending}" for ending in work.WORK_ENDINGS}
-    facts = work.write_scene_rates("virtual_wall", points, paths)
-    assert json.loads(paths["json"].read_text()) == facts
-    assert len(paths["csv"].read_text().splitlines()) == 1 + len(points)
-    assert all(path.stat().st_size > 0 for path in paths.values())
-
-
-def test_rates_are_charted_from_the_command_line_and_other_settings_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = ["chart", "point_mass", "--scene-rates", "--out", str(tmp_path)]
-    assert main(asked) == 0
-    assert "  50 Hz: " in capsys.readouterr().out
-    assert {file.name for file in tmp_path.iterdir()} == {
-        f"point_mass_rates.{ending}" for ending in work.WORK_ENDINGS
-    }
-    assert main([*asked, "--quick"]) == 2
-    assert "takes neither" in capsys.readouterr().err
-
-
-def test_a_scene_without_a_path_has_no_rates() -> None:
-    with pytest.raises(StudyError, match="no hand path lies beside"):
-        work.measure_scene_rates(work.floating(1))

@@ -47,6 +47,9 @@ def open_workload(name: str, extent: Extent) -> Workload:
     """
     grid, finest = extent.grid, extent.finest
     known: dict[str, Callable[[], Workload]] = {
+        "jam": lambda: peg.Jam(grid),
+        "spring_arm": lambda: free_bodies.SpringArm(free_bodies.COUPLING, grid),
+        "tap": lambda: contact_bodies.Tap(free_bodies.COUPLING, grid, finest),
         "point_mass": lambda: free_bodies.DrivenMass(scene_run.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
         "rod_impact": lambda: contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, grid),
@@ -232,7 +235,7 @@ class Measurement:
         """True if nothing but method and period was chosen."""
         setting = self.setting
         is_plain = setting.has_usual_contact and setting.iterations is None
-        return is_plain and setting.substeps == 1
+        return is_plain and setting.substeps == 1 and not setting.scene_ticks
 
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
         """Returns the row of a table with every choice and every number."""
@@ -246,6 +249,7 @@ class Measurement:
             "integrator": method.integrator,
             "period_s": setting.period,
             "substeps": setting.substeps,
+            "scene_ticks": setting.scene_ticks,
             "timestep_s": setting.timestep,
             "contact": setting.contact_name,
             **self.chosen,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,10 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import motion_for
 from hapticbridge.check.cost import TICK_SHARE, WARM_UP, TimingStats
 from hapticbridge.check.observe import Setting, rehearsal_parameters
-from hapticbridge.check.perception import felt_error
-from hapticbridge.device import SimulatedDevice, scene_hand
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import BoundKernel
@@ -30,12 +25,9 @@ from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.chart.chart import machine, one_core
 from hapticbridge.lab.chart.output import PICTURES, csv_text, write_files
 from hapticbridge.lab.chart.scene_run import COUPLING
-from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.maps.base import scene_of
-from hapticbridge.options import steady_stiffness
 from hapticbridge.plotting import new_figure
 from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import LOSSLESS_COUPLING
 from hapticbridge.scene import Scene
 
 PERIOD = 1e-3
@@ -580,130 +572,3 @@ def _row(each: Work) -> dict[str, object]:
     row = asdict(each)
     spread = row.pop("time")
     return row | {f"time_{name}": value for name, value in spread.items()}
-
-
-# Rate of one scene behind a loop of 1 kHz
-
-SCENE_TICKS = (1, 2, 5, 10, 20)
-"""Ticks of the loop between two steps of the scene: 1000, 500, 200, 100 and 50 Hz."""
-
-
-@dataclass(frozen=True, slots=True)
-class SceneRate:
-    """One hand on one scene at one rate of the scene.
-
-    Attributes:
-        rate: Steps of the scene per second in Hz.
-        jnd: Felt error against the scene at the loop's rate, in just noticeable differences.
-        force_rms: RMS difference of the force on the tool in N.
-        step: Processor time in s per step of the scene, the loop's ticks between included.
-        share: That time as a share of the scene's period; above 1 the scene falls behind the clock.
-        environment: ``strict``, ``within slack`` or ``active``.
-    """
-
-    rate: float
-    jnd: float
-    force_rms: float
-    step: float
-    share: float
-    environment: str
-
-
-def measure_scene_rates(
-    scene: Scene, ticks_of_scene: Sequence[int] = SCENE_TICKS, *, duration: float | None = None
-) -> list[SceneRate]:
-    """Runs the scene's own hand with its own path at several rates of the scene.
-
-    All rates have one coupling, the stiffest that is steady at the slowest. The run at the loop's
-    rate is the reference: it is the scene in slow motion, if a step takes longer than a tick.
-
-    Args:
-        scene: A scene with a hand path beside it.
-        ticks_of_scene: Ticks of the loop between two steps, from 1 (always run) upwards.
-        duration: Simulated time in s; by default that of the path.
-
-    Raises:
-        StudyError: The scene has no hand path, or a run ended early.
-    """
-    motion = motion_for(scene)
-    if motion is None:
-        raise StudyError(f"no hand path lies beside '{scene.path}'; write NAME.csv there")
-    hand = SimulatedDevice(hand=scene_hand(scene.model, scene.path), path=motion)
-    most = steady_stiffness(scene, hand.info, PERIOD * max(ticks_of_scene), 1.0, 1.0)
-    share = min(1.0, most / COUPLING.stiffness)
-    coupling = replace(
-        COUPLING,
-        stiffness=share * COUPLING.stiffness,
-        rotational_stiffness=share * COUPLING.rotational_stiffness,
-    )
-    ticks = round((motion.duration if duration is None else duration) / PERIOD)
-    ticks -= ticks % math.lcm(*ticks_of_scene)
-    found: list[SceneRate] = []
-    reference: NDArray[np.void] | None = None
-    loop = ClosedLoop(scene)
-    loop.run(hand, coupling, LOSSLESS_COUPLING, ticks=WARM_UP)  # loads the machine code
-    for each in sorted({1, *ticks_of_scene}):
-        outcome = loop.run(
-            hand,
-            coupling,
-            LOSSLESS_COUPLING,
-            ticks=ticks,
-            scene_ticks=each if each > 1 else 0,
-            keep_records=True,
-        )
-        if outcome.ticks < ticks:
-            raise StudyError(
-                f"the run at {1.0 / (each * PERIOD):g} Hz ended at tick {outcome.ticks}"
-            )
-        reference = outcome.records if reference is None else reference
-        felt = felt_error(reference, outcome.records)
-        step = outcome.seconds * each / ticks
-        found.append(
-            SceneRate(
-                rate=1.0 / (each * PERIOD),
-                jnd=felt.jnd,
-                force_rms=felt.force_rms,
-                step=step,
-                share=step / (each * PERIOD),
-                environment=outcome.environment,
-            )
-        )
-    return found
-
-
-def draw_scene_rates(name: str, points: Sequence[SceneRate]) -> Figure:
-    """Draws felt error and cost of a step against the rate of the scene."""
-    figure = new_figure(8, 3.6)
-    felt, cost = figure.subplots(1, 2, sharex=True)
-    rates = np.array([each.rate for each in points])
-    felt.plot(rates[1:], [each.jnd for each in points[1:]], "o-", color="black", mfc="white")
-    felt.axhline(1.0, color="grey", linestyle=":", label="just noticeable")
-    felt.set(yscale="log", ylabel="felt error against 1 kHz (JND)")
-    felt.legend(fontsize="small")
-    steps = 1e3 * np.array([each.step for each in points])
-    cost.plot(rates, steps, "o-", color="black", mfc="white", label="a step costs")
-    cost.plot(rates, 1e3 / rates, ":", color="grey", label="a step may cost: the scene's period")
-    cost.set(yscale="log", ylabel="processor time of a step (ms)")
-    cost.legend(fontsize="small")
-    for axes in (felt, cost):
-        axes.set(xscale="log", xlabel="rate of the scene (Hz)")
-        axes.set_xticks(rates, [f"{rate:g}" for rate in rates])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(visible=True, alpha=0.25)
-    figure.suptitle(f"{name}: one hand, the scene beside a loop of 1 kHz", fontsize="medium")
-    return figure
-
-
-def write_scene_rates(
-    name: str, points: Sequence[SceneRate], paths: Mapping[str, Path]
-) -> dict[str, Any]:
-    """Writes picture, table and JSON; returns the content of the JSON file.
-
-    Raises:
-        HapticBridgeError: A file cannot be written.
-    """
-    rows: list[dict[str, object]] = [{"scene": name} | asdict(each) for each in points]
-    facts = {"scene": name, "points": rows}
-    texts = {"csv": csv_text(rows), "json": json.dumps(facts, indent=2, allow_nan=False) + "\n"}
-    write_files(paths, texts, draw_scene_rates(name, points))
-    return facts
