@@ -333,7 +333,7 @@ def test_only_passive_points_are_round_and_of_their_methods_colour(chart: Chart)
     found = {
         (str(line.get_marker()), str(line.get_color()))
         for line in axes.lines
-        if np.size(line.get_xdata()) == 1 and line.get_marker() != "*"
+        if np.size(line.get_xdata()) == 1 and line.get_marker() not in {"*", "None"}
     }
     red = {mark for mark, colour in found if colour == WARNING}
     assert red == {"X", "v"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import astuple
 from itertools import count
 from pathlib import Path
@@ -25,7 +26,8 @@ def test_floating_bodies_are_as_many_as_asked_and_touch_nothing() -> None:
 def test_plate_stands_on_as_many_contacts_as_it_has_feet() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "contacts")
     chart = work.measure_work(families, most=30, rounds=1)
-    assert [point.contacts for point in chart.points] == [1, 3, 10, 30]
+    for variant in work.METHOD_VARIANTS:
+        assert [p.contacts for p in chart.of(families[0], variant)] == [1, 3, 10, 30]
     assert {point.freedoms for point in chart.points} == {6}
 
 
@@ -40,11 +42,30 @@ def test_boxes_at_rest_sleep_where_they_may_and_only_there() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "resting")
     chart = work.measure_work(families, most=3, rounds=1)
     contacts = {(p.variant, p.size): p.contacts for p in chart.points}
-    for variant in work.VARIANTS:
+    assert len(families[0].variants) == 4
+    for variant in families[0].variants:
         awake = 0 if variant.sleeps else 12
         assert contacts[variant.name, 3] == awake
     scene = work.resting(2)
     assert scene.model.opt.enableflags & 64 == 0
+
+
+def test_substeps_divide_the_tick_and_the_paragraph_names_every_slope() -> None:
+    families = tuple(family for family in work.FAMILIES if family.name == "substeps")
+    chart = work.measure_work(families, most=4, rounds=1)
+    assert [point.contacts for point in chart.points] == [10, 10, 10]
+    scene = families[0].build(4)
+    work.tick_times(scene, work.USUAL, lambda: 0, 4)
+    assert scene.model.opt.timestep == pytest.approx(work.PERIOD / 4)
+    assert re.search(r"Substeps, bridge: .* for 4, as n\^[0-9.]+ from 1 on", work.paragraph(chart))
+
+
+def test_whole_loops_are_timed_with_hands_recording_and_view() -> None:
+    loops = work.measure_loops(rounds=1, ticks=100)
+    assert [each.name for each in loops] == list(work.LOOPS)
+    assert all(0 < each.low <= each.median <= each.high < 0.01 for each in loops)
+    chart = work.WorkChart((), "a machine", loops)
+    assert "Whole loop, two hands: " in work.paragraph(chart)
 
 
 @pytest.mark.parametrize("build", [work.floating, work.plate, work.mesh_ball, work.resting])
@@ -79,7 +100,7 @@ def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "bodies")
     # a clock that goes on by 1 µs a call: every tick takes one
     chart = work.measure_work(families, most=1, rounds=1, clock=lambda: 1000 * next(ticks))
-    (point,) = chart.points
+    point = chart.points[0]
     assert point.time.median == pytest.approx(1e-6)
     assert point.rate == pytest.approx(0.5 / 1e-6)
 

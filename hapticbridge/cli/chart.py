@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,7 @@ from hapticbridge.lab.chart.setting import (
 )
 from hapticbridge.lab.chart.work import (
     WORK_ENDINGS,
+    measure_loops,
     measure_work,
     write_work,
 )
@@ -110,6 +111,8 @@ class Chart:
         paths = prepared_files(self.out, WORK, WORK_ENDINGS)
         with progress(f"chart {WORK}") as show:
             chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
+        with err.status("running whole loops …"):
+            chart = replace(chart, loops=measure_loops())
         facts = write_work(chart, paths)
         if self.as_json:
             print_json(facts)
