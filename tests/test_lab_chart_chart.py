@@ -288,11 +288,16 @@ def test_most_accurate_sound_point_is_recommended_among_costs_that_no_user_notic
 def test_recommendation_says_if_the_product_does_it_by_itself_and_else_how() -> None:
     default = made_up(0.010, 0.5, method="lossless")
     assert default.setting == DEFAULT
-    text = recommendation([default, made_up(0.011, 0.49)], "m")
-    assert "use lossless, 1 ms" in text  # errors alike: the default
+    # nobody feels a tenth of a just noticeable difference
+    text = recommendation([default, made_up(0.011, 0.41)], "m")
+    assert "use lossless, 1 ms" in text
     assert text.endswith("It is the default of 'hapticbridge run'.")
     text = recommendation([default, made_up(0.012, 0.2, substeps=2)], "m")
     assert "'--method implicit --substeps 2'; the default is lossless, 1 ms, which errs" in text
+    slower = replace(default, setting=replace(default.setting, scene_ticks=10))
+    assert recommendation([slower], "m").endswith(
+        "'hapticbridge run', which chooses the scene's rate; '--scene-rate 100' sets it."
+    )
     unfit = made_up(0.010, 0.1, method="lossless", verdict="active")
     text = recommendation([unfit, made_up(0.012, 0.2)], "m")
     assert "the default is lossless, 1 ms, but its environment is active" in text

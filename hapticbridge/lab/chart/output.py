@@ -49,6 +49,9 @@ ALIKE = 0.05
 """Relative difference of two errors that is irrelevant, no unit. A larger one changes the two
 digits that are printed."""
 
+IMPERCEPTIBLE = 0.1
+"""Difference of two errors in JND that is not felt: a tenth of the least that is."""
+
 ALONE = " No other time step bears this out, so it may be luck."
 
 TOLERANCE = 1e-9
@@ -65,7 +68,8 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
 
     Points that a second step confirms come first, if there are any. Of those that take at most
     ``SPARE`` of a core more than the cheapest, the most accurate is chosen. Among errors that agree
-    within ``ALIKE``, the default of the product is preferred, then a point with the usual contacts.
+    within ``ALIKE`` or ``IMPERCEPTIBLE``, the default of the product is preferred, then a point
+    with the usual contacts, then the cheapest.
     """
     fit = [each for each in points if _is_at_rate(each) and not _objections(each, points)]
     if not fit:
@@ -74,16 +78,21 @@ def recommended(points: Sequence[Measurement]) -> Measurement | None:
     cheapest = min(fit, key=lambda each: each.cost.median)
     alike = [each for each in fit if each.cost.low <= cheapest.cost.high + SPARE]
     least = min(each.score.jnd for each in alike)
-    best = [each for each in alike if each.score.jnd <= (1 + ALIKE) * least]
+    worst = max((1 + ALIKE) * least, least + IMPERCEPTIBLE)
+    best = [each for each in alike if each.score.jnd <= worst]
     return min(
         best,
         key=lambda each: (
-            each.setting != DEFAULT,
+            not _is_default(each.setting),
             not each.is_usual,
-            each.score.jnd,
             each.cost.median,
         ),
     )
+
+
+def _is_default(setting: Setting) -> bool:
+    """Returns True for the default at any rate of the scene, which the product chooses itself."""
+    return replace(setting, scene_ticks=0) == DEFAULT
 
 
 def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
@@ -98,12 +107,12 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     best = recommended(points)
     goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
     if not is_truth:
-        goal += " (counted from the method's own limit at small steps, not from the truth)"
+        goal += " (counted from the reference above, which is not the truth)"
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
         return (
             f"{goal}, use {best.setting.label}: {_numbers(best)}. It is passive, has no hazard, "
-            f"and no such point errs less for at most {100 * SPARE:g} % of a core more."
+            f"and for at most {100 * SPARE:g} % of a core more no such point errs noticeably less."
             f"{alone} {_way_to(best, points)}"
         )
     tried = [each for each in points if _is_at_rate(each) and np.isfinite(each.score.jnd)]
@@ -119,20 +128,24 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
 def _way_to(best: Measurement, points: Sequence[Measurement]) -> str:
     """States how a user gets a point: the default, or options and why the default is not it."""
     setting = best.setting
-    if setting == DEFAULT:
-        return "It is the default of 'hapticbridge run'."
+    rate = f"--scene-rate {1 / setting.scene_period:g}" if setting.scene_ticks else ""
+    if _is_default(setting):
+        chosen = f", which chooses the scene's rate; '{rate}' sets it" if rate else ""
+        return f"It is the default of 'hapticbridge run'{chosen}."
     if setting.engine != OWN or setting.iterations is not None:
         return "'hapticbridge run' does not offer it."
     options = f"--method {setting.method.name}"
     if setting.substeps > 1:
         options += f" --substeps {setting.substeps}"
+    if rate:
+        options += f" {rate}"
     if setting.contact_name != DEFAULT.contact_name:
         options += " --contact scene"
     default = _default_of(points)
     if default is None:
         return f"Choose it with '{options}'; the default was not measured."
     faults = _objections(default, points)
-    why = f"but {' and '.join(faults)}" if faults else "which errs more"
+    why = f"but {' and '.join(faults)}" if faults else "which errs by more than that"
     return (
         f"Choose it with '{options}'; the default is {default.setting.label}, {why}: "
         f"{_numbers(default)}."
