@@ -370,6 +370,14 @@ def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object,
     assert recommended([flawed, good]) is good  # type: ignore[list-item]
 
 
+def test_contacts_that_are_passive_in_this_motion_alone_are_not_recommended() -> None:
+    usual = made_up(0.03, 0.2, method="lossless")
+    own = setting.Setting(METHODS["implicit"].with_contact("scene"), 1e-3)
+    cheap = replace(made_up(0.01, 0.1), setting=own)
+    assert recommended([cheap, usual]) is usual
+    assert "MuJoCo's contacts may create energy in another motion" in recommendation([cheap], "m")
+
+
 def test_picture_says_why_a_cheaper_method_is_passed_over(chart: Chart) -> None:
     good, kicks = made_up(0.02, 0.5), made_up(0.01, 0.4, method="explicit")
     panel = chart.workload.panels[0]
@@ -431,7 +439,7 @@ def test_point_nearer_to_its_own_limit_than_that_is_to_others_is_not_comparable(
     assert shared.is_comparable
     assert recommended([apart, shared]) is shared
     text = recommendation([apart], "a machine")
-    assert "its own limit lies 0.34 JND from what most methods converge to" in text
+    assert "its own limit lies 0.34 JND from that of rigid contacts" in text
     far = made_up(0.010, 0.5, method="lossless", limit_apart=0.34)
     assert far.is_comparable
 

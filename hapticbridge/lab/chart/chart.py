@@ -206,7 +206,7 @@ class Measurement:
         score: Errors.
         chosen: Contacts and solver of the engine, by name.
         limit_apart: Where errors are counted from each method's own limit: the distance in JND of
-            that limit from the one that most methods agree on. 0 where they are counted from the
+            that limit from the central one (``References``). 0 where they are counted from the
             truth.
     """
 
@@ -493,8 +493,7 @@ def _notes(apart: Mapping[str, float]) -> Iterator[str]:
         central = min(apart, key=lambda name: apart[name])
         listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
         yield (
-            "How far the methods' own limits lie from the one that most of them are near, that of "
-            f"{central}, in JND: {listed}. A point that is nearer to its own limit than that limit "
-            "is to the others cannot be compared with them: it is drawn pale, and is neither on "
-            "the front nor recommended."
+            f"How far the methods' own limits lie from that of {central}, in JND: {listed}. A "
+            "point that is nearer to its own limit than that limit is to this one cannot be "
+            "compared: it is drawn pale, and is neither on the front nor recommended."
         )

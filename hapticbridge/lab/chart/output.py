@@ -267,9 +267,7 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     elif not steady < JND:
         found.append(f"its error grows to {steady:.2g} JND at a smaller step, so it is luck")
     if not each.is_comparable:
-        found.append(
-            f"its own limit lies {each.limit_apart:.2g} JND from what most methods converge to"
-        )
+        found.append(f"its own limit lies {each.limit_apart:.2g} JND from that of rigid contacts")
     if each.setting.iterations is not None:
         found.append("its solver is cut short")
     if not each.is_sound:
@@ -280,6 +278,8 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
         found.append(f"it takes {100 * each.cost.median:.0f} % of a core")
     if each.setting.method.hazard:
         found.append("it may kick on a real device")
+    elif not each.setting.method.is_rigid:
+        found.append("MuJoCo's contacts may create energy in another motion")
     return found
 
 
@@ -452,8 +452,8 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
         facts.append("level: smaller steps gain nothing")
     if not all(each.is_comparable for each in points):
         facts.append(
-            "pale: nearer to its own limit than\n"
-            "that is to most others' (off, in JND):\nnot comparable"
+            "pale: nearer to its own limit than that\n"
+            "is to rigid contacts' (off, in JND):\nnot comparable"
         )
     if any(each.score.jnd < FLOOR for each in points):
         facts.append(f"at the lower edge: {FLOOR:g} JND or less")

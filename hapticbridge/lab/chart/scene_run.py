@@ -342,12 +342,13 @@ class OwnReferences:
     def disagreement(self) -> dict[str, float]:
         """Returns the distance in JND of each method's limit from the central one.
 
-        The central limit has the least median distance to all, so most methods agree on it. It
-        belongs to a method that renders the requested coupling, if there is one. Limits that agree
-        are likely the motion of the model; if they differ, at most one is.
+        The central limit has the least median distance to all, among the methods with rigid
+        contacts and a coupling's law, if there are any, or with a law. Scenes model rigid bodies:
+        where contacts of MuJoCo converge to another motion, their limit is that of its springs.
         """
         found = {name: each.records for name, each in self._found.items() if each is not None}
-        centers = [name for name in found if METHODS[name].has_law] or list(found)
+        laws = [name for name in found if METHODS[name].has_law]
+        centers = [name for name in laws if METHODS[name].is_rigid] or laws or list(found)
         apart = [
             {name: felt_error(found[center], each).jnd for name, each in found.items()}
             for center in centers
