@@ -28,10 +28,13 @@ from hapticbridge.lab.chart.chart import (
     pareto_front,
 )
 from hapticbridge.lab.chart.output import (
+    DEFAULT,
+    WARNING,
     draw_chart,
     prepared_files,
     recommendation,
     recommended,
+    standing,
     write_chart,
 )
 from hapticbridge.lab.chart.workload import Score, Verdict
@@ -271,19 +274,75 @@ def test_table_says_what_contacts_and_solver_really_were() -> None:
     assert [each["solver_iterations"] for each in chosen] == [100, 100, 100, 5, 100]
 
 
-def test_cheapest_sound_point_is_recommended_and_the_more_accurate_of_equal_costs() -> None:
-    cheap = made_up(0.010, 0.9, spread=0.1)
-    better = made_up(0.0105, 0.3, method="lossless")
-    dear = made_up(0.020, 0.1)
+def test_most_accurate_sound_point_is_recommended_among_costs_that_no_user_notices() -> None:
+    cheap = made_up(0.010, 0.9)
+    better = made_up(0.019, 0.3, method="lossless")
+    dear = made_up(0.030, 0.1, method="compensated")
     assert recommended([cheap, better, dear]) is better
     assert recommended([cheap, dear]) is cheap
+    # where the spreads of two costs meet within that, they are alike whichever is disturbed
+    disturbed = made_up(0.022, 0.1, method="compensated", spread=0.1)
+    assert recommended([cheap, better, disturbed]) is disturbed
 
 
-def test_points_whose_spreads_meet_cost_alike_whichever_is_disturbed() -> None:
-    calm, disturbed = made_up(0.0100, 0.9), made_up(0.0110, 0.3, method="lossless", spread=0.1)
-    assert recommended([calm, disturbed]) is disturbed
-    apart = made_up(0.0110, 0.3, method="lossless", spread=0.05)
-    assert recommended([calm, apart]) is calm
+def test_recommendation_says_if_the_product_does_it_by_itself_and_else_how() -> None:
+    default = made_up(0.010, 0.5, method="lossless")
+    assert default.setting == DEFAULT
+    # nobody feels a tenth of a just noticeable difference
+    text = recommendation([default, made_up(0.011, 0.41)], "m")
+    assert "use lossless, 1 ms" in text
+    assert text.endswith("It is the default of 'hapticbridge run'.")
+    text = recommendation([default, made_up(0.012, 0.2, substeps=2)], "m")
+    assert "'--method implicit --substeps 2'; the default is lossless, 1 ms, which errs" in text
+    slower = replace(default, setting=replace(default.setting, scene_ticks=10))
+    assert recommendation([slower], "m").endswith(
+        "'hapticbridge run', which chooses the scene's rate; '--scene-rate 100' sets it."
+    )
+    unfit = made_up(0.010, 0.1, method="lossless", verdict="active")
+    text = recommendation([unfit, made_up(0.012, 0.2)], "m")
+    assert "the default is lossless, 1 ms, but its environment is active" in text
+
+
+def test_page_says_who_is_ahead_of_the_default_by_how_much_and_what_it_takes() -> None:
+    own = [
+        made_up(1e-2 * (1e-3 / period), 0.4 * (1e3 * period) ** 2, method="lossless", period=period)
+        for period in (2e-3, 1e-3, 5e-4)
+    ]
+    assert "the default, lossless, 1 ms, is on the front" in standing(own)
+    ahead = made_up(0.005, 0.2, method="explicit", verdict="within slack")
+    text = standing([*own, ahead])
+    assert "Ahead: explicit, 1 ms. The best has 1/2 of its error at 1/2 of its cost" in text
+    assert "a light tool diverges" in text
+    # its error falls with the square of the step
+    assert text.endswith("'lossless' reaches that error at a period of 0.71 ms.")
+    none = standing([*own, made_up(0.005, 1e-3, method="explicit", verdict="strict")])
+    assert none.endswith("'lossless' does not reach that error at any step that was tried.")
+    # what is cheaper and worse, or dearer and better, or not passive, or slower is not ahead
+    others = [
+        made_up(0.005, 0.5),
+        made_up(0.02, 0.1),
+        made_up(0.005, 0.1, verdict="active"),
+        made_up(0.005, 0.1, period=2e-3),
+    ]
+    assert "is on the front" in standing([*own, *others])
+
+
+def test_only_passive_points_are_round_and_of_their_methods_colour(chart: Chart) -> None:
+    panel = chart.workload.panels[0]
+    verdicts: tuple[Verdict, ...] = ("strict", "within slack", "active", "diverged")
+    points = tuple(
+        replace(made_up(0.01, 0.5, period=1e-3 / (1 + k), verdict=verdict), panel=panel.key)
+        for k, verdict in enumerate(verdicts)
+    )
+    axes = draw_chart(replace(chart, measurements=points)).axes[0]
+    found = {
+        (str(line.get_marker()), str(line.get_color()))
+        for line in axes.lines
+        if np.size(line.get_xdata()) == 1 and line.get_marker() not in {"*", "None"}
+    }
+    red = {mark for mark, colour in found if colour == WARNING}
+    assert red == {"X", "v"}
+    assert {mark for mark, colour in found if colour != WARNING} == {"o"}
 
 
 def test_usual_contact_is_recommended_where_errors_are_alike() -> None:
@@ -309,6 +368,14 @@ def test_flawed_point_is_not_recommended_but_named_with_its_flaw(flawed: object,
     assert said in text
     good = made_up(0.3, 0.9)
     assert recommended([flawed, good]) is good  # type: ignore[list-item]
+
+
+def test_contacts_that_are_passive_in_this_motion_alone_are_not_recommended() -> None:
+    usual = made_up(0.03, 0.2, method="lossless")
+    own = setting.Setting(METHODS["implicit"].with_contact("scene"), 1e-3)
+    cheap = replace(made_up(0.01, 0.1), setting=own)
+    assert recommended([cheap, usual]) is usual
+    assert "MuJoCo's contacts may create energy in another motion" in recommendation([cheap], "m")
 
 
 def test_picture_says_why_a_cheaper_method_is_passed_over(chart: Chart) -> None:
@@ -372,7 +439,7 @@ def test_point_nearer_to_its_own_limit_than_that_is_to_others_is_not_comparable(
     assert shared.is_comparable
     assert recommended([apart, shared]) is shared
     text = recommendation([apart], "a machine")
-    assert "its own limit lies 0.34 JND from what most methods converge to" in text
+    assert "its own limit lies 0.34 JND from that of rigid contacts" in text
     far = made_up(0.010, 0.5, method="lossless", limit_apart=0.34)
     assert far.is_comparable
 

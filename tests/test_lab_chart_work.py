@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from dataclasses import astuple
 from itertools import count
 from pathlib import Path
@@ -14,7 +14,6 @@ from scipy.spatial import ConvexHull
 from hapticbridge.cli import main
 from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import work
-from hapticbridge.scene import load_scene
 
 
 def test_floating_bodies_are_as_many_as_asked_and_touch_nothing() -> None:
@@ -27,7 +26,8 @@ def test_floating_bodies_are_as_many_as_asked_and_touch_nothing() -> None:
 def test_plate_stands_on_as_many_contacts_as_it_has_feet() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "contacts")
     chart = work.measure_work(families, most=30, rounds=1)
-    assert [point.contacts for point in chart.points] == [1, 3, 10, 30]
+    for variant in work.METHOD_VARIANTS:
+        assert [p.contacts for p in chart.of(families[0], variant)] == [1, 3, 10, 30]
     assert {point.freedoms for point in chart.points} == {6}
 
 
@@ -42,11 +42,30 @@ def test_boxes_at_rest_sleep_where_they_may_and_only_there() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "resting")
     chart = work.measure_work(families, most=3, rounds=1)
     contacts = {(p.variant, p.size): p.contacts for p in chart.points}
-    for variant in work.VARIANTS:
+    assert len(families[0].variants) == 4
+    for variant in families[0].variants:
         awake = 0 if variant.sleeps else 12
         assert contacts[variant.name, 3] == awake
     scene = work.resting(2)
     assert scene.model.opt.enableflags & 64 == 0
+
+
+def test_substeps_divide_the_tick_and_the_paragraph_names_every_slope() -> None:
+    families = tuple(family for family in work.FAMILIES if family.name == "substeps")
+    chart = work.measure_work(families, most=4, rounds=1)
+    assert [point.contacts for point in chart.points] == [10, 10, 10]
+    scene = families[0].build(4)
+    work.tick_times(scene, work.USUAL, lambda: 0, 4)
+    assert scene.model.opt.timestep == pytest.approx(work.PERIOD / 4)
+    assert re.search(r"Substeps, bridge: .* for 4, as n\^[0-9.]+ from 1 on", work.paragraph(chart))
+
+
+def test_whole_loops_are_timed_with_hands_recording_and_view() -> None:
+    loops = work.measure_loops(rounds=1, ticks=100)
+    assert [each.name for each in loops] == list(work.LOOPS)
+    assert all(0 < each.low <= each.median <= each.high < 0.01 for each in loops)
+    chart = work.WorkChart((), "a machine", loops)
+    assert "Whole loop, two hands: " in work.paragraph(chart)
 
 
 @pytest.mark.parametrize("build", [work.floating, work.plate, work.mesh_ball, work.resting])
@@ -81,7 +100,7 @@ def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "bodies")
     # a clock that goes on by 1 µs a call: every tick takes one
     chart = work.measure_work(families, most=1, rounds=1, clock=lambda: 1000 * next(ticks))
-    (point,) = chart.points
+    point = chart.points[0]
     assert point.time.median == pytest.approx(1e-6)
     assert point.rate == pytest.approx(0.5 / 1e-6)
 
@@ -95,38 +114,3 @@ def test_work_refuses_what_it_would_not_heed(
     assert main(["chart", "work", *option, "--out", str(tmp_path)]) == 2
     assert "it takes neither --methods nor" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_slower_scene_feels_more_different_and_its_chart_is_written(tmp_path: Path) -> None:
-    points = work.measure_scene_rates(load_scene("virtual_wall"), duration=3.0)
-    assert [each.rate for each in points] == pytest.approx([1000, 500, 200, 100, 50])
-    assert {each.environment for each in points} == {"strict"}
-    errors = [each.jnd for each in points]
-    # the same run twice is the same; half as often differs least, every 20 ms most
-    assert errors[0] == 0.0
-    assert 0.0 < errors[1] < 0.3 * errors[4]
-    assert max(errors) == errors[4]
-    assert points[4].step > 0.0
-    paths = {ending: tmp_path / f"wall.{ending}" for ending in work.WORK_ENDINGS}
-    facts = work.write_scene_rates("virtual_wall", points, paths)
-    assert json.loads(paths["json"].read_text()) == facts
-    assert len(paths["csv"].read_text().splitlines()) == 1 + len(points)
-    assert all(path.stat().st_size > 0 for path in paths.values())
-
-
-def test_rates_are_charted_from_the_command_line_and_other_settings_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = ["chart", "point_mass", "--scene-rates", "--out", str(tmp_path)]
-    assert main(asked) == 0
-    assert "  50 Hz: " in capsys.readouterr().out
-    assert {file.name for file in tmp_path.iterdir()} == {
-        f"point_mass_rates.{ending}" for ending in work.WORK_ENDINGS
-    }
-    assert main([*asked, "--quick"]) == 2
-    assert "takes neither" in capsys.readouterr().err
-
-
-def test_a_scene_without_a_path_has_no_rates() -> None:
-    with pytest.raises(StudyError, match="no hand path lies beside"):
-        work.measure_scene_rates(work.floating(1))

@@ -43,7 +43,9 @@ from hapticbridge.theory.rigid_body import CoupledStepRule, drive_mass, integrat
 NOTHING = (0.0, 0.0, 0.0)
 FRAME = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
 START = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
-SINGLE_PRECISION = {"physx", "physx_spring"}
+SINGLE_PRECISION = {"physx", "physx_spring", "rapier"}
+PARTS = {"rapier": 8}
+"""Parts into which an engine divides a step under a held force, where more than one."""
 SPRINGS = {"ode_spring", "physx_spring"}
 """Engines whose coupling is a spring of their own, solved with the contacts."""
 
@@ -69,20 +71,25 @@ def test_a_tool_falls_as_half_g_t_squared_to_first_order(engine: Engine) -> None
         with opened(engine, task, timestep) as simulation:
             coast(simulation, round(0.2 / timestep))
             errors.append(simulation.pose().position[2] + 0.5 * GRAVITY * 0.2**2)
-            assert simulation.velocity().linear[2] == pytest.approx(-GRAVITY * 0.2, rel=1e-5)
+            rounding = 5e-5 if engine.name in PARTS else 1e-5
+            assert simulation.velocity().linear[2] == pytest.approx(-GRAVITY * 0.2, rel=rounding)
     # a step that takes the new velocity is ahead by half a step's fall
-    assert errors == pytest.approx([-0.5 * GRAVITY * 0.2 * t for t in (2e-3, 1e-3)], rel=5e-3)
+    # (single precision rounds by 2 µm in 0.2 s)
+    ahead = 0.5 * GRAVITY * 0.2 / PARTS.get(engine.name, 1)
+    assert errors == pytest.approx([-ahead * t for t in (2e-3, 1e-3)], rel=0.02)
 
 
 def test_a_driven_mass_follows_its_scheme_and_the_closed_form(engine: Engine) -> None:
     handle = driven_mass(1e-3)[1]
     scheme: CoupledStepRule = "implicit" if engine.name in SPRINGS else "held"
     expected = drive_mass(COUPLING, MASS, handle, 1e-3, scheme).position
-    # PhysX solves its spring in parts of a step, so it lies between the two schemes
-    apart = {"physx": 1e-5, "physx_spring": 0.05}.get(engine.name, 1e-12)
+    # PhysX solves its spring in parts of a step, so it lies between the two schemes; Rapier every
+    # force, so that it is nearer to an exact hold
+    apart = {"physx": 1e-5, "physx_spring": 0.05, "rapier": 0.02}.get(engine.name, 1e-12)
     assert np.abs(driven_path(engine, 1e-3) - expected).max() < apart * AMPLITUDE
     coarse, fine = driven_error(engine, 2e-3), driven_error(engine, 1e-3)
-    assert fine < (0.02 if engine.name in SPRINGS else 0.002)
+    is_divided = engine.name in SPRINGS or engine.name in PARTS
+    assert fine < (0.02 if is_divided else 0.002)
     # first order; PhysX divides a step into as many parts whatever its length
     assert coarse / fine == pytest.approx(2, rel=0.25 if engine.name in SPRINGS else 0.1)
 
@@ -119,6 +126,7 @@ GAINS = {
     "ode_spring": (-0.2, 0.0),
     "physx": (0.0, 0.02),
     "physx_spring": (0.0, 0.02),
+    "rapier": (0.0, 0.25),
     "pybullet": (0.0, 0.25),
     "pybullet_dantzig": (0.0, 0.25),
     "drake_point": (0.0, 0.25),
@@ -175,7 +183,9 @@ def test_a_moving_tool_starts_with_the_velocity_of_its_centre(engine: Engine) ->
         pose = simulation.pose()
     before = START.position + turn(START.quaternion).apply(FRAME.position)
     after = pose.position + turn(pose.quaternion).apply(FRAME.position)
-    assert after - before == pytest.approx(0.01 * np.array(velocity.linear), abs=2e-6)
+    # in single precision each part of a step rounds the position by up to 15 nm
+    rounding = 1e-5 if engine.name in PARTS else 2e-6
+    assert after - before == pytest.approx(0.01 * np.array(velocity.linear), abs=rounding)
 
 
 @pytest.mark.parametrize("kind", RESTING)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,20 +13,26 @@ from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.engine_run import peer_settings
 from hapticbridge.lab.chart.output import ChartFiles, prepared_files, write_chart
-from hapticbridge.lab.chart.setting import chosen_methods, chosen_periods, settings_for
+from hapticbridge.lab.chart.scene_run import SceneRates
+from hapticbridge.lab.chart.setting import (
+    Setting,
+    chosen_methods,
+    chosen_periods,
+    rate_settings,
+    settings_for,
+)
 from hapticbridge.lab.chart.work import (
     WORK_ENDINGS,
-    measure_scene_rates,
+    measure_loops,
     measure_work,
-    write_scene_rates,
     write_work,
 )
+from hapticbridge.lab.chart.workload import Workload
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
-from hapticbridge.scene import load_scene
 
 ALL = "all"
 
-WORK = "work"
+WORK, SLOW_SCENE = "work", "slow_scene"
 QUICK_SIZE = 30
 """Largest scene of a quick chart of work."""
 
@@ -35,10 +41,11 @@ QUICK_SIZE = 30
 class Chart:
     """Chart the cost of ways to simulate a scene against their error.
 
-    The scene is point_mass, peg_in_hole, rod_impact, sliding_block or spinning_body, which have
-    references of their own, or any scene with a hand path beside it, which is compared with finer
-    steps. 'work' in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png,
-    .svg, .csv and .json into the folder.
+    The scene is point_mass, spinning_body, spring_arm, tap, rod_impact, sliding_block, jam or
+    peg_in_hole, which have references of their own, or any scene with a hand path beside it, which
+    is compared with finer steps. slow_scene is 'beads' with --scene-rates. 'work' in place of a
+    scene charts what a tick costs as a scene grows. Writes SCENE.png, .svg, .csv and .json into the
+    folder.
 
     Example:
         hapticbridge chart peg_in_hole --out charts
@@ -57,27 +64,25 @@ class Chart:
     quick: bool = False
     """Three time steps and three rounds of timing: half a minute."""
     scene_rates: bool = False
-    """Chart felt error and cost against the rate of a scene that steps slower than the loop."""
+    """Chart a scene that steps less often than the loop, beside a loop that is as slow."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print what the chart says as JSON."""
 
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
-        if self.scene_rates:
-            return self._execute_scene_rates()
-        if self.scene == WORK:
+        is_rates = self.scene_rates or self.scene == SLOW_SCENE
+        if is_rates or self.scene == WORK:
             if self.methods is not None or self.steps is not None or self.engines:
+                name = "--scene-rates" if self.scene_rates else f"'{self.scene}'"
                 raise StudyError(
-                    f"'{WORK}' has scenes and settings of its own; it takes neither --methods nor "
-                    "--steps nor --engines"
+                    f"{name} has settings of its own; it takes neither --methods nor --steps nor "
+                    "--engines"
                 )
-            return self._execute_work()
-        periods = chosen_periods(self.steps, is_quick=self.quick)
-        methods = chosen_methods(self.methods)
+            if not is_rates:
+                return self._execute_work()
         with err.status("preparing references …"):
-            workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
+            workload, settings, periods = self._rates() if is_rates else self._usual()
         paths = prepared_files(self.out, workload.name)
-        settings = settings_for(methods, periods, has_contact=workload.has_contact)
         with caught_prints(_print_dim), progress(f"chart {workload.name}") as show:
             settings += peer_settings(self._peers(), periods)
             chart = measure_chart(
@@ -90,36 +95,29 @@ class Chart:
             _print(files)
         return 0
 
+    def _usual(self) -> tuple[Workload, list[Setting], list[float]]:
+        periods = chosen_periods(self.steps, is_quick=self.quick)
+        methods = chosen_methods(self.methods)
+        workload = open_workload(self.scene, Extent(periods[0], periods[-1]))
+        return workload, settings_for(methods, periods, has_contact=workload.has_contact), periods
+
+    def _rates(self) -> tuple[Workload, list[Setting], list[float]]:
+        is_named = self.scene == SLOW_SCENE
+        scene = "beads" if is_named else self.scene
+        workload = SceneRates(scene, SLOW_SCENE if is_named else f"{Path(scene).stem}_rates")
+        return workload, rate_settings(), []
+
     def _execute_work(self) -> int:
         paths = prepared_files(self.out, WORK, WORK_ENDINGS)
         with progress(f"chart {WORK}") as show:
             chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
+        with err.status("running whole loops …"):
+            chart = replace(chart, loops=measure_loops())
         facts = write_work(chart, paths)
         if self.as_json:
             print_json(facts)
         else:
             out.print(plain(facts["paragraph"]))
-        err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
-        return 0
-
-    def _execute_scene_rates(self) -> int:
-        if self.methods is not None or self.steps is not None or self.engines or self.quick:
-            raise StudyError(
-                "--scene-rates has settings of its own; it takes neither --methods nor --steps nor "
-                "--engines nor --quick"
-            )
-        scene = load_scene(self.scene)
-        paths = prepared_files(self.out, f"{scene.path.stem}_rates", WORK_ENDINGS)
-        with err.status("running every rate …"):
-            facts = write_scene_rates(scene.path.stem, measure_scene_rates(scene), paths)
-        if self.as_json:
-            print_json(facts)
-        else:
-            for point in facts["points"]:
-                out.print(
-                    f"{point['rate']:4.0f} Hz: {point['jnd']:.2g} JND, a step costs "
-                    f"{1e3 * point['step']:.3g} ms, {plain(point['environment'])}"
-                )
         err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
         return 0
 
@@ -144,7 +142,8 @@ def _print_dim(line: str) -> None:
 def _print(files: ChartFiles) -> None:
     for panel in files.facts["panels"]:
         out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
-        out.print(f"  {plain(panel['recommendation'])}")
+        for text in filter(None, (panel["recommendation"], panel["standing"])):
+            out.print(f"  {plain(text)}")
         out.print("  on the front, by cost:" if panel["front"] else "  nothing is on the front")
         for point in panel["front"]:
             out.print(

@@ -47,6 +47,9 @@ def open_workload(name: str, extent: Extent) -> Workload:
     """
     grid, finest = extent.grid, extent.finest
     known: dict[str, Callable[[], Workload]] = {
+        "jam": lambda: peg.Jam(grid),
+        "spring_arm": lambda: free_bodies.SpringArm(free_bodies.COUPLING, grid),
+        "tap": lambda: contact_bodies.Tap(free_bodies.COUPLING, grid, finest),
         "point_mass": lambda: free_bodies.DrivenMass(scene_run.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),
         "rod_impact": lambda: contact_bodies.RodImpact(contact_bodies.ROD_COUPLING, grid),
@@ -203,7 +206,7 @@ class Measurement:
         score: Errors.
         chosen: Contacts and solver of the engine, by name.
         limit_apart: Where errors are counted from each method's own limit: the distance in JND of
-            that limit from the one that most methods agree on. 0 where they are counted from the
+            that limit from the central one (``References``). 0 where they are counted from the
             truth.
     """
 
@@ -232,7 +235,7 @@ class Measurement:
         """True if nothing but method and period was chosen."""
         setting = self.setting
         is_plain = setting.has_usual_contact and setting.iterations is None
-        return is_plain and setting.substeps == 1
+        return is_plain and setting.substeps == 1 and not setting.scene_ticks
 
     def cells(self, workload: str, coupling: Coupling) -> dict[str, object]:
         """Returns the row of a table with every choice and every number."""
@@ -246,6 +249,7 @@ class Measurement:
             "integrator": method.integrator,
             "period_s": setting.period,
             "substeps": setting.substeps,
+            "scene_ticks": setting.scene_ticks,
             "timestep_s": setting.timestep,
             "contact": setting.contact_name,
             **self.chosen,
@@ -489,8 +493,7 @@ def _notes(apart: Mapping[str, float]) -> Iterator[str]:
         central = min(apart, key=lambda name: apart[name])
         listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
         yield (
-            "How far the methods' own limits lie from the one that most of them are near, that of "
-            f"{central}, in JND: {listed}. A point that is nearer to its own limit than that limit "
-            "is to the others cannot be compared with them: it is drawn pale, and is neither on "
-            "the front nor recommended."
+            f"How far the methods' own limits lie from that of {central}, in JND: {listed}. A "
+            "point that is nearer to its own limit than that limit is to this one cannot be "
+            "compared: it is drawn pale, and is neither on the front nor recommended."
         )

@@ -1,15 +1,18 @@
-"""Workload ``sliding_block``: a block that sticks, breaks away and slides, in closed form."""
+"""Workloads with a contact whose motion is known: a sliding block, a falling rod, a tap."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from hapticbridge.check.perception import WEBER
 from hapticbridge.coupling import Coupling
@@ -31,7 +34,7 @@ from hapticbridge.lab.engines.base import Body, Pose, Shape, Task, Velocity
 from hapticbridge.lab.maps.base import scene_of
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.record import TICK_DTYPE
-from hapticbridge.scene import Scene
+from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.impact import Impact, ImpactBody, resolve_impact
 
 BLOCK_MASS = 0.2
@@ -397,3 +400,129 @@ class RodImpact(Staged):
 def _worst(takes: Sequence[Take]) -> Verdict:
     order: tuple[Verdict, ...] = ("not metered", "strict", "within slack", "active")
     return max((take.environment for take in takes), key=order.index)
+
+
+TAP_MASS, BALL, GAP = 0.05, 0.01, 0.01
+"""Mass in kg, radius in m, and way to the wall in m, of the tool of ``models/virtual_wall``."""
+
+TAP_SIZE, TAP_FREQUENCY, TAP_DURATION = 8e-3, 3.0, 1.0
+"""Amplitude in m, frequency in Hz and duration in s: three taps, 6 mm behind the wall's face."""
+
+CLEAR = 1e-9
+"""Distance in m from the wall at which a ball that leaves it starts: leaving is no impact."""
+
+TAP_PANEL = Panel(
+    "tapping",
+    "a ball on a rail that taps a wall",
+    "closed form between rigid impacts without rebound, by SciPy's DOP853 and Brent's method",
+)
+
+
+def tapping(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a handle that moves along x, A (1 − cos ωt)."""
+    positions, quaternions = still(times)
+    positions[:, 0] = TAP_SIZE * (1 - np.cos(2 * np.pi * TAP_FREQUENCY * times))
+    return positions, quaternions
+
+
+def exact_taps(
+    coupling: Coupling, times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the ball's position in m and the force of the coupling in N at increasing times in s.
+
+    The ball is free until it meets the wall, where its velocity becomes 0. It rests there until the
+    coupling pulls it away, K (h − gap) + B h' < 0.
+    """
+    k, b, omega = coupling.stiffness, coupling.damping, 2 * np.pi * TAP_FREQUENCY
+    end = float(times[-1])
+
+    def force(time: Any, place: Any, speed: Any) -> Any:
+        stretch = TAP_SIZE * (1 - np.cos(omega * time)) - place
+        return k * stretch + b * (TAP_SIZE * omega * np.sin(omega * time) - speed)
+
+    def meets(_time: float, state: NDArray[np.float64]) -> float:
+        return float(state[0]) - GAP
+
+    meets.terminal, meets.direction = True, 1.0  # type: ignore[attr-defined]
+    place, speed = np.full(times.size, GAP), np.zeros(times.size)
+    now, state = 0.0, [0.0, 0.0]
+    while now < end:
+        free = solve_ivp(
+            lambda t, y: [y[1], force(t, y[0], y[1]) / TAP_MASS],
+            (now, end),
+            state,
+            "DOP853",
+            events=meets,
+            rtol=1e-10,
+            atol=1e-13,
+            dense_output=True,
+        )
+        met = float(free.t[-1])
+        during = (times > now) & (times <= met)
+        if during.any():
+            place[during], speed[during] = free.sol(times[during])
+        if free.status == 0:
+            break
+        # the handle turns back within half a period
+        later = np.linspace(met, met + 0.5 / TAP_FREQUENCY, 2000)
+        pulls = np.flatnonzero(force(later, GAP, 0.0) < 0)
+        first = int(pulls[0])
+        now = met if not first else brentq(force, later[first - 1], later[first], (GAP, 0.0))
+        state = [GAP - CLEAR, 0.0]
+    return place, force(times, place, speed)
+
+
+class Tap(Staged):
+    """Tapping on a wall as a workload.
+
+    Args:
+        coupling: K and B; nothing turns.
+        grid: Longest period T in s.
+        finest: Shortest in s.
+    """
+
+    name = "tap"
+    about = "a ball on a rail taps a wall three times"
+    panels: Sequence[Panel] = (TAP_PANEL,)
+    needs_tool = "pulls by no spring of known stiffness"
+    has_contact = True
+
+    def __init__(self, coupling: Coupling, grid: float, finest: float) -> None:
+        self._grid, self._finest = grid, finest
+        count = round(TAP_DURATION / grid)
+        self._reference = np.zeros(count, TICK_DTYPE)
+        self._reference["tool_quaternion"][:, 0] = 1.0
+        place, force = exact_taps(coupling, grid * np.arange(1.0, count + 1))
+        self._reference["tool_position"][:, 0] = place
+        self._reference["wrench_on_tool"][:, 0] = force
+        super().__init__(
+            coupling,
+            Stages(lambda: Stage(load_scene("virtual_wall"), tapping, grid * count, coupling)),
+        )
+
+    def peer_work(self) -> PeerWork:
+        """Describes the ball to other engines: free, and pressed at its centre alone."""
+        duration = self._grid * self._reference.size
+        moment = 0.4 * TAP_MASS * BALL**2
+        task = Task(
+            self.name,
+            Body(TAP_MASS, (moment,) * 3, shapes=(Shape("sphere", (BALL,)),)),
+            (Shape("box", (0.01, 0.03, 0.03), (0.01 + BALL + GAP, 0.0, 0.0)),),
+            coupling=self.coupling,
+            handle=motion_along(tapping, duration, self._finest),
+        )
+        return PeerWork((task,), duration, self._judge)
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        if take.has_diverged:
+            return {TAP_PANEL.key: diverged(take.created, take.ended)}
+        records = take.at(self._grid)
+        has_touched = bool(np.any(records["contacts"] > 0))
+        score = score_of(
+            self._reference,
+            records,
+            created=take.created,
+            verdict=take.environment if has_touched else "lost contact",
+        )
+        return {TAP_PANEL.key: score}

@@ -1,4 +1,4 @@
-"""Workload ``point_mass``: a free mass moved and turned through the coupling, in closed form."""
+"""Workloads without contact: a driven mass, a spinning body, and an arm on a spring."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -266,3 +267,119 @@ class SpinningBody(Staged):
         torque = FELT_STIFFNESS * tool_angles(self._reference, records)
         turned = float(np.sqrt(np.mean(torque**2))) / (LEVER * FORCE_FLOOR)
         return {SPINNING_PANEL.key: replace(score, jnd=max(score.jnd, turned))}
+
+
+ARM_LENGTH, ARM_INERTIA = 0.25, 0.0104
+"""Length in m, and moment of inertia about the hinge in kg m², of a uniform arm of 0.5 kg."""
+
+ARM_STIFFNESS, ARM_DAMPING = 31.0, 0.02
+"""Stiffness in N m/rad and damping in N m s/rad of the hinge: 500 N/m at the grip."""
+
+ARM_DURATION = 1.0
+"""Duration in s: three strokes of the handle."""
+
+ARM_PANEL = Panel(
+    "swinging",
+    "an arm on a hinge with a spring, led by its end",
+    "SciPy's DOP853 of the hinge and an unsampled coupling, to 1e-10",
+)
+
+_ARM = f"""
+<mujoco model="spring_arm">
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="arm">
+      <joint type="hinge" axis="0 0 1" stiffness="{ARM_STIFFNESS!r}" damping="{ARM_DAMPING!r}"/>
+      <inertial pos="0 0 0" mass="0.5"
+        diaginertia="{ARM_INERTIA!r} {ARM_INERTIA!r} {ARM_INERTIA!r}"/>
+      <geom type="sphere" size="0.01" mass="0" contype="0" conaffinity="0"/>
+      <site name="grip" pos="{ARM_LENGTH!r} 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def led_across(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns a handle that moves along y, A (1 − cos ωt), and does not turn."""
+    positions, quaternions = still(times)
+    positions[:, 1] = AMPLITUDE * (1 - np.cos(2 * np.pi * FREQUENCY * times))
+    return positions, quaternions
+
+
+def exact_arm(coupling: Coupling, grid: float, count: int) -> NDArray[np.void]:
+    """Returns the records of an exact simulation of the arm at grid, 2 grid, … in s.
+
+    I q'' = −k q − d q' + (p × f)_z,    f = K (h − p) + B (h' − p'),    p = L (cos q, sin q)
+    """
+    omega = 2 * np.pi * FREQUENCY
+
+    def force(time: float, angle: float, rate: float) -> tuple[NDArray[np.float64], ...]:
+        place = ARM_LENGTH * np.array([np.cos(angle), np.sin(angle)])
+        speed = rate * np.array([-place[1], place[0]])
+        handle = np.array([ARM_LENGTH, AMPLITUDE * (1 - np.cos(omega * time))])
+        handle_speed = np.array([0.0, AMPLITUDE * omega * np.sin(omega * time)])
+        stretch, closing = handle - place, handle_speed - speed
+        return place, coupling.stiffness * stretch + coupling.damping * closing
+
+    def rates(time: float, state: NDArray[np.float64]) -> list[float]:
+        angle, rate = state
+        place, pull = force(time, angle, rate)
+        torque = place[0] * pull[1] - place[1] * pull[0]
+        torque -= ARM_STIFFNESS * angle + ARM_DAMPING * rate
+        return [rate, torque / ARM_INERTIA]
+
+    times = grid * np.arange(1.0, count + 1)
+    found = solve_ivp(
+        rates, (0.0, times[-1]), [0.0, 0.0], "DOP853", t_eval=times, rtol=1e-10, atol=1e-12
+    ).y
+    records = np.zeros(count, TICK_DTYPE)
+    for k, (time, angle, rate) in enumerate(zip(times, *found, strict=True)):
+        place, pull = force(time, angle, rate)
+        records["tool_position"][k, :2], records["wrench_on_tool"][k, :2] = place, pull
+    turned = Rotation.from_rotvec(np.outer(found[0], (0.0, 0.0, 1.0))).as_quat(
+        canonical=True, scalar_first=True
+    )
+    records["tool_quaternion"] = turned
+    return records
+
+
+class SpringArm(Staged):
+    """The arm as a workload.
+
+    Args:
+        coupling: K and B. K_r and B_r must be 0, because the handle does not turn.
+        grid: Longest period T in s.
+    """
+
+    name = "spring_arm"
+    about = "an arm on a hinge with a spring, led across by its end"
+    panels: Sequence[Panel] = (ARM_PANEL,)
+    needs_tool = "lets no arm swing by itself"
+    has_contact = False
+
+    def __init__(self, coupling: Coupling, grid: float) -> None:
+        self._grid, count = grid, round(ARM_DURATION / grid)
+        self._reference = exact_arm(coupling, grid, count)
+        super().__init__(
+            coupling, Stages(lambda: Stage(scene_of(_ARM), led_across, grid * count, coupling))
+        )
+
+    def peer_work(self) -> PeerWork:
+        """Refuses other engines, whose tasks have one free body.
+
+        Raises:
+            StudyError: Always.
+        """
+        raise StudyError("the arm has a hinge, and other engines are given free bodies alone")
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        if take.has_diverged:
+            return {ARM_PANEL.key: diverged(take.created, take.ended)}
+        score = score_of(
+            self._reference,
+            take.at(self._grid),
+            created=take.created,
+            verdict=take.environment,
+        )
+        return {ARM_PANEL.key: score}

@@ -9,6 +9,7 @@ import math
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,18 @@ from matplotlib.ticker import NullFormatter
 from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
-from hapticbridge.lab.chart.setting import who
-from hapticbridge.lab.chart.workload import Panel, Verdict
+from hapticbridge.lab.chart.setting import OWN, Setting, who
+from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
 from hapticbridge.lab.folder import prepared_folder
+from hapticbridge.options import DEFAULT_OPTIONS
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.run_description import versions
 
 RATE = 1000.0
-"""Required rate in Hz."""
+"""Rate of the loop in Hz that a recommendation is for: that of most devices."""
+
+DEFAULT = Setting(DEFAULT_OPTIONS.rendering_method, 1.0 / DEFAULT_OPTIONS.rate)
+"""Setting of ``hapticbridge run`` without options."""
 
 JND = 1.0
 """Largest error in just noticeable differences."""
@@ -36,9 +41,16 @@ JND = 1.0
 SHARE = 0.5
 """Share of a core for the simulation; the rest is for the device and for waking up."""
 
+SPARE = 0.01
+"""Share of a core that a cheaper point must save to be preferred: 10 µs of a tick at 1 kHz, which
+is less than a wake-up is late. With a smaller share, cost decides where no user can notice it."""
+
 ALIKE = 0.05
 """Relative difference of two errors that is irrelevant, no unit. A larger one changes the two
 digits that are printed."""
+
+IMPERCEPTIBLE = 0.1
+"""Difference of two errors in JND that is not felt: a tenth of the least that is."""
 
 ALONE = " No other time step bears this out, so it may be luck."
 
@@ -49,28 +61,42 @@ TOLERANCE = 1e-9
 def recommended(points: Sequence[Measurement]) -> Measurement | None:
     """Returns the recommended point, None if there is none.
 
-    Candidates have ``RATE`` or more, an error below ``JND`` here and at every smaller step, a
+    Candidates run at ``RATE``, with an error below ``JND`` here and at every smaller step, a
     passive environment and a solver that runs to its tolerance. They take at most ``SHARE`` of a
     core. Their error can be compared with others' (``Measurement.is_comparable``), and the method
     has no hazard on a real device (``Method.hazard``).
 
-    Points that a second step confirms come first, if there are any. Of them the cheapest is chosen;
-    of those whose spread of cost overlaps its own, the most accurate. Among errors that agree
-    within ``ALIKE``, a point with the usual contacts is preferred.
+    Points that a second step confirms come first, if there are any. Of those that take at most
+    ``SPARE`` of a core more than the cheapest, the most accurate is chosen. Among errors that agree
+    within ``ALIKE`` or ``IMPERCEPTIBLE``, the default of the product is preferred, then a point
+    with the usual contacts, then the cheapest.
     """
-    fit = [each for each in points if _is_fast(each) and not _objections(each, points)]
+    fit = [each for each in points if _is_at_rate(each) and not _objections(each, points)]
     if not fit:
         return None
     fit = [each for each in fit if is_borne_out(each, points)] or fit
     cheapest = min(fit, key=lambda each: each.cost.median)
-    alike = [each for each in fit if each.cost.low <= cheapest.cost.high]
+    alike = [each for each in fit if each.cost.low <= cheapest.cost.high + SPARE]
     least = min(each.score.jnd for each in alike)
-    best = [each for each in alike if each.score.jnd <= (1 + ALIKE) * least]
-    return min(best, key=lambda each: (not each.is_usual, each.score.jnd, each.cost.median))
+    worst = max((1 + ALIKE) * least, least + IMPERCEPTIBLE)
+    best = [each for each in alike if each.score.jnd <= worst]
+    return min(
+        best,
+        key=lambda each: (
+            not _is_default(each.setting),
+            not each.is_usual,
+            each.cost.median,
+        ),
+    )
+
+
+def _is_default(setting: Setting) -> bool:
+    """Returns True for the default at any rate of the scene, which the product chooses itself."""
+    return replace(setting, scene_ticks=0) == DEFAULT
 
 
 def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
-    """States the recommendation and why nothing is better, or the nearest point and its faults.
+    """States the recommendation and its reason, or the nearest point and its faults.
 
     Args:
         points: Points of one panel.
@@ -81,18 +107,118 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     best = recommended(points)
     goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
     if not is_truth:
-        goal += " (counted from the method's own limit at small steps, not from the truth)"
+        goal += " (counted from the reference above, which is not the truth)"
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
-        return f"{goal}, use {best.setting.label}: {_numbers(best)}.{alone}"
-    fast = [each for each in points if _is_fast(each) and np.isfinite(each.score.jnd)]
-    if not fast:
+        return (
+            f"{goal}, use {best.setting.label}: {_numbers(best)}. It is passive, has no hazard, "
+            f"and for at most {100 * SPARE:g} % of a core more no such point errs noticeably less."
+            f"{alone} {_way_to(best, points)}"
+        )
+    tried = [each for each in points if _is_at_rate(each) and np.isfinite(each.score.jnd)]
+    if not tried:
         return f"{goal}, nothing was tried that runs at this rate."
-    nearest = min(fast, key=lambda each: (len(_objections(each, points)), each.score.jnd))
+    nearest = min(tried, key=lambda each: (len(_objections(each, points)), each.score.jnd))
     return (
         f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
-        f"but {' and '.join(_objections(nearest, points))}."
+        f"but {' and '.join(_objections(nearest, points))}. {_way_to(nearest, points)}"
     )
+
+
+def _way_to(best: Measurement, points: Sequence[Measurement]) -> str:
+    """States how a user gets a point: the default, or options and why the default is not it."""
+    setting = best.setting
+    rate = f"--scene-rate {1 / setting.scene_period:g}" if setting.scene_ticks else ""
+    if _is_default(setting):
+        chosen = f", which chooses the scene's rate; '{rate}' sets it" if rate else ""
+        return f"It is the default of 'hapticbridge run'{chosen}."
+    if setting.engine != OWN or setting.iterations is not None:
+        return "'hapticbridge run' does not offer it."
+    options = f"--method {setting.method.name}"
+    if setting.substeps > 1:
+        options += f" --substeps {setting.substeps}"
+    if rate:
+        options += f" {rate}"
+    if setting.contact_name != DEFAULT.contact_name:
+        options += " --contact scene"
+    default = _default_of(points)
+    if default is None:
+        return f"Choose it with '{options}'; the default was not measured."
+    faults = _objections(default, points)
+    why = f"but {' and '.join(faults)}" if faults else "which errs by more than that"
+    return (
+        f"Choose it with '{options}'; the default is {default.setting.label}, {why}: "
+        f"{_numbers(default)}."
+    )
+
+
+def _default_of(points: Sequence[Measurement]) -> Measurement | None:
+    return next((each for each in points if each.setting == DEFAULT), None)
+
+
+def ahead_of_default(points: Sequence[Measurement]) -> list[Measurement]:
+    """Returns the points at ``RATE`` that beat the default, cheapest first.
+
+    They are sound, comparable, and render the requested coupling (``Chart.front``), cost no more
+    and err less than the default by more than ``ALIKE``.
+    """
+    default = _default_of(points)
+    if default is None:
+        return []
+    beaten = [
+        each
+        for each in points
+        if _is_at_rate(each)
+        and each.is_sound
+        and each.is_comparable
+        and each.setting.method.has_law
+        and each.cost.median <= default.cost.high
+        and each.score.jnd * (1 + ALIKE) < default.score.jnd
+    ]
+    return sorted(beaten, key=lambda each: each.cost.median)
+
+
+def standing(points: Sequence[Measurement]) -> str:
+    """States if the default is on the front at ``RATE``, or who is ahead and what it would take."""
+    default = _default_of(points)
+    if default is None:
+        return ""
+    ahead = ahead_of_default(points)
+    if not ahead:
+        return (
+            f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is on the front: no "
+            "passive point errs less at its cost."
+        )
+    best = min(ahead, key=lambda each: each.score.jnd)
+    error, cost = default.score.jnd / best.score.jnd, default.cost.median / best.cost.median
+    but = f"; but {best.setting.method.hazard}" if best.setting.method.hazard else ""
+    names = ", ".join(dict.fromkeys(each.setting.label for each in ahead))
+    return (
+        f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is not on the front. Ahead: "
+        f"{names}. The best has 1/{error:.2g} of its error at 1/{cost:.2g} of its cost{but}. "
+        f"{_what_it_takes(points, best.score.jnd)}"
+    )
+
+
+def _what_it_takes(points: Sequence[Measurement], error: float) -> str:
+    """States the period at which the default's method reaches an error in JND."""
+    own = sorted(
+        (each.setting.period, each.score.jnd)
+        for each in points
+        if replace(each.setting, period=DEFAULT.period) == DEFAULT and 0 < each.score.jnd < math.inf
+    )
+    name = DEFAULT.method.name
+    reached = [step for step, jnd in own if jnd <= error]
+    if not reached:
+        return f"'{name}' does not reach that error at any step that was tried."
+    fine = max(reached)
+    coarse = min((pair for pair in own if pair[0] > fine), default=None)
+    if coarse is None:
+        return f"'{name}' reaches that error at {1e3 * fine:.2g} ms."
+    (low, below), (high, above) = (fine, dict(own)[fine]), coarse
+    share = math.log(error / below) / math.log(above / below)
+    step = low * (high / low) ** share
+    return f"'{name}' reaches that error at a period of {1e3 * step:.2g} ms."
 
 
 def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
@@ -113,8 +239,8 @@ def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
     )
 
 
-def _is_fast(each: Measurement) -> bool:
-    return each.setting.period * RATE <= 1 + TOLERANCE
+def _is_at_rate(each: Measurement) -> bool:
+    return abs(each.setting.period * RATE - 1) <= TOLERANCE
 
 
 def steady_error(each: Measurement, points: Sequence[Measurement]) -> float:
@@ -141,9 +267,7 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
     elif not steady < JND:
         found.append(f"its error grows to {steady:.2g} JND at a smaller step, so it is luck")
     if not each.is_comparable:
-        found.append(
-            f"its own limit lies {each.limit_apart:.2g} JND from what most methods converge to"
-        )
+        found.append(f"its own limit lies {each.limit_apart:.2g} JND from that of rigid contacts")
     if each.setting.iterations is not None:
         found.append("its solver is cut short")
     if not each.is_sound:
@@ -154,6 +278,8 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
         found.append(f"it takes {100 * each.cost.median:.0f} % of a core")
     if each.setting.method.hazard:
         found.append("it may kick on a real device")
+    elif not each.setting.method.is_rigid:
+        found.append("MuJoCo's contacts may create energy in another motion")
     return found
 
 
@@ -188,13 +314,17 @@ UNTIMED = 1.0
 MARKS: dict[Verdict, tuple[str, bool, str]] = {
     "strict": ("o", True, "passive"),
     "within slack": ("o", False, "passive within the slack"),
-    "active": ("^", True, "created energy"),
+    "active": ("X", True, "NOT passive: created energy"),
     "lost contact": ("P", True, "lost contact"),
-    "diverged": ("X", True, "diverged (at the upper edge)"),
-    "failed": ("v", True, "the engine failed (at the upper edge)"),
+    "diverged": ("v", True, "diverged (at the upper edge)"),
+    "failed": ("^", True, "the engine failed (at the upper edge)"),
     "not metered": ("s", True, "another engine: energy not metered"),
 }
-"""Marker, True if it is filled, and its meaning."""
+"""Marker, True if it is filled, and its meaning. Only passive points are round and have the colour
+of their method; the others are ``WARNING``."""
+
+WARNING = "#c00000"
+"""Colour of points that are not passive."""
 
 
 def colours_of(chart: Chart) -> dict[str, Any]:
@@ -243,14 +373,15 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
             continue
         axes.plot([], [], "-", color=colour, lw=2, label=_named(name, selected, orders.get(name)))
         line = [each for each in selected if each.is_usual]
-        axes.plot(
-            [drawn_cost(each, points) for each in line],
-            [drawn_error(each) for each in line],
-            "-",
-            color=colour,
-            lw=0.8,
-            alpha=0.6,
-        )
+        for pair in pairwise(line):
+            axes.plot(
+                [drawn_cost(each, points) for each in pair],
+                [drawn_error(each) for each in pair],
+                "-" if all(each.is_sound for each in pair) else ":",
+                color=colour,
+                lw=0.8,
+                alpha=0.6,
+            )
         for each in selected:
             _draw_point(axes, each, drawn_cost(each, points), colour)
     _draw_front(axes, chart.front(panel))
@@ -284,9 +415,8 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
         axes.plot([], [], "o", color="grey", ms=3.5, label=label)
     for verdict in dict.fromkeys(each.score.verdict for each in points):
         mark, is_filled, label = MARKS[verdict]
-        axes.plot(
-            [], [], mark, color="grey", mfc="grey" if is_filled else "white", ms=6, label=label
-        )
+        grey = "grey" if verdict in PASSIVE else WARNING
+        axes.plot([], [], mark, color=grey, mfc=grey if is_filled else "white", ms=6, label=label)
     for label in _explained(points, orders.values()):
         axes.plot([], [], " ", label=label)
     axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
@@ -298,7 +428,7 @@ def _passed_over(
     """Returns why a method on the front is not recommended, one legend each."""
     reasons: dict[str, str] = {}
     for each in front:
-        found = _objections(each, points) if _is_fast(each) else []
+        found = _objections(each, points) if _is_at_rate(each) else []
         if found and who(each.setting) != who(best.setting):
             reasons.setdefault(who(each.setting), found[-1])
     return [
@@ -322,8 +452,8 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
         facts.append("level: smaller steps gain nothing")
     if not all(each.is_comparable for each in points):
         facts.append(
-            "pale: nearer to its own limit than\n"
-            "that is to most others' (off, in JND):\nnot comparable"
+            "pale: nearer to its own limit than that\n"
+            "is to rigid contacts' (off, in JND):\nnot comparable"
         )
     if any(each.score.jnd < FLOOR for each in points):
         facts.append(f"at the lower edge: {FLOOR:g} JND or less")
@@ -332,6 +462,7 @@ def _explained(points: Sequence[Measurement], orders: Collection[Order]) -> list
 
 def _draw_point(axes: Axes, each: Measurement, place: float, colour: Any) -> None:
     mark, is_filled, _ = MARKS[each.score.verdict]
+    colour = colour if each.is_sound else WARNING
     cost = each.cost
     axes.errorbar(
         place,
@@ -466,6 +597,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
             "recommendation": recommendation(
                 chart.of(panel), chart.machine, is_truth=panel.is_truth
             ),
+            "standing": standing(chart.of(panel)),
             "front": [
                 {
                     "setting": each.setting.label,

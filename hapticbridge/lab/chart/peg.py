@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.check.perception import FORCE_FLOOR, WEBER
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory import read_motion
@@ -24,7 +26,15 @@ from hapticbridge.lab.chart.scene_run import (
     path_of,
 )
 from hapticbridge.lab.chart.setting import OWN, Setting
-from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
+from hapticbridge.lab.chart.workload import (
+    Judge,
+    Panel,
+    PeerWork,
+    Score,
+    Take,
+    diverged,
+    score_of,
+)
 from hapticbridge.lab.engines.base import open_engine
 from hapticbridge.lab.maps.contact_rigs import ROTATION
 from hapticbridge.record import TICK_DTYPE
@@ -323,25 +333,103 @@ class JammedPeg:
     stiffness: float
     hand: int
 
+    @property
+    def motion(self) -> Motion:
+        """Path of the handle."""
+        return jamming_path(self.hand)
+
+    @property
+    def coupling(self) -> Coupling:
+        """K and B; the rotation's gains are those of the map ``contact``."""
+        return Coupling(self.stiffness, JAM_DAMPING, ROTATION[0] * self.stiffness, ROTATION[1])
+
+    def scene(self) -> Scene:
+        """Loads the peg, 25 mm of it in its hole."""
+        scene = load_scene("peg_in_hole", mass=self.mass, friction=self.friction)
+        scene.model.key_qpos[0, 2] = JAM_START
+        return scene
+
+    def work(self, duration: float, finest: float, judge: Judge) -> PeerWork:
+        """Describes the peg to other engines."""
+        path = path_of(self.motion)
+        return work_of(self.scene(), path, duration, finest, self.coupling, judge)
+
     def take(self, setting: Setting) -> Take:
         """Runs the bridge or another engine with a meter of its energy.
 
         Raises:
             HapticBridgeError: The method cannot render the scene, or the engine is not installed.
         """
-        motion = jamming_path(self.hand)
-        coupling = Coupling(self.stiffness, JAM_DAMPING, ROTATION[0] * self.stiffness, ROTATION[1])
-        scene = load_scene("peg_in_hole", mass=self.mass, friction=self.friction)
-        scene.model.key_qpos[0, 2] = JAM_START
-        path, ticks = path_of(motion), round(motion.duration / setting.period)
-        duration = ticks * setting.period
+        duration = round(self.motion.duration / setting.period) * setting.period
         if setting.engine != OWN:
-            work = work_of(scene, path, duration, setting.period, coupling, lambda _: {})
+            work = self.work(duration, setting.period, lambda _: {})
             return EngineRun(open_engine(setting.engine), work, setting).takes()[0][0]
         takes: list[Take] = []
-        stage = Stage(scene, path, duration, coupling)
+        stage = Stage(self.scene(), path_of(self.motion), duration, self.coupling)
         stage.play(setting, lambda take: takes.append(replace(take, records=take.records.copy())))
         return takes[0]
+
+
+JAM = JammedPeg(0.1, 0.42, 1000.0, 0)
+"""Jammed peg of the chart: that of ``models/peg_in_hole`` in the recorded hand."""
+
+LEFT = 0.05
+"""Distance in m of the peg's centre from the hole's at which it has left the hole."""
+
+JAM_PANEL = Panel(
+    "jamming",
+    "the peg jammed by a recorded hand, with friction",
+    "a rigid peg by exact geometry: K times the depth to which it is inside the walls, beside the "
+    "force's threshold",
+)
+
+
+class Jam(Staged):
+    """The jammed peg as a workload.
+
+    A jam with friction has no motion that is true for every mechanics, but no rigid peg is inside a
+    wall. Depth d takes K d from the force, which is the error.
+
+    Args:
+        grid: Longest period T in s.
+    """
+
+    name = "jam"
+    about = "a peg with friction is jammed in its hole by a recorded hand"
+    panels: Sequence[Panel] = (JAM_PANEL,)
+    needs_tool = "jams no tool behind a coupling"
+    has_contact = True
+
+    def __init__(self, grid: float) -> None:
+        self._grid = grid
+        self._duration = grid * math.floor(JAM.motion.duration / grid)
+        super().__init__(
+            JAM.coupling,
+            Stages(lambda: Stage(JAM.scene(), path_of(JAM.motion), self._duration, JAM.coupling)),
+        )
+
+    def peer_work(self) -> PeerWork:
+        """Describes the peg to other engines."""
+        return JAM.work(self._duration, self._grid, self._judge)
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        if take.has_diverged:
+            return {JAM_PANEL.key: diverged(take.created, take.ended)}
+        records = take.at(self._grid)
+        has_left = bool(np.abs(records["tool_position"]).max() > LEFT)
+        depth = np.zeros(1) if has_left else penetrations(records)
+        force = np.linalg.norm(records["wrench_on_tool"][:, :3], axis=1)
+        threshold = max(WEBER * float(np.sqrt(np.mean(force**2))), FORCE_FLOOR)
+        missing = self.coupling.stiffness * float(np.sqrt(np.mean(depth**2)))
+        score = Score(
+            jnd=math.inf if has_left else missing / threshold,
+            force_rms=missing,
+            position_peak=float(depth.max()),
+            created=take.created,
+            verdict="lost contact" if has_left else take.environment,
+        )
+        return {JAM_PANEL.key: score}
 
 
 def penetrations(records: NDArray[np.void]) -> NDArray[np.float64]:

@@ -18,9 +18,16 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.device.trajectory import pose_at
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.lab.chart.setting import OWN, Setting, ShippedOptions
+from hapticbridge.lab.chart.setting import (
+    OWN,
+    SCENE_TICKS,
+    USUAL_MS,
+    Setting,
+    ShippedOptions,
+)
 from hapticbridge.lab.chart.workload import (
     NAN,
     Judge,
@@ -35,11 +42,21 @@ from hapticbridge.lab.chart.workload import (
     score_of,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import RunSetup
+from hapticbridge.options import PRESCRIBED_MOTION, RunSetup, steady_stiffness
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
-from hapticbridge.rendering import IMPLICIT, Method, prepare, resolve_contact_stiffness
+from hapticbridge.rendering import (
+    IMPLICIT,
+    LOSSLESS_COUPLING,
+    Method,
+    prepare,
+    resolve_contact_stiffness,
+)
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.slow_scene import SlowScene
 from hapticbridge.summary import Ledger
+
+Runner = Callable[[NDArray[np.void], NDArray[np.void]], int]
+"""Function that runs one tick per sample, writes the records, and returns the completed ticks."""
 
 Path = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Motion of the handle: maps times in s, shape (n,), to positions in m, (n, 3), and quaternions (n,
@@ -123,9 +140,9 @@ class Stage:
             self._rows = np.zeros(samples.size, TICK_DTYPE)
         rows = self._rows[: samples.size]
         for start in self._starts:
-            binding = self.bound(setting, start)
+            binding, run = self._opened(setting, start)
             begin = time.thread_time()
-            done = simulate(binding.state, samples, binding.row, rows)
+            done = run(samples, rows)
             # the time of a diverged run is extrapolated to its full length
             seconds += (time.thread_time() - begin) * samples.size / max(done, 1)
             if judge is not None:
@@ -138,10 +155,35 @@ class Stage:
         Raises:
             HapticBridgeError: The method cannot render the scene.
         """
-        scene, period, method = self._scene, setting.period, setting.method
+        scene = self._scene
+        return BoundKernel(scene.model, scene.data, self._parameters(setting, start))
+
+    def _opened(self, setting: Setting, start: Start | None) -> tuple[BoundKernel, Runner]:
+        """Returns the bound loop, and the function that runs its ticks."""
+        scene, parameters = self._scene, self._parameters(setting, start)
+        binding = BoundKernel(scene.model, scene.data, parameters)
+        if not setting.scene_ticks:
+            return binding, lambda samples, rows: simulate(
+                binding.state, samples, binding.row, rows
+            )
+        slow = SlowScene(binding, scene.model, scene.data, parameters)
+
+        def run(samples: NDArray[np.void], rows: NDArray[np.void]) -> int:
+            flags = np.zeros(samples.size, np.int64)
+            results = 1 + np.arange(samples.size) // setting.scene_ticks
+            return slow.simulate(
+                samples, flags, np.full(samples.size, setting.period), results, rows
+            )
+
+        return binding, run
+
+    def _parameters(self, setting: Setting, start: Start | None) -> RunParameters:
+        scene, method = self._scene, setting.method
         scene.set_contact(is_rigid=False)  # or it would restore what is applied now
         self._shipped.apply(scene, setting)
-        effective = prepare(scene, self.coupling, period, setting.substeps, method, warns=False)
+        effective = prepare(
+            scene, self.coupling, setting.scene_period, setting.substeps, method, warns=False
+        )
         # an error inside the C symbol would end the process, so the first step runs in Python
         mujoco.mj_step(scene.model, scene.data)
         scene.reset()
@@ -153,11 +195,12 @@ class Stage:
             scene=scene,
             coupling=self.coupling,
             method=method,
-            period=period,
+            period=setting.period,
             substeps=setting.substeps,
+            scene_ticks=setting.scene_ticks,
             contact_stiffness=resolve_contact_stiffness(method, self.coupling, None),
         )
-        return BoundKernel(scene.model, scene.data, setup.parameters(first, effective))
+        return setup.parameters(first, effective)
 
     def _take(
         self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int
@@ -299,12 +342,13 @@ class OwnReferences:
     def disagreement(self) -> dict[str, float]:
         """Returns the distance in JND of each method's limit from the central one.
 
-        The central limit has the least median distance to all, so most methods agree on it. It
-        belongs to a method that renders the requested coupling, if there is one. Limits that agree
-        are likely the motion of the model; if they differ, at most one is.
+        The central limit has the least median distance to all, among the methods with rigid
+        contacts and a coupling's law, if there are any, or with a law. Scenes model rigid bodies:
+        where contacts of MuJoCo converge to another motion, their limit is that of its springs.
         """
         found = {name: each.records for name, each in self._found.items() if each is not None}
-        centers = [name for name in found if METHODS[name].has_law] or list(found)
+        laws = [name for name in found if METHODS[name].has_law]
+        centers = [name for name in laws if METHODS[name].is_rigid] or laws or list(found)
         apart = [
             {name: felt_error(found[center], each).jnd for name, each in found.items()}
             for center in centers
@@ -462,6 +506,58 @@ class SceneMotion(Staged):
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes
         return {self.panels[0].key: self._limits.score(take)}
+
+
+class SceneRates(SceneMotion):
+    """A scene that steps less often than a loop of 1 kHz, or in a loop that is as slow as it.
+
+    All points have one coupling, the stiffest that is steady at the slowest rate of the scene.
+
+    Args:
+        scene: As for ``SceneMotion``.
+        name: Name of the files.
+
+    Raises:
+        HapticBridgeError: The scene cannot be read, or there is no hand path beside it.
+    """
+
+    has_contact = False  # its contacts are not varied
+
+    def __init__(self, scene: str, name: str) -> None:
+        grid = 1e-3 * USUAL_MS * max(SCENE_TICKS)
+        most = steady_stiffness(load_scene(scene), PRESCRIBED_MOTION, grid, 1.0, 1.0)
+        share = min(1.0, most / COUPLING.stiffness)
+        coupling = replace(
+            COUPLING,
+            stiffness=share * COUPLING.stiffness,
+            rotational_stiffness=share * COUPLING.rotational_stiffness,
+        )
+        super().__init__(scene, coupling, grid, grid)
+        (panel,) = self.panels
+        self.panels = (
+            replace(panel, key="rates", reference="the scene stepped in every tick of 1 kHz"),
+        )
+        self.references = None
+        kept: list[Take] = []
+        usual = Setting(LOSSLESS_COUPLING, 1e-3 * USUAL_MS)
+        self._stages.for_method(usual).play(usual, kept.append)
+        self._reference = kept[0].records.copy()
+        self.about, self.name = f"{self.name}: {self.about}", name
+
+    def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
+        (take,) = takes
+        if take.has_diverged:
+            return {"rates": diverged(take.created, take.ended)}
+        # a slower loop holds its force until its next tick
+        ticks = round(take.setting.period / (1e-3 * USUAL_MS))
+        ends = np.arange(ticks, self._reference.size + 1)
+        score = score_of(
+            self._reference[ends - 1],
+            take.records[ends // ticks - 1],
+            created=take.created,
+            verdict=take.environment,
+        )
+        return {"rates": score}
 
 
 def path_of(motion: Motion, speed: float = 1.0) -> Path:

@@ -56,6 +56,7 @@ class Setting:
         iterations: Limit of MuJoCo's solver; None for that of the scene.
         engine: Engine. Any other than ``OWN`` is set as its documentation advises. It holds the
             coupling's force as method ``explicit`` does, unless its name ends with ``SPRING``.
+        scene_ticks: Ticks between two results of a slower scene; 0 steps it in every tick.
     """
 
     method: Method
@@ -64,11 +65,17 @@ class Setting:
     contact: str = SHIPPED
     iterations: int | None = None
     engine: str = OWN
+    scene_ticks: int = 0
+
+    @property
+    def scene_period(self) -> float:
+        """Time between two results of the scene in s."""
+        return max(self.scene_ticks, 1) * self.period
 
     @property
     def timestep(self) -> float:
         """MuJoCo's time step h in s."""
-        return self.period / self.substeps
+        return self.scene_period / self.substeps
 
     @property
     def contact_name(self) -> str:
@@ -88,6 +95,8 @@ class Setting:
         parts = [who, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")
+        if self.scene_ticks:
+            parts.append(f"scene at {1 / self.scene_period:g} Hz")
         if not self.has_usual_contact:
             parts.append(f"contact: {self.contact}")
         if self.iterations is not None:
@@ -267,6 +276,21 @@ def settings_for(
             Setting(method, usual, iterations=count) for method in varied for count in ITERATIONS
         ]
     return points
+
+
+SCENE_TICKS = (2, 5, 10, 20)
+"""Ticks of a loop at 1 kHz between two results of a slower scene: 500 to 50 Hz."""
+
+
+def rate_settings() -> list[Setting]:
+    """Returns the points of a chart of a slower scene.
+
+    The methods of ``VARIED`` run with the scene beside a loop of 1 kHz at each of ``SCENE_TICKS``,
+    and with a loop that is as slow as the scene.
+    """
+    methods, period = [METHODS[name] for name in VARIED], 1e-3 * USUAL_MS
+    beside = [Setting(m, period, scene_ticks=n) for m in methods for n in SCENE_TICKS]
+    return beside + [Setting(m, n * period) for m in methods for n in (1, *SCENE_TICKS)]
 
 
 def _with_neighbour(usual: float, periods: Sequence[float]) -> list[float]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +16,31 @@ import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import motion_for
+from hapticbridge.bridge import Bridge
 from hapticbridge.check.cost import TICK_SHARE, WARM_UP, TimingStats
-from hapticbridge.check.observe import Setting, rehearsal_parameters
-from hapticbridge.check.perception import felt_error
-from hapticbridge.device import SimulatedDevice, scene_hand
-from hapticbridge.errors import StudyError
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.hands import Grasp
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.chart.chart import machine, one_core
 from hapticbridge.lab.chart.output import PICTURES, csv_text, write_files
 from hapticbridge.lab.chart.scene_run import COUPLING
-from hapticbridge.lab.closed_loop import ClosedLoop
 from hapticbridge.lab.maps.base import scene_of
-from hapticbridge.options import steady_stiffness
+from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.record import SAMPLE_DTYPE
-from hapticbridge.rendering import LOSSLESS_COUPLING
+from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.rendering import (
+    IMPLICIT,
+    LOSSLESS_COUPLING,
+    Method,
+    default_method,
+    unguarded_parameters,
+)
 from hapticbridge.scene import Scene
 
 PERIOD = 1e-3
@@ -58,6 +63,7 @@ class Variant:
     Attributes:
         name: Name in tables.
         has_islands: True if MuJoCo divides the scene into islands that are solved separately.
+        method: Rendering method; None for the default.
         is_bare: True if MuJoCo's step runs alone, without the bridge's arithmetic.
         sleeps: True if MuJoCo lets bodies at rest sleep. The bridge refuses that (a sleeping tool
             would not feel its coupling), so it is measured with the bare step.
@@ -65,33 +71,47 @@ class Variant:
 
     name: str
     has_islands: bool = True
+    method: Method | None = None
     is_bare: bool = False
     sleeps: bool = False
 
 
 USUAL = Variant("bridge")
-VARIANTS = (
+METHOD_VARIANTS = (
     USUAL,
+    Variant("bridge, implicit", method=IMPLICIT),
+    Variant("bridge, contacts of the scene", method=LOSSLESS_COUPLING.with_contact("scene")),
+    Variant("explicit", method=METHODS["explicit"]),
+)
+"""Methods whose cost is compared as bodies and contacts grow."""
+
+VARIANTS = (
+    *METHOD_VARIANTS,
     Variant("bridge, islands off", has_islands=False),
     Variant("MuJoCo's step alone", is_bare=True),
     Variant("MuJoCo's step alone, with sleep", is_bare=True, sleeps=True),
 )
 
 
-def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDArray[np.float64]:
+def tick_times(
+    scene: Scene, variant: Variant, clock: Callable[[], int], substeps: int = 1
+) -> NDArray[np.float64]:
     """Returns the time of each tick in s, for whole ticks of the live loop.
 
     Args:
         scene: Scene; reset first.
         variant: Way to step it.
         clock: Time in ns.
+        substeps: MuJoCo steps per tick.
 
     Raises:
         SceneError: The scene cannot be rendered.
     """
     model, data = scene.model, scene.data
     with _flags(model, variant):
-        parameters = rehearsal_parameters(scene, Setting(COUPLING, PERIOD))
+        method = variant.method or default_method(substeps)
+        parameters = unguarded_parameters(scene, COUPLING, PERIOD, substeps, method)
+        scene.reset()
         binding = BoundKernel(model, data, parameters)
         state, row = binding.state, binding.row
         samples = np.zeros(TICKS, SAMPLE_DTYPE)
@@ -100,7 +120,7 @@ def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDAr
         samples["quaternion"][:, 0] = 1.0
         before = direct(before_step, state, samples[:1], row, 0, PERIOD)
         after = direct(after_step, state, row, 0)
-        step, times = mujoco.mj_step, np.zeros(TICKS)
+        step, times = mujoco.mj_step if variant.is_bare else binding.step, np.zeros(TICKS)
         started, done = clock(), 0
         for k in range(TICKS):
             sample = samples[k : k + 1]
@@ -111,9 +131,10 @@ def tick_times(scene: Scene, variant: Variant, clock: Callable[[], int]) -> NDAr
                 times[k] = clock() - begin
             else:
                 begin = clock()
-                before(state, sample, row, 0, PERIOD)
-                step(model, data)
-                after(state, row, 0)
+                for substep in range(substeps):
+                    before(state, sample, row, substep, PERIOD)
+                    step(model, data)
+                    after(state, row, substep)
                 times[k] = clock() - begin
             done = k + 1
             if clock() - started > 1e9 * LONGEST and done > 2 * WARM_UP:
@@ -159,6 +180,10 @@ _FRAME = """
 </mujoco>"""
 
 
+SUBSTEPS = "substeps"
+"""Name of the family whose count is that of MuJoCo's steps per tick, and not of the scene."""
+
+
 @dataclass(frozen=True, slots=True)
 class Family:
     """Scenes that differ in one count.
@@ -169,6 +194,7 @@ class Family:
         about: Description of the scenes in a sentence.
         sizes: The counts.
         build: Returns the scene of a count.
+        variants: Ways to step it.
     """
 
     name: str
@@ -176,6 +202,11 @@ class Family:
     about: str
     sizes: tuple[int, ...]
     build: Callable[[int], Scene]
+    variants: tuple[Variant, ...] = (USUAL,)
+
+    def substeps(self, size: int) -> int:
+        """Returns the MuJoCo steps per tick at a size."""
+        return size if self.name == SUBSTEPS else 1
 
 
 def floating(count: int) -> Scene:
@@ -238,6 +269,7 @@ FAMILIES = (
         "free balls that touch nothing",
         (1, 2, 5, 10, 20, 50, 100, 200),
         floating,
+        METHOD_VARIANTS,
     ),
     Family(
         "contacts",
@@ -245,6 +277,7 @@ FAMILIES = (
         "one body that stands on many feet",
         (1, 3, 10, 30, 100, 200, 500),
         plate,
+        METHOD_VARIANTS,
     ),
     Family(
         "triangles",
@@ -254,7 +287,19 @@ FAMILIES = (
         mesh_ball,
     ),
     Family(
-        "resting", "boxes at rest", "on the floor, four contacts each", (1, 3, 10, 30, 100), resting
+        "resting",
+        "boxes at rest",
+        "on the floor, four contacts each",
+        (1, 3, 10, 30, 100),
+        resting,
+        (USUAL, *VARIANTS[len(METHOD_VARIANTS) :]),
+    ),
+    Family(
+        SUBSTEPS,
+        "substeps",
+        "MuJoCo's steps in a tick, on ten feet",
+        (1, 2, 4, 8, 16),
+        lambda _: plate(10),
     ),
 )
 
@@ -352,16 +397,35 @@ class Growth:
 
 
 @dataclass(frozen=True, slots=True)
+class LoopCost:
+    """Processor time of the loop's own thread in a tick of the bridge.
+
+    Attributes:
+        name: Hands, recording and view.
+        median: Over the rounds in s.
+        low: Smallest in s.
+        high: Largest in s.
+    """
+
+    name: str
+    median: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
 class WorkChart:
     """Results of the measurement.
 
     Attributes:
         points: One per family, size and variant.
         machine: Description of the machine.
+        loops: Costs of whole loops.
     """
 
     points: tuple[Work, ...]
     machine: str
+    loops: tuple[LoopCost, ...] = ()
 
     def of(self, family: Family, variant: Variant) -> list[Work]:
         """Returns the points of a family by size."""
@@ -413,8 +477,6 @@ def measure_work(
 ) -> WorkChart:
     """Times ticks of growing scenes, all in turn, on one core.
 
-    Bodies at rest are measured with every variant, the others as the bridge runs them.
-
     Args:
         families: Families of scenes.
         most: Largest size; None for all.
@@ -427,7 +489,7 @@ def measure_work(
         for family in families
         for size in family.sizes
         if most is None or size <= most
-        for variant in (VARIANTS if family.name == "resting" else (USUAL,))
+        for variant in family.variants
     ]
     scenes: dict[tuple[str, int], Scene] = {}
     times: dict[int, list[NDArray[np.float64]]] = {i: [] for i in range(len(jobs))}
@@ -440,7 +502,8 @@ def measure_work(
                 key = (family.name, size)
                 if key not in scenes:
                     scenes[key] = family.build(size)
-                times[index].append(tick_times(scenes[key], variant, clock))
+                substeps = family.substeps(size)
+                times[index].append(tick_times(scenes[key], variant, clock, substeps))
                 data = scenes[key].data
                 counts[index] = int(data.ncon), int(data.nefc), int(scenes[key].model.nv)
         where = machine(core)
@@ -468,6 +531,64 @@ def measure_work(
     return WorkChart(tuple(points), where)
 
 
+BAR = """
+<mujoco model="bar">
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body name="bar"><freejoint/>
+      <geom type="capsule" size="0.01" fromto="-0.1 0 0 0.1 0 0" mass="0.2"/>
+      <site name="grip" pos="-0.1 0 0"/><site name="other" pos="0.1 0 0"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+"""Bar in free space that one hand or two hold."""
+
+LOOP_TICKS = 2000
+"""Timed ticks of a loop per round, after a quarter as many that warm it up."""
+
+LOOPS = ("one hand", "two hands", "one hand, recorded", "one hand, viewed")
+"""Loops whose cost is compared; the last needs the extra ``view``."""
+
+
+def measure_loops(rounds: int = ROUNDS, ticks: int = LOOP_TICKS) -> tuple[LoopCost, ...]:
+    """Times whole loops of the bridge in turn: device, tick, record; with a recording, with a view.
+
+    The recorder and the view are processes of their own, whose time does not count.
+
+    Args:
+        rounds: Number of runs of every loop.
+        ticks: Timed ticks of a run.
+    """
+    found: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        bar = Path(folder) / "bar.xml"
+        bar.write_text(BAR, encoding="utf-8")
+        for turn, name in product(range(rounds), LOOPS):
+            path = Path(folder) / f"{turn}.mcap" if name.endswith("recorded") else None
+            try:
+                window = _window() if name.endswith("viewed") else None
+            except HapticBridgeError:
+                continue
+            hands = [Grasp("grip"), Grasp("other")] if name == "two hands" else "simulated"
+            with Bridge(
+                bar, hands, clock=SimulatedClock(), recording=path, observer=window
+            ) as bridge:
+                bridge.run(ticks // 4 * bridge.period)
+                begin = time.thread_time()
+                bridge.run(ticks * bridge.period)
+                found.setdefault(name, []).append((time.thread_time() - begin) / ticks)
+    return tuple(
+        LoopCost(name, float(np.median(times)), min(times), max(times))
+        for name, times in found.items()
+    )
+
+
+def _window() -> RingObserver:
+    from hapticbridge.view import Address, Window  # noqa: PLC0415 - needs the extra 'view'
+
+    return Window(Address(0))
+
+
 RATE = 1000.0
 """Rate in Hz for the paragraph."""
 
@@ -484,10 +605,11 @@ the curves."""
 
 def draw_work(chart: WorkChart) -> Figure:
     """Draws the tick's time over the count, one panel per family."""
-    figure = new_figure(8, 7)
-    panels = figure.subplots(2, 2, sharey=True)
-    for axes, family in zip(panels.ravel(), FAMILIES, strict=True):
+    figure = new_figure(8, 10)
+    panels = figure.subplots(3, 2)
+    for axes, family in zip(panels.ravel(), FAMILIES, strict=False):
         _draw_family(axes, chart, family)
+    _draw_loops(panels.ravel()[-1], chart.loops)
     figure.suptitle(
         "Processor time of a tick at 1 kHz; n^p (least and largest p between two sizes)\n"
         f"{chart.machine}",
@@ -526,6 +648,16 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
     axes.legend(fontsize="xx-small", loc="upper left")
 
 
+def _draw_loops(axes: Axes, loops: Sequence[LoopCost]) -> None:
+    names = [each.name.replace(", ", ",\n") for each in loops]
+    axes.barh(names, [1e6 * each.median for each in loops], color="C0")
+    axes.invert_yaxis()
+    axes.set_xlabel(
+        "processor time of a tick of the whole loop (µs), a bar in free space", size="x-small"
+    )
+    axes.tick_params(labelsize="x-small")
+
+
 def paragraph(chart: WorkChart) -> str:
     """States the growth of a tick's time, and the largest scenes that fit into a tick at 1 kHz."""
     facts = []
@@ -534,11 +666,16 @@ def paragraph(chart: WorkChart) -> str:
             points = chart.of(family, variant)
             first, last = points[0], points[-1]
             most = max((each.size for each in points if each.rate >= RATE), default=0)
+            growth = chart.growth(family, variant)
+            slope = (
+                "" if growth is None else f", as n^{growth.exponent:.2f} from {growth.start:g} on"
+            )
             facts.append(
                 f"{family.unit.capitalize()}, {variant.name}: {1e6 * first.time.median:.3g} µs a "
-                f"tick for {first.size}, {1e6 * last.time.median:.3g} µs for {last.size}; up to "
-                f"{most} hold 1 kHz"
+                f"tick for {first.size}, {1e6 * last.time.median:.3g} µs for {last.size}{slope}; "
+                f"up to {most} hold 1 kHz"
             )
+    facts += [f"Whole loop, {each.name}: {1e6 * each.median:.3g} µs a tick" for each in chart.loops]
     return ". ".join([*facts, HOLDS]) + "."
 
 
@@ -569,6 +706,7 @@ def write_work(chart: WorkChart, paths: Mapping[str, Path]) -> dict[str, Any]:
         "machine": chart.machine,
         "paragraph": paragraph(chart),
         "growth": growths,
+        "loops": [asdict(each) for each in chart.loops],
         "points": rows,
     }
     texts = {"csv": csv_text(rows), "json": json.dumps(facts, indent=2, allow_nan=False) + "\n"}
@@ -580,130 +718,3 @@ def _row(each: Work) -> dict[str, object]:
     row = asdict(each)
     spread = row.pop("time")
     return row | {f"time_{name}": value for name, value in spread.items()}
-
-
-# Rate of one scene behind a loop of 1 kHz
-
-SCENE_TICKS = (1, 2, 5, 10, 20)
-"""Ticks of the loop between two steps of the scene: 1000, 500, 200, 100 and 50 Hz."""
-
-
-@dataclass(frozen=True, slots=True)
-class SceneRate:
-    """One hand on one scene at one rate of the scene.
-
-    Attributes:
-        rate: Steps of the scene per second in Hz.
-        jnd: Felt error against the scene at the loop's rate, in just noticeable differences.
-        force_rms: RMS difference of the force on the tool in N.
-        step: Processor time in s per step of the scene, the loop's ticks between included.
-        share: That time as a share of the scene's period; above 1 the scene falls behind the clock.
-        environment: ``strict``, ``within slack`` or ``active``.
-    """
-
-    rate: float
-    jnd: float
-    force_rms: float
-    step: float
-    share: float
-    environment: str
-
-
-def measure_scene_rates(
-    scene: Scene, ticks_of_scene: Sequence[int] = SCENE_TICKS, *, duration: float | None = None
-) -> list[SceneRate]:
-    """Runs the scene's own hand with its own path at several rates of the scene.
-
-    All rates have one coupling, the stiffest that is steady at the slowest. The run at the loop's
-    rate is the reference: it is the scene in slow motion, if a step takes longer than a tick.
-
-    Args:
-        scene: A scene with a hand path beside it.
-        ticks_of_scene: Ticks of the loop between two steps, from 1 (always run) upwards.
-        duration: Simulated time in s; by default that of the path.
-
-    Raises:
-        StudyError: The scene has no hand path, or a run ended early.
-    """
-    motion = motion_for(scene)
-    if motion is None:
-        raise StudyError(f"no hand path lies beside '{scene.path}'; write NAME.csv there")
-    hand = SimulatedDevice(hand=scene_hand(scene.model, scene.path), path=motion)
-    most = steady_stiffness(scene, hand.info, PERIOD * max(ticks_of_scene), 1.0, 1.0)
-    share = min(1.0, most / COUPLING.stiffness)
-    coupling = replace(
-        COUPLING,
-        stiffness=share * COUPLING.stiffness,
-        rotational_stiffness=share * COUPLING.rotational_stiffness,
-    )
-    ticks = round((motion.duration if duration is None else duration) / PERIOD)
-    ticks -= ticks % math.lcm(*ticks_of_scene)
-    found: list[SceneRate] = []
-    reference: NDArray[np.void] | None = None
-    loop = ClosedLoop(scene)
-    loop.run(hand, coupling, LOSSLESS_COUPLING, ticks=WARM_UP)  # loads the machine code
-    for each in sorted({1, *ticks_of_scene}):
-        outcome = loop.run(
-            hand,
-            coupling,
-            LOSSLESS_COUPLING,
-            ticks=ticks,
-            scene_ticks=each if each > 1 else 0,
-            keep_records=True,
-        )
-        if outcome.ticks < ticks:
-            raise StudyError(
-                f"the run at {1.0 / (each * PERIOD):g} Hz ended at tick {outcome.ticks}"
-            )
-        reference = outcome.records if reference is None else reference
-        felt = felt_error(reference, outcome.records)
-        step = outcome.seconds * each / ticks
-        found.append(
-            SceneRate(
-                rate=1.0 / (each * PERIOD),
-                jnd=felt.jnd,
-                force_rms=felt.force_rms,
-                step=step,
-                share=step / (each * PERIOD),
-                environment=outcome.environment,
-            )
-        )
-    return found
-
-
-def draw_scene_rates(name: str, points: Sequence[SceneRate]) -> Figure:
-    """Draws felt error and cost of a step against the rate of the scene."""
-    figure = new_figure(8, 3.6)
-    felt, cost = figure.subplots(1, 2, sharex=True)
-    rates = np.array([each.rate for each in points])
-    felt.plot(rates[1:], [each.jnd for each in points[1:]], "o-", color="black", mfc="white")
-    felt.axhline(1.0, color="grey", linestyle=":", label="just noticeable")
-    felt.set(yscale="log", ylabel="felt error against 1 kHz (JND)")
-    felt.legend(fontsize="small")
-    steps = 1e3 * np.array([each.step for each in points])
-    cost.plot(rates, steps, "o-", color="black", mfc="white", label="a step costs")
-    cost.plot(rates, 1e3 / rates, ":", color="grey", label="a step may cost: the scene's period")
-    cost.set(yscale="log", ylabel="processor time of a step (ms)")
-    cost.legend(fontsize="small")
-    for axes in (felt, cost):
-        axes.set(xscale="log", xlabel="rate of the scene (Hz)")
-        axes.set_xticks(rates, [f"{rate:g}" for rate in rates])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(visible=True, alpha=0.25)
-    figure.suptitle(f"{name}: one hand, the scene beside a loop of 1 kHz", fontsize="medium")
-    return figure
-
-
-def write_scene_rates(
-    name: str, points: Sequence[SceneRate], paths: Mapping[str, Path]
-) -> dict[str, Any]:
-    """Writes picture, table and JSON; returns the content of the JSON file.
-
-    Raises:
-        HapticBridgeError: A file cannot be written.
-    """
-    rows: list[dict[str, object]] = [{"scene": name} | asdict(each) for each in points]
-    facts = {"scene": name, "points": rows}
-    texts = {"csv": csv_text(rows), "json": json.dumps(facts, indent=2, allow_nan=False) + "\n"}
-    write_files(paths, texts, draw_scene_rates(name, points))
-    return facts

@@ -215,7 +215,7 @@ class References(Protocol):
     """Limits to which the methods converge."""
 
     def disagreement(self) -> dict[str, float]:
-        """Returns the distance in JND of each limit from the one that most agree on, by method."""
+        """Returns the distance in JND of each limit from the central one, by method."""
 
 
 class Workload(Protocol):

@@ -390,6 +390,7 @@ ENGINES = {
     "ode_spring": "ode",
     "physx": "physx",
     "physx_spring": "physx",
+    "rapier": "rapier",
     "pybullet": "bullet",
     "pybullet_dantzig": "bullet",
     "drake_point": "drake",
