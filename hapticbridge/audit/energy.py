@@ -58,27 +58,43 @@ def dissipated_by_damping(
     return np.asarray(np.where(is_running, energy / time, 0.0))
 
 
-def released_by_coupling(parameters: RunParameters, gains: Array, motion: Motion) -> Array:
+def stored_in_springs(
+    parameters: RunParameters, gains: Array, stretched: tuple[Array, Array]
+) -> Array:
     """Returns V(e) + V(φ), the energy that the coupling's springs hold, (n,) in J of the scene.
 
     With the work w_k on the tool and the energy E_d given to the device beyond its dissipation,
 
-        E_d + (s/scale) [Σ w_k + V(e_k)] <= 0
+        E_d + (s/scale) [Σ w_k + V(e_k) − V(e_start)] <= 0
 
     for every hand and tool if b >= K T/2 + B': the identity behind (6), with V(e) at the end on the
-    left. V is the energy of a spring whose force stops growing at the force level. It holds at any
-    share r, because the handle moves by r times the device's motion where the device gets r times
-    the force. An excess above zero is the fault of the port ``device``.
+    left. At the start the springs may hold the tool's weight. V is the energy of a spring whose
+    force stops growing at the force level. It holds at any share r, because the handle moves by r
+    times the device's motion where the device gets r times the force. An excess above zero is the
+    fault of the port ``device``.
+
+    Args:
+        parameters: Run parameters.
+        gains: K, B', K_r and B'_r, (n, 4).
+        stretched: e in m and φ in rad, (n, 3) each.
 
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
     stored = np.zeros(len(gains))
-    for column, limit, e in zip(
-        (0, 2), limits_on_tool(parameters), (motion.stretch, motion.twist), strict=True
-    ):
+    for column, limit, e in zip((0, 2), limits_on_tool(parameters), stretched, strict=True):
         stored += spring_energy(gains[:, column], np.linalg.norm(e, axis=1), limit)
     return stored
+
+
+def _springs_at_start(parameters: RunParameters, gains: Array, motion: Motion) -> Array:
+    """Returns the springs' energy before each tick's motion, (n,) in J; for the first tick.
+
+    Before it the tool turns little, so that φ and the turns of handle and tool add.
+    """
+    stretch = motion.stretch + motion.tool_step - motion.handle_step
+    twist = motion.twist + motion.tool_turn - motion.handle_turn
+    return stored_in_springs(parameters, gains, (stretch, twist))
 
 
 def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
@@ -148,7 +164,7 @@ class EnergyBalance:
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖² below the force level, (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation, the energy
-            released by scene and coupling, and the unfelt work (``unfelt_work``), (n,) in J. Zero
+            released by scene and coupling since the start, and the unfelt work (``unfelt_work``), (n,) in J. Zero
             for an unknown damping or several laws per tick. With a coupling law, energy created by
             the environment is not included; it belongs to the other port.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
@@ -203,8 +219,11 @@ class EnergyBalance:
         totals["discarded"] = discarded
         totals |= _device_energies(block, events, delay)
         in_springs: Array | float = 0.0  # with a delay the device is elsewhere
+        at_start = _springs_at_start(parameters, gains, motion) * (ticks["tick"] == 0)
+        totals["start_springs"] = _summed(at_start, before["start_springs"])
         if parameters.has_law and not delay:
-            in_springs = released_by_coupling(parameters, gains, motion)
+            in_springs = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
+            in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
         ceiling = np.minimum(

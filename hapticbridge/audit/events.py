@@ -237,6 +237,7 @@ SUMS = (
     "unfelt_work",
     "tank_ceiling",
     "discarded",
+    "start_springs",
 )
 """Names of the cumulative energies."""
 
