@@ -302,6 +302,10 @@ _LIMIT_MOTORS = (
     "start at rest (ctrl in keyframe 'home'); if they are meant to push the hand, --energy-limit "
     "is what it may get"
 )
+_FIND_PUMP = (
+    "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
+    "'hapticbridge audit RECORDING' names the likely cause"
+)
 _DIVERGED = (
     "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
     "stiffness or the period"
@@ -321,7 +325,7 @@ def _hand_at(grip: str) -> str:
     return f"hand at '{grip}': " if grip else ""
 
 
-def trip_remedy(reason: str, motor_work: float) -> str:
+def trip_remedy(reason: str, motor_work: float, created: float = 0.0) -> str:
     """Returns the remedy for a trip, for the message to the user; empty if none is known.
 
     Exception and recording keep the bare reason, because it is compared when the run is repeated.
@@ -329,11 +333,15 @@ def trip_remedy(reason: str, motor_work: float) -> str:
     Args:
         reason: Result of ``trip_reason``, or a sentence that ends with it.
         motor_work: Work of the scene's own motors until then in J, which may be the cause.
+        created: Energy in J that the scene had created until then, which may be the cause.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
-            is_pushed = code == GAVE_ENERGY and motor_work > USUAL_ENERGY
-            return _LIMIT_MOTORS.format(format_energy(motor_work)) if is_pushed else remedy
+            if code == GAVE_ENERGY and created > USUAL_ENERGY:
+                return _FIND_PUMP.format(format_energy(created))
+            if code == GAVE_ENERGY and motor_work > USUAL_ENERGY:
+                return _LIMIT_MOTORS.format(format_energy(motor_work))
+            return remedy
     return ""
 
 

@@ -26,7 +26,7 @@ from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
-from hapticbridge.timekeeping import RunTimes, Timekeeping
+from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
 from hapticbridge.units import format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
@@ -164,7 +164,7 @@ WELD = "the weld in its stiffest directions at the start"
 _NAME_WIDTH = 20
 """Characters of a row's name in the text of a summary, with the space after it."""
 
-_OF_A_HAND = ("peak", "reach", "coupling work", "device energy", "slack")
+_OF_A_HAND = ("peak", "reach", "coupling work", "device energy", "net to the hand", "slack")
 """Rows of the text of a summary that each of several hands has of its own."""
 
 _PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
@@ -205,11 +205,14 @@ class Summary:
             one does. None if its damping is unknown, or
             if no coupling law makes the condition sufficient.
         timekeeping: Time that the run kept, and the device conditions at this time.
-        stopped_by: ``duration``, ``signal``, ``caller``, or another caller of ``Bridge.stop``.
+        stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
+            ``Bridge.stop``.
         recording: The recording, or None.
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
+        most_given: Largest energy in J that the hand had got beyond what it put in and what the
+            device's damping burned; 0 without a hand.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
@@ -241,6 +244,7 @@ class Summary:
     recording: Path | None
     reach: float | None
     has_hand: bool
+    most_given: float = 0.0
     grip: str = ""
     device: str = ""
     hands: tuple[Summary, ...] = ()
@@ -301,7 +305,8 @@ class Summary:
         used = f", {format_share(self.slack_share)} of the slack used" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
-        yield f"{judged}{self.verdict} ({port or self.environment}){since}{used}"
+        until = " until the guard tripped" if self.stopped_by == "trip" else ""
+        yield f"{judged}{self.verdict} ({port or self.environment}){until}{since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"
 
@@ -339,6 +344,19 @@ class Summary:
         for name, joules in self.energies.items():
             if joules:  # exactly 0 without motors or springs
                 yield name.replace("_", " "), format_energy(joules)
+        if self.most_given > INSTANT:
+            yield "net to the hand", f"{format_energy(self.most_given)} at most, {self._origin}"
+
+    @property
+    def _origin(self) -> str:
+        """Origin of energy that a hand got, as far as it is known."""
+        motors = self.energies["actuator_work"]
+        if motors > INSTANT:
+            return (
+                f"beyond what it put in: the scene's motors did {format_energy(motors)} of work, "
+                "and no guarantee covers motors that push"
+            )
+        return "beyond what it put in and what the device's damping burned"
 
     def _device_lines(self) -> Iterator[str]:
         """Yields if the device bears the coupling at the time that the run kept."""
@@ -427,6 +445,7 @@ class Summary:
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
+            most_given=0.0 if info.is_prescribed else float(state["observer"]["most_given"][0]),
             grip=parameters.grip,
             device=info.name,
         )

@@ -121,16 +121,50 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
 ) -> None:
     scene, record = tmp_path / "driven.xml", tmp_path / "driven.mcap"
     scene.write_text(DRIVEN)
-    code, _, err = call("run", scene, "--fast", "--duration", 0.2, "--record", record)
+    code, out, err = call("run", scene, "--fast", "--duration", 0.2, "--record", record)
     assert code == 3
     assert "most of it from motors, springs or parts of the scene" in err
     assert "this tool weighs" not in err
     assert "than the limit; the scene's motors did " in err
     assert "lower --stiffness" not in err
+    assert "passive (strict) until the guard tripped" in out
+    assert "mJ at most, beyond what it put in: the scene's motors did " in out
+    assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
+    assert "no guarantee covers motors that push" in out
     assert "what to change: the scene's motors did " in out
     scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))  # as the remedy says
     assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0
+
+
+PUMPED = """<mujoco><option timestep="0.001"/><worldbody><body name="drawer">
+<joint name="slide" type="slide" axis="1 0 0" range="-0.1 0.1" damping="{damping}" stiffness="50"/>
+<geom type="box" size="0.1 0.1 0.03" mass="0.5"/><site name="grip" pos="-0.11 0 0"/></body>
+</worldbody><actuator><general name="pump" joint="slide" gainprm="0" biastype="affine"
+biasprm="0 0 {bias}"/></actuator></mujoco>"""
+"""A drawer whose joint or motor pushes it the harder the faster it moves."""
+
+
+@pytest.mark.parametrize(
+    ("damping", "bias", "told", "remedy"),
+    [
+        (-6, 0, "joint 'slide' has a damping of -6", "the scene itself created"),
+        (1, 9, "actuator 'pump' pushes joint 'slide' harder", "the scene's motors did"),
+        (1, -9, "", ""),
+        (1, 0.5, "", ""),
+    ],
+)
+def test_what_pumps_is_named_before_it_trips(
+    call: Called, tmp_path: Path, damping: float, bias: float, told: str, remedy: str
+) -> None:
+    scene = tmp_path / "drawer.xml"
+    scene.write_text(PUMPED.format(damping=damping, bias=bias))
+    code, _, err = call("run", scene, "--fast", "--duration", 3)
+    assert code == (3 if told else 0)
+    assert told in err
+    assert remedy in err
+    assert ("harder" in err or "has a damping" in err) == bool(told)
+    assert "lower --stiffness" not in err
 
 
 def test_a_hand_without_an_end_of_its_motion_runs_for_five_simulated_seconds(

@@ -164,9 +164,9 @@ class EnergyBalance:
         environment_energy: S_k − S_start − works, with the ``coupling_work`` above, (n,) in J.
         slack: Σ ½ (K + B'/T) ‖δx‖² + ½ (K_r + B'_r/T) ‖δφ‖² below the force level, (n,) in J.
         excess_device_energy: Energy given to the device beyond its dissipation, the energy
-            released by scene and coupling since the start, and the unfelt work (``unfelt_work``), (n,) in J. Zero
-            for an unknown damping or several laws per tick. With a coupling law, energy created by
-            the environment is not included; it belongs to the other port.
+            released by scene and coupling since the start, and the unfelt work (``unfelt_work``),
+            (n,) in J. Zero for an unknown damping or several laws per tick. With a coupling law,
+            energy created by the environment is not included; it belongs to the other port.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.

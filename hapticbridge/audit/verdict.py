@@ -45,7 +45,7 @@ from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import requested_of
 from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import RunTimes, Timekeeping
+from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
 # End of a run
@@ -302,9 +302,22 @@ def verdict_on(
         doubt = "" if kept is None else kept.fault
         if facts["certified"] is False and not (kept and kept.refutation):
             doubt = "the device has less damping than the coupling needs"
-        notes = (found["reason"], doubt, unusual_end(recording.events), facts["unchecked"])
+        pushed = _motor_words(facts.get("energies", {}))
+        end = unusual_end(recording.events)
+        notes = (found["reason"], doubt, pushed, end, facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
+
+
+def _motor_words(energies: Mapping[str, float]) -> str:
+    """Returns a clause on motors of the scene that pushed the hand; empty if none did."""
+    work, given = (energies.get(name, 0.0) for name in ("actuator_work", "device_energy"))
+    if min(work, given) <= INSTANT:
+        return ""
+    return (
+        f"the scene's motors did {format_energy(work)} of work and the device gave the hand "
+        f"{format_energy(given)}: no guarantee covers motors that push"
+    )
 
 
 def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFile]) -> Facts:

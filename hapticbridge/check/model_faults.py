@@ -34,12 +34,12 @@ from hapticbridge.scene.contacts import (
 
 
 def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
-    """Yields faults that make a run feel wrong from its first second: units, angles, creep.
+    """Yields faults that make a run feel wrong from its first second: units, pumps, angles, creep.
 
     They need no motion, so that a run can tell them at its start. The scene is reset.
     """
     loaded = CompiledScene(source, scene, Places(source, scene.model))
-    for rule in (_units, _angles, _frictions):
+    for rule in (_units, _pumps, _angles, _frictions):
         scene.reset()
         yield from rule(loaded)
 
@@ -247,6 +247,7 @@ _SMALLEST_EXTENT = 1e-3  # m; a grip nearer than this counts as on the tool
 def geometry_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields faults of sizes and shapes."""
     yield from _units(case)
+    yield from _pumps(case)
     yield from _angles(case)
     yield from _dented_meshes(case)
     yield from _far_grip(case)
@@ -280,6 +281,40 @@ def _units(case: CompiledScene) -> Iterator[Fault]:
         "kg",
         change,
     )
+
+
+def _pumps(case: CompiledScene) -> Iterator[Fault]:
+    """Finds joints and motors that push what moves already: energy without end."""
+    model = case.model
+    for joint in range(model.njnt):
+        damping = float(model.dof_damping[model.jnt_dofadr[joint]])
+        place = case.places.joint(joint)
+        if damping < 0.0:
+            yield Fault(
+                "pump",
+                place,
+                f"{place.element} has a damping of {number(damping)}: it pushes what moves already",
+                'damping="0" or more',
+            )
+        for motor in range(model.nu):
+            is_there = int(model.actuator_trntype[motor]) in _OF_A_JOINT
+            if not is_there or model.actuator_trnid[motor, 0] != joint:
+                continue
+            gear = float(model.actuator_gear[motor, 0])
+            gain = gear * gear * float(model.actuator_biasprm[motor, 2])
+            if gain > max(damping, 0.0):
+                yield Fault(
+                    "pump",
+                    place,
+                    f"actuator '{model.actuator(motor).name}' pushes {place.element} harder the "
+                    f"faster it moves (velocity bias {number(gain)}, damping of the joint "
+                    f"{number(damping)})",
+                    "a third number of at most 0 in its biasprm",
+                )
+
+
+_OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+"""Transmissions of an actuator that acts on a joint."""
 
 
 def _angles(case: CompiledScene) -> Iterator[Fault]:

@@ -343,8 +343,8 @@ def _print_report(report: AuditReport) -> None:
 
 def _print_trip(report: AuditReport) -> None:
     """Prints what to change after a trip of a run that was passive until then."""
-    work = report.energies.get("actuator_work", 0.0)
-    if remedy := trip_remedy(report.reason, work):
+    energies = (report.energies.get(name, 0.0) for name in ("actuator_work", "environment_energy"))
+    if remedy := trip_remedy(report.reason, *energies):
         out.print(f"what to change: {plain(remedy)}")
     out.print("next: hapticbridge guide faults")
 

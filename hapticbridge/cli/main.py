@@ -93,8 +93,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SafetyTrip as trip:
         from hapticbridge.guard import trip_remedy  # noqa: PLC0415 - imports numba
 
-        work = float(trip.records["actuator_work"][-1]) if len(trip.records) else 0.0
-        parts = str(trip), trip_remedy(str(trip), work)
+        work, created = (
+            float(trip.records[name][-1]) if len(trip.records) else 0.0
+            for name in ("actuator_work", "environment_energy")
+        )
+        parts = str(trip), trip_remedy(str(trip), work, created)
         code = _say("safety trip", "; ".join(filter(None, parts)), SAFETY_TRIP)
     except HapticBridgeError as error:
         code = _say("error", error)

@@ -27,7 +27,7 @@ from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.mouse import MouseDevice
-from hapticbridge.errors import HapticBridgeError, RecordingError, choices
+from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
 from hapticbridge.guard import (
     USUAL_ENERGY,
     USUAL_HOLD_TORQUE,
@@ -255,6 +255,7 @@ class Run:
     FIRST_OPTIONS: ClassVar = (
         "scene",
         "settings",
+        "grip",
         "device",
         "force_limit",
         "dead_man",
@@ -614,7 +615,12 @@ class Run:
             notify(f"view: {window.url}")
         if not self.as_json:
             announce_measured(bridge)
-        summary = bridge.run(self._duration(bridge.device.info))
+        try:
+            summary = bridge.run(self._duration(bridge.device.info))
+        except SafetyTrip:
+            stack.close()
+            self._print(bridge.summary(), is_viewed=window is not None)
+            raise
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])

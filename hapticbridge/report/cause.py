@@ -385,7 +385,8 @@ def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cau
     return Cause(
         "unknown",
         f"{where}; method '{method.name}' is not known to create energy without contact",
-        "try a higher rate with 'hapticbridge audit FILE --what-if rate=…'",
+        "look for a joint or motor that pumps with 'hapticbridge check SCENE', or try a higher "
+        "rate with 'hapticbridge audit FILE --what-if rate=…'",
     )
 
 
