@@ -386,7 +386,11 @@ def test_options_reach_the_device_and_the_specification_goes_first(tmp_path: Pat
 @pytest.mark.parametrize(
     ("spec", "options", "words"),
     [
-        ("falcn", {}, "unknown device 'falcn'; choose one of 'falcon', 'forcedimension', 'haply'"),
+        (
+            "falcn",
+            {},
+            "unknown device 'falcn'; did you mean 'falcon'? choose one of 'falcon', 'forcedimension', 'haply'",
+        ),
         ("haply:colour=red", {}, "unknown option 'colour' of the haply device; choose one of 'd"),
         ("forcedimension:colour=red", {}, "unknown option 'colour' of the forcedimension dev"),
         ("rawhid:colour=red", {}, "unknown option 'colour' of the rawhid device; choose one of 'd"),

@@ -65,7 +65,9 @@ def test_the_template_is_listed_opened_and_run_by_its_name(call: Called) -> None
     assert open_device("rail:damping=3").info.damping == 3.0
     with pytest.raises(DeviceError, match="unknown option 'colour' of the rail device; choose"):
         open_device("rail:colour=red")
-    with pytest.raises(DeviceError, match=r"unknown device 'ral'; choose one of .*'rail'"):
+    with pytest.raises(
+        DeviceError, match=r"unknown device 'ral'; did you mean 'rail'. choose one of .*'rail'"
+    ):
         open_device("ral")
     with pytest.raises(DeviceError, match="'rail' moves in real time"):
         hb.Bridge("point_mass", "rail", clock=hb.SimulatedClock())
