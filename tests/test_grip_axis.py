@@ -93,7 +93,7 @@ def test_the_fingers_feel_the_spring_through_the_lever(scale: float | None) -> N
     expected = (stiffness * target - spring * 0.1) / (stiffness + spring)
     assert angle == pytest.approx(expected, abs=2e-5)
     force = -lever * spring * (angle + 0.1)
-    assert device.felt[-2] == pytest.approx(force, rel=1e-3)
+    assert device.felt[device.felt != 0.0][-1] == pytest.approx(force, rel=1e-3)
     assert device.sent[-1].tolist() == [[0.0] * 6] * 2  # at the end
 
 
@@ -145,10 +145,11 @@ def test_a_dead_man_button_lets_go_of_both() -> None:
     with hb.Bridge(tongs(), [grasp], clock=hb.SimulatedClock()) as bridge:
         device.buttons = 1
         bridge.run(0.5)
-        assert abs(device.felt[-2]) > 0.05
+        assert np.abs(device.felt).max() > 0.05
+        before = len(device.felt)
         device.buttons = 0
         bridge.run(0.5)
-        assert device.felt[-2] == 0.0
+        assert not device.felt[before + 100 :].any()  # the force fades within 20 ticks
 
 
 def test_a_device_whose_grip_axis_is_not_coupled_gets_six_numbers() -> None:
