@@ -295,8 +295,10 @@ class Summary:
         for each in self.hands:
             yield f"hand at '{each.grip}' on {each.device}:"
             for name, text in each._rows():
+                is_got = name == "device energy" and each.energies["device_energy"] > INSTANT
+                origin = ", put in by other hands" if is_got and not each.most_given else ""
                 if name in _OF_A_HAND:
-                    yield f"  {name:<{_NAME_WIDTH - 2}}{text}"
+                    yield f"  {name:<{_NAME_WIDTH - 2}}{text}{origin}"
             yield from (f"  {line}" for line in (*each._coupling_lines(), *each._device_lines()))
         yield from self._last_lines()
 

@@ -310,8 +310,9 @@ def _print_report(report: AuditReport) -> None:
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
     kept = report.timekeeping
-    for sentence in report.coupling_sentences[:1]:
-        out.print(f"  {plain(sentence)}")
+    for sentence in report.coupling_sentences:
+        if ": K = " in f": {sentence}":  # of several hands, behind the hand's grip
+            out.print(f"  {plain(sentence)}")
     in_time = ", with every tick in time" if kept is not None and kept.fault else ""
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
