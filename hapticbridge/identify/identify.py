@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.clock import Clock
+from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import (
@@ -34,7 +34,10 @@ from hapticbridge.identify.excitation import (
 )
 from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
 from hapticbridge.jit import direct
+from hapticbridge.realtime import real_time
+from hapticbridge.realtime.realtime import warn_of_refusals
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.units import format_si
 
 # Short, safe run that moves one axis of a device and records it
 
@@ -155,7 +158,7 @@ def _fault_message(code: int, s: np.void) -> str:
         return (
             f"the device moved {distance:.3g} {unit} from where it started, the limit is "
             f"{factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
-            "or allow more travel"
+            "check the sign of its axes (a reversed one runs away), or allow more travel (--travel)"
         )
     if code in (FAST, TURNED_FAST):
         step = factor * float(np.linalg.norm(s["place"][part] - s["before"][part]))
@@ -228,6 +231,10 @@ at most, a moving hand 0.7; no real device was measured."""
 
 LOST_GAIN = 0.05
 """Share of the force above half of its maximum whose loss counts as saturation, without unit."""
+
+LATE = 1.5
+"""Longest interval of one in a thousand ticks, relative to the period, from which on the loop is
+named beside the device; without unit."""
 
 PRECISION = 0.2
 """Largest usable half-width of the mass, relative to its value, without unit."""
@@ -319,18 +326,24 @@ def identify(
     device.start(period)
     clock.start(round(period * 1e9))
     runs, fits = {}, {}
-    for axis in chosen:
-        report = None if progress is None else partial(progress, axis)
-        runs[axis] = run = move_axis(
-            device,
-            clock,
-            axis,
-            period=period,
-            duration=duration,
-            allowance=allowance,
-            progress=report,
-        )
-        fits[axis] = _checked_fit(run, info)
+    with ExitStack() as stack:
+        if info.is_real and clock.name == RealClock.name:
+            warn_of_refusals(stack.enter_context(real_time()))
+        for axis in chosen:
+            report = None if progress is None else partial(progress, axis)
+            runs[axis] = run = move_axis(
+                device,
+                clock,
+                axis,
+                period=period,
+                duration=duration,
+                allowance=allowance,
+                progress=report,
+            )
+            try:
+                fits[axis] = _checked_fit(run, info)
+            except IdentificationError as error:
+                raise IdentificationError(f"{error}{_late_words(run)}") from None
     intervals = np.concatenate([run.intervals for run in runs.values()])
     return Identification(
         info=info,
@@ -347,6 +360,17 @@ def identify(
 def duration_at(period: float) -> float:
     """Returns the default time per axis in s for a period in s: 12, and more below 333 Hz."""
     return DURATION * stretch(period)
+
+
+def _late_words(run: AxisRun) -> str:
+    """Returns a clause on a loop that did not keep its own period; empty if it did."""
+    longest = float(np.quantile(run.intervals, 0.999))
+    if longest <= LATE * run.period:
+        return ""
+    return (
+        f"; but the loop itself was late: one tick in a thousand took {format_si(longest, 's')} "
+        "and more, see 'hapticbridge doctor'"
+    )
 
 
 def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
@@ -384,7 +408,8 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
     if not fit.mass.half_width < PRECISION * fit.mass.value:
         raise IdentificationError(
             f"{where}: mass {fit.mass.value:.2g} ± {fit.mass.half_width:.2g} is not known well "
-            "enough; allow more travel, more force or more time"
+            "enough; allow more travel (--travel), more force (--force-share) or more time "
+            "(--duration)"
         )
     return fit
 
