@@ -265,7 +265,6 @@ class Run:
         "stiffness",
         "damping",
         "view",
-        "as_json",
     )
 
     scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
