@@ -1,4 +1,4 @@
-"""Files: atomic replacement, JSON without NaN, imports of optional packages."""
+"""Files: atomic replacement, folders proven writable, JSON without NaN, optional packages."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import secrets
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.errors import HapticBridgeError, StudyError
 
 # Import of optional packages
 
@@ -126,3 +127,33 @@ def atomic_write(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             draft.unlink(missing_ok=True)
+
+
+def prepared_folder(folder: Path, names: Collection[str] = ()) -> Path:
+    """Makes a folder, if there is none, and proves that it and its files can be written.
+
+    Args:
+        folder: Folder to write into.
+        names: Files in it that will be written; existing ones stay unchanged. Without names, any
+            new file must be possible.
+
+    Raises:
+        StudyError: The path is a file, or the folder or a file in it cannot be made or written.
+    """
+    path = folder
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not names:
+            tempfile.TemporaryFile(dir=folder).close()
+        for path in (folder / name for name in names):
+            is_new = not path.exists()
+            with path.open("ab"):
+                pass
+            if is_new:
+                path.unlink()
+    except FileExistsError:
+        raise StudyError(f"'{folder}' is a file; name a folder to write into") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise StudyError(f"cannot write '{path}': {reason}") from None
+    return folder

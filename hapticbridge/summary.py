@@ -211,7 +211,7 @@ class Summary:
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
-        most_given: Largest energy in J that the hand had got beyond what it put in and what the
+        max_net_energy: Largest energy in J that the hand had got beyond what it put in and what the
             device's damping burned; 0 without a hand.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
@@ -244,7 +244,7 @@ class Summary:
     recording: Path | None
     reach: float | None
     has_hand: bool
-    most_given: float = 0.0
+    max_net_energy: float = 0.0
     grip: str = ""
     device: str = ""
     hands: tuple[Summary, ...] = ()
@@ -296,7 +296,7 @@ class Summary:
             yield f"hand at '{each.grip}' on {each.device}:"
             for name, text in each._rows():
                 is_got = name == "device energy" and each.energies["device_energy"] > INSTANT
-                origin = ", put in by other hands" if is_got and not each.most_given else ""
+                origin = ", put in by other hands" if is_got and not each.max_net_energy else ""
                 if name in _OF_A_HAND:
                     yield f"  {name:<{_NAME_WIDTH - 2}}{text}{origin}"
             yield from (f"  {line}" for line in (*each._coupling_lines(), *each._device_lines()))
@@ -346,8 +346,8 @@ class Summary:
         for name, joules in self.energies.items():
             if joules:  # exactly 0 without motors or springs
                 yield name.replace("_", " "), format_energy(joules)
-        if self.most_given > INSTANT:
-            yield "net to the hand", f"{format_energy(self.most_given)} at most, {self._origin}"
+        if self.max_net_energy > INSTANT:
+            yield "net to the hand", f"{format_energy(self.max_net_energy)} at most, {self._origin}"
 
     @property
     def _origin(self) -> str:
@@ -447,7 +447,9 @@ class Summary:
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
-            most_given=0.0 if info.is_prescribed else float(state["observer"]["most_given"][0]),
+            max_net_energy=0.0
+            if info.is_prescribed
+            else float(state["observer"]["max_guarded_energy"][0]),
             grip=parameters.grip,
             device=info.name,
         )

@@ -183,6 +183,38 @@ SHEET = DeviceInfo(
 )
 
 
+class AnsweringDevice:
+    """A device on the x axis whose hand answers the force that it was sent.
+
+    Args:
+        speed: Speed in m/s until the next tick, from the tick and the force in N.
+        sheet: Fields of the data sheet that differ from ``SHEET``.
+    """
+
+    def __init__(self, speed: Callable[[int, float], float], **sheet: Any) -> None:
+        self.info = replace(SHEET, axes=("x",), **sheet)
+        self._speed = speed
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._period, self._tick, self._place, self._force = period, 0, 0.0, 0.0
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self._place += self._speed(self._tick, self._force) * self._period
+        self._tick += 1
+        sample["position"][0] = self._place, 0.0, 0.0
+        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._force = float(wrench[0])
+
+    def close(self) -> None:
+        self._force = 0.0
+
+
 class ScriptedDevice:
     """A device whose poses, buttons and gaps come from its tick, and which keeps what it is sent.
 

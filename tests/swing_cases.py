@@ -127,7 +127,7 @@ class LateInBunches:
     def close(self) -> None:
         self.device.close()
 
-    def most_given(self) -> float:
+    def max_net_energy(self) -> float:
         """Returns the largest energy in J that the hand had got beyond what the damping burnt."""
         moved = np.diff(self._places, axis=0)
         work = np.einsum("ki,ki->k", self._forces[1 : len(moved) + 1], moved)
@@ -146,4 +146,4 @@ def bunched(
         summary = bridge.run(motion.duration)
         flags = bridge.latest_records(summary.ticks)["flags"]
     found = int(np.bitwise_or.reduce(flags)) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
-    return found, late.most_given()
+    return found, late.max_net_energy()

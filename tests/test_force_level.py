@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from adversary import UNPAID, Attack
-from audit_cases import balance_of
+from audit_cases import AnsweringDevice, balance_of
 from numpy.typing import NDArray
 
 import hapticbridge as hb
@@ -52,44 +52,19 @@ def test_a_limit_on_the_device_alone_is_seen_to_fail() -> None:
 
 
 STRETCHING, DAMPING = 100, 2.0
-"""Ticks for which ``Yielding`` stretches the spring, and the damping of its device in N s/m."""
-
-
-class Yielding:
-    """A hand that stretches the spring, then yields at the speed that gets most of a held force."""
-
-    info = hb.DeviceInfo(
-        name="yielding", axes=("x",), force_limit=1.0, damping=DAMPING, delay=0.0, is_real=False
-    )
-
-    def start(self, period: float) -> NDArray[np.void]:
-        self.period, self.tick, self.position, self.force = period, 0, 0.0, 0.0
-        sample = np.zeros(1, hb.SAMPLE_DTYPE)
-        sample["quaternion"][0, 0] = 1.0
-        return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        yielding = self.force / (2.0 * DAMPING) * self.period
-        self.position += 1e-4 if 0 < self.tick < STRETCHING else yielding
-        self.tick += 1
-        sample["position"][0] = self.position, 0.0, 0.0
-        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.force = float(wrench[0])
-
-    def close(self) -> None:
-        self.force = 0.0
+"""Ticks for which a hand stretches the spring, and the damping of its device in N s/m."""
 
 
 def test_at_the_level_no_slack_hides_what_a_scene_creates(tmp_path: Path) -> None:
     # the tool runs away at 1 m/s whatever the coupling does: the scene creates 1 W at 1 N
+    def yielding(tick: int, force: float) -> float:  # at the speed that gets most of a held force
+        return 0.1 if 0 < tick < STRETCHING else force / (2.0 * DAMPING)
+
     path = tmp_path / "run.mcap"
     limits = hb.Limits(force=1.0, torque=0.5, hold_force=100.0, energy=math.inf, stretch=math.inf)
     with hb.Bridge(
         "point_mass",
-        Yielding(),
+        AnsweringDevice(yielding, damping=DAMPING, force_limit=1.0),
         method="implicit",
         controller="off",
         limits=limits,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, SlowClock, recorded
+from audit_cases import AnsweringDevice, ScriptedDevice, SlowClock, recorded
 from bridge_runs import fast, sway
 from cli_cases import Called
 from numpy.typing import NDArray
@@ -24,7 +24,6 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.timing import DELAY_PRICE
-from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.summary import Summary
 from hapticbridge.timekeeping import INSTANT
@@ -235,47 +234,19 @@ def test_short_delays_are_judged_by_what_they_gave(tmp_path: Path) -> None:
     assert summary.timekeeping.delay_energy == 0.0
 
 
-class Snatching:
-    """A hand that presses to 8 N, and yields in the tick that is late as gets most out of it."""
-
-    info = DeviceInfo(
-        name="snatching", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
-    )
-
-    def __init__(self, stalled: int, skipped: int, share: float) -> None:
-        self.stalled, self.skipped, self.share = stalled, skipped, share
-
-    def start(self, period: float) -> NDArray[np.void]:
-        self.period, self.tick, self.position, self.force = period, 0, 0.0, 0.0
-        sample = np.zeros(1, SAMPLE_DTYPE)
-        sample["quaternion"][0, 0] = 1.0
-        return sample
-
-    def read(self, sample: NDArray[np.void]) -> int:
-        speed = 0.05 if abs(self.force) < 8.0 and self.tick < self.stalled else 0.0
-        if self.tick == self.stalled:
-            speed = self.share * self.force / (2.0 * 2.0) * (1 + self.skipped)
-        if self.tick > 0:
-            self.position += speed * self.period
-        self.tick += 1
-        sample["position"][0] = self.position, 0.0, 0.0
-        sample["quaternion"][0] = 1.0, 0.0, 0.0, 0.0
-        return 0
-
-    def write(self, wrench: NDArray[np.float64]) -> None:
-        self.force = float(wrench[0])
-
-    def close(self) -> None:
-        self.force = 0.0
-
-
 @pytest.mark.parametrize(("skipped", "share"), [(1, 1.0), (3, 1.0), (3, 0.0), (3, -0.2)])
 def test_a_force_that_outlasts_its_spring_is_counted(
     tmp_path: Path, skipped: int, share: float
 ) -> None:
     # with share 0 the hand stands still in that moment, with -0.2 it presses on
     path, stalled = tmp_path / "run.mcap", 800
-    device, clock = Snatching(stalled, skipped, share), SlowClock({stalled: skipped})
+
+    def snatching(tick: int, force: float) -> float:
+        if tick == stalled:  # late, and yields as fast as gets most out of it
+            return share * force / (2.0 * 2.0) * (1 + skipped)
+        return 0.05 if abs(force) < 8.0 and 0 < tick < stalled else 0.0
+
+    device, clock = AnsweringDevice(snatching), SlowClock({stalled: skipped})
     summary = recorded(path, "virtual_wall", device, clock=clock, duration=1.0)
     ticks = read_recording(path).ticks
     moved, time = np.diff(ticks["device_position"][:, 0]), 1e-9 * np.diff(ticks["read_ns"])

@@ -167,6 +167,9 @@ class EnergyBalance:
             released by scene and coupling since the start, and the unfelt work (``unfelt_work``),
             (n,) in J. Zero for an unknown damping or several laws per tick. With a coupling law,
             energy created by the environment is not included; it belongs to the other port.
+        net_energy: Energy given to the hand beyond what the device's damping burned, less what the
+            scene's storage has lost since the start, (n,) in J; zero without a hand. It is what the
+            guard's energy limit bounds. An unknown damping burns nothing here.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
@@ -179,6 +182,7 @@ class EnergyBalance:
     environment_energy: Array
     slack: Array
     excess_device_energy: Array
+    net_energy: Array
     contact_tank: Array
     sums: dict[str, float]
 
@@ -225,6 +229,9 @@ class EnergyBalance:
             in_springs = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
             in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
+        lost = np.minimum(stored - others_work, 0.0)
+        net = totals["device_energy"] - totals["device_dissipation"]
+        net = net + parameters.force_scale / parameters.scale * lost
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
         ceiling = np.minimum(
             np.minimum.accumulate(parameters.tank_cap + created), before["tank_ceiling"]
@@ -238,6 +245,7 @@ class EnergyBalance:
             environment_energy=created,
             slack=totals["slack"],
             excess_device_energy=excess,
+            net_energy=net * parameters.guarding.has_hand,
             contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
             sums={name: float(total[-1]) for name, total in totals.items()},
         )

@@ -97,6 +97,7 @@ class PassivityTally:
             condition behind a coupling law is proven safe without it.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
+        max_net_energy: Largest net energy to the hand in J (``EnergyBalance.net_energy``).
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
         excess: First tick in which the device received excess energy, and that energy.
@@ -105,6 +106,7 @@ class PassivityTally:
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
+    max_net_energy: float = 0.0
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
@@ -117,6 +119,7 @@ class PassivityTally:
         allowed = balance.slack + rounding
         used = float(np.max(np.where(is_unstrict, created / allowed, 0.0)))
         self.slack_share = max(self.slack_share, used)
+        self.max_net_energy = max(self.max_net_energy, float(np.max(balance.net_energy)))
         self.unstrict = self.unstrict or _first(is_unstrict, created, start)
         self.active = self.active or _first(created > allowed, created - balance.slack, start)
         if self.is_watched:
@@ -275,6 +278,7 @@ def verdict_on(
                     timings = [TimingTally(hand.run.parameters) for hand in hands]
                     fault, facts["duration"] = _check_records(hands, energies, timings)
                     facts["energies"] = _energies_of_hands(energies)
+                    facts["max_net_energy"] = max(each.max_net_energy for each in energies)
                     for hand, own, timing in zip(hands, of_hands, timings, strict=True):
                         own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
                         fault = fault or first_contradiction(
@@ -302,21 +306,20 @@ def verdict_on(
         doubt = "" if kept is None else kept.fault
         if facts["certified"] is False and not (kept and kept.refutation):
             doubt = "the device has less damping than the coupling needs"
-        pushed = _motor_words(facts.get("energies", {}))
+        pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
         end = unusual_end(recording.events)
         notes = (found["reason"], doubt, pushed, end, facts["unchecked"])
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 
 
-def _motor_words(energies: Mapping[str, float]) -> str:
+def _motor_words(work: float, net: float) -> str:
     """Returns a clause on motors of the scene that pushed the hand; empty if none did."""
-    work, given = (energies.get(name, 0.0) for name in ("actuator_work", "device_energy"))
-    if min(work, given) <= INSTANT:
+    if min(work, net) <= INSTANT:
         return ""
     return (
-        f"the scene's motors did {format_energy(work)} of work and the device gave the hand "
-        f"{format_energy(given)}: no guarantee covers motors that push"
+        f"the scene's motors did {format_energy(work)} of work and the hand got up to "
+        f"{format_energy(net)} beyond what it put in: no guarantee covers motors that push"
     )
 
 

@@ -53,7 +53,7 @@ OBSERVER_DTYPE = np.dtype(
         ("observed_energy", "<f8"),
         ("net_device_energy", "<f8"),
         ("guarded_energy", "<f8"),
-        ("most_given", "<f8"),
+        ("max_guarded_energy", "<f8"),
         ("created_energy", "<f8"),
         ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
@@ -65,9 +65,8 @@ OBSERVER_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
-N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``most_given`` is the largest
-``guarded_energy`` so far. ``reversals`` holds one bit per
-tick."""
+N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``max_guarded_energy`` is the
+largest ``guarded_energy`` so far. ``reversals`` holds one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -231,7 +230,7 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
     observer.net_device_energy += delivered
     observer.guarded_energy = guarded_energy(s)
-    observer.most_given = max(observer.most_given, observer.guarded_energy)
+    observer.max_guarded_energy = max(observer.max_guarded_energy, observer.guarded_energy)
     for i in range(6):
         u = rate * (moved[i] if i < 3 else turned[i - 3])
         has_reversed = 1 if u * observer.device_velocity[i] < 0.0 else 0

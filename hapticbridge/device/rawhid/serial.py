@@ -154,12 +154,13 @@ class SystemPorts:
 def _group(path: str) -> str:
     """Returns the name of the group that owns a port; Debian's where there is none to be read.
 
-    ``Path.group`` raises OSError without the port, KeyError for a group without a name, and
-    NotImplementedError on Windows, which has no groups.
+    There is none without the port, for a group without a name, and on Windows.
     """
     try:
-        return Path(path).group()
-    except (OSError, KeyError, NotImplementedError):
+        import grp  # noqa: PLC0415 - not on Windows
+
+        return grp.getgrgid(Path(path).stat().st_gid).gr_name
+    except (ImportError, OSError, KeyError):
         return "dialout"
 
 

@@ -20,11 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null
+from hapticbridge.files import finite_or_null, prepared_folder
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
 from hapticbridge.lab.chart.setting import OWN, Setting, who
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
-from hapticbridge.lab.folder import prepared_folder
 from hapticbridge.options import DEFAULT_OPTIONS
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.run_description import versions

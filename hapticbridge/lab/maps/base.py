@@ -24,9 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.device import Motion
 from hapticbridge.errors import StudyError
-from hapticbridge.files import finite_or_null
+from hapticbridge.files import finite_or_null, prepared_folder
 from hapticbridge.lab.closed_loop import ClosedLoop
-from hapticbridge.lab.folder import prepared_folder
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import write_picture
 from hapticbridge.scene import Scene, load_scene
