@@ -102,7 +102,10 @@ def rewritten(
     attachments: Mapping[str, bytes] | None = None,
     signer: Any = None,
 ) -> Path:
-    """Writes a recording with parts changed, and a seal that fits them."""
+    """Writes a recording with parts changed, and a seal that fits them.
+
+    As in a recording of a run, an event comes before the ticks that follow it.
+    """
     files = {**recording.attachments, **(attachments or {})}
     writer = RecordingWriter(
         path,
@@ -111,10 +114,14 @@ def rewritten(
         int(recording.meta["epoch_ns"]),
         record=(recording.ticks if ticks is None else ticks).dtype,
     )
-    writer.write_ticks(recording.ticks if ticks is None else ticks)
+    rows, start = recording.ticks if ticks is None else ticks, 0
     for event in recording.events if events is None else events:
-        time = event["time_ns"]
+        tick, time = (event.get(name) for name in ("tick", "time_ns"))
+        stop = int(np.searchsorted(rows["tick"], tick)) if isinstance(tick, int) else start
+        writer.write_ticks(rows[start : max(start, stop)])
         writer.write_event(event, time if isinstance(time, int) else 0)
+        start = max(start, stop)
+    writer.write_ticks(rows[start:])
     writer.close(signer)
     return path
 

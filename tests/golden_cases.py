@@ -24,6 +24,7 @@ from unittest.mock import patch
 
 import numpy as np
 from audit_cases import ScriptedDevice, SlowClock, rewritten
+from mcap.reader import SeekingReader
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 
@@ -562,15 +563,18 @@ def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Pa
     for name, data in recording.attachments.items():
         short = {name: data[:-8]}
         yield f"attachment {name} cut", rewritten(recording, path, attachments=short)
-    content = recording.path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
+    # the recorder fills chunks as fast as it gets records, a rewritten file has equal ones; sizes
+    # after compression differ with the host's name and the time
+    content = rewritten(recording, path).read_bytes()
+    summary = SeekingReader(io.BytesIO(content)).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[1]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2  # in its records
+    path.write_bytes(content[:middle])
     yield "file cut in the middle", path
     path.write_bytes(content[:-100])
     yield "file without its end", path
-    # the recorder fills chunks as fast as it gets records, a rewritten file has equal ones
-    content = rewritten(recording, path).read_bytes()
-    place = len(content) // 4  # far from the ends of its chunk
-    path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    path.write_bytes(content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :])
     yield "one bit of the file", path
 
 
