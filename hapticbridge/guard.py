@@ -291,6 +291,8 @@ _REASONS = {
     GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
 }
 _REMEDIES = {
+    BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
+    "is not 1",
     JUMPED: "check the unit (m) and the times (s) of what it reports, and that no sample is late",
     STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
@@ -299,8 +301,8 @@ _REMEDIES = {
 }
 _LIMIT_MOTORS = (
     "the scene's motors did {} of work until then: limit their force (forcerange) or let them "
-    "start at rest (ctrl in keyframe 'home'); if they are meant to push the hand, --energy-limit "
-    "is what it may get"
+    "start at rest (ctrl in keyframe 'home'); 'hapticbridge check SCENE' names those that push at "
+    "the start; if they are meant to push the hand, --energy-limit is what it may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "

@@ -576,7 +576,10 @@ class RunSetup:
             weightless = self._sent(holding_force(scene, parameters, has_weight=False))
             if weightless > max(most, force / 2):
                 return ""  # motors or springs push, more than the weight
-            return f"it pulls with up to {force:.3g} N, and the device holds {most:.3g} N"
+            return (
+                f"it pulls with up to {force:.3g} N, its first swing included, and the device "
+                f"holds {most:.3g} N"
+            )
         if (force := self._sent(toppling_force(scene, parameters))) > most:
             return (
                 f"it stands upright and topples: {TIPPED:g} m beside, it pulls with "

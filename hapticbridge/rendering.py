@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import Any
@@ -649,7 +649,9 @@ class Rehearsal:
             self.model.actuator_biasprm[self._actuator] = bias
 
 
-def static_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
+def static_load(
+    scene: Scene, parameters: RunParameters, *, has_weight: bool = True
+) -> NDArray[np.float64]:
     """Returns the wrench that holds the tool of a prepared scene at rest, (6,) in N and N m.
 
     World frame, about the grip. The tool settles on the coupling with the handle at its grip; its
@@ -660,7 +662,24 @@ def static_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
     Args:
         scene: The prepared scene, at its start.
         parameters: Parameters of the run.
+        has_weight: If false, gravity is left out.
     """
+    with _gravity(scene.model, is_on=has_weight):
+        return _settled_load(scene, parameters)
+
+
+@contextmanager
+def _gravity(model: mujoco.MjModel, *, is_on: bool) -> Iterator[None]:
+    """Lets a model have its gravity, or none, for a while."""
+    gravity = model.opt.gravity.copy()
+    try:
+        model.opt.gravity *= is_on
+        yield
+    finally:
+        model.opt.gravity = gravity
+
+
+def _settled_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
     rehearsal, grip = Rehearsal(scene, parameters), scene.grip_pose()
     model, data = rehearsal.model, rehearsal.data
     dofs = tree_of_tool(model, held_body(model, scene.grip)).dofs
@@ -738,15 +757,12 @@ def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool =
         parameters: Parameters of the run; a handle with absolute poses is taken at the grip.
         has_weight: If false, gravity is left out.
     """
-    handle, gravity = parameters.handle_origin, scene.model.opt.gravity.copy()
+    handle = parameters.handle_origin
     if handle == IDENTITY_POSE or not has_weight:
         handle = scene.grip_pose()
-    try:
-        scene.model.opt.gravity *= has_weight
+    with _gravity(scene.model, is_on=has_weight):
         steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
         return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
-    finally:
-        scene.model.opt.gravity = gravity
 
 
 TIPPED = 0.1

@@ -525,3 +525,31 @@ def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told:
         fallen = float(fault.sentence.split(" by ")[1].split(" m ")[0])
         seconds = case_of(written(tmp_path, text)).motion.duration
         assert fallen == pytest.approx(4.905 * seconds**2, rel=0.05)
+
+
+def test_what_a_run_changes_by_itself_and_a_motor_that_pushes_are_notes(tmp_path: Path) -> None:
+    slide = '<body name="tool"><joint name="rail" type="slide"/><geom size="0.01" mass="1"/>'
+    motors = (
+        '<actuator><{} joint="rail"/></actuator><keyframe><key name="home" ctrl="{}"/></keyframe>'
+    )
+    for motor, control, told in (
+        ('motor gear="3"', 1.0, ["pushes joint 'rail' with 3 N"]),
+        ('motor gear="3"', 0.0, []),
+        ('position kp="300"', 0.01, []),  # holds the joint at a place
+    ):
+        text = mjcf(motors.format(motor, control), body=slide + '<site name="grip"/></body>')
+        faults = faults_in(tmp_path, text, STILL)
+        notes = [fault for fault in faults if fault.is_note]
+        assert "time step" in kinds(notes)
+        sentences = [fault.sentence for fault in notes if fault.kind == "motor"]
+        assert [
+            told_part in sentence for told_part, sentence in zip(told, sentences, strict=True)
+        ] == ([True] * len(told))
+
+
+def test_wrong_units_come_alone_because_all_else_follows_from_them(tmp_path: Path) -> None:
+    (fault,) = faults_in(
+        tmp_path, mjcf(HEAVY, GOOD_CONTACT, body=free('size="5 40" type="capsule"'))
+    )
+    assert fault.kind == "units"
+    assert "more findings wait until this is mended" in fault.sentence

@@ -98,6 +98,14 @@ def test_a_device_of_another_integrator_is_measured_as_well() -> None:
     assert fit.friction.value == pytest.approx(0.0, abs=2e-3)
 
 
+def test_a_long_delay_is_measured_and_one_beyond_the_search_is_refused() -> None:
+    slow = {"damping": 1.5, "friction": 0.1, "delay": 30}
+    assert fitted(SimulatedDevice(hand=None, **slow)).delay.value == pytest.approx(0.03, abs=5e-4)
+    for ticks in (45, 60):
+        with pytest.raises(IdentificationError, match="answers 40 ms late or later"):
+            fitted(SimulatedDevice(hand=None, **slow | {"delay": ticks}))
+
+
 def test_half_a_period_of_delay_is_found_although_no_tick_is_that_long() -> None:
     fine = SimulatedDevice(hand=None, mass=0.2, damping=1.0, delay=1)
     sample = fine.start(0.5 * PERIOD)

@@ -19,12 +19,14 @@ class Fault:
         place: File, line and element.
         sentence: Description with its numbers.
         change: Text to write at the place.
+        is_note: True if a run works as well without the change; the scene counts as sound.
     """
 
     kind: str
     place: Place
     sentence: str
     change: str
+    is_note: bool = False
 
 
 def number(value: float) -> str:

@@ -219,6 +219,9 @@ def _listed(values: Sequence[float]) -> str:
 
 # Faults of sizes and shapes: units, filled holes, a distant grip, a small device
 
+UNITS = "units"
+"""Kind of the fault of a tool whose sizes or masses no hand could hold."""
+
 LARGEST_TOOL, HEAVIEST_TOOL = 3.0, 50.0
 """Length in m and mass in kg above which no hand holds a tool, so that wrong units are
 suspected."""
@@ -248,6 +251,7 @@ def geometry_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     """Yields faults of sizes and shapes."""
     yield from _units(case)
     yield from _pumps(case)
+    yield from _motors(case)
     yield from _angles(case)
     yield from _dented_meshes(case)
     yield from _far_grip(case)
@@ -275,7 +279,7 @@ def _units(case: CompiledScene) -> Iterator[Fault]:
     place = case.places.mesh(meshes[0]) if meshes else case.places.body(body)
     change = 'scale="0.001 0.001 0.001"' if meshes else "its sizes and positions in m, kg"
     yield Fault(
-        "units",
+        UNITS,
         place,
         f"the tool {' and '.join(found)}: are these millimetres or grams? MuJoCo counts in m and "
         "kg",
@@ -311,6 +315,33 @@ def _pumps(case: CompiledScene) -> Iterator[Fault]:
                     f"{number(damping)})",
                     "a third number of at most 0 in its biasprm",
                 )
+
+
+MOTOR_FORCE = 0.1
+"""Force in N, or torque in N m, of a motor at the start from which it is told."""
+
+
+def _motors(case: CompiledScene) -> Iterator[Fault]:
+    """Finds motors that push from the start on, whatever the joint does; a servo holds it."""
+    model, data = case.model, case.scene.data
+    case.scene.reset()
+    for motor in range(model.nu):
+        force = float(data.actuator_force[motor]) * float(model.actuator_gear[motor, 0])
+        is_there = int(model.actuator_trntype[motor]) in _OF_A_JOINT
+        if not is_there or model.actuator_biasprm[motor, 1] != 0.0 or abs(force) < MOTOR_FORCE:
+            continue
+        joint = int(model.actuator_trnid[motor, 0])
+        unit = "N" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "N m"
+        place = case.places.joint(joint)
+        yield Fault(
+            "motor",
+            place,
+            f"actuator '{model.actuator(motor).name}' pushes {place.element} with "
+            f"{number(abs(force))} {unit} from the start on; no guarantee covers what a motor "
+            "gives the hand",
+            "ctrl=\"0\" in keyframe 'home', or a smaller forcerange",
+            is_note=True,
+        )
 
 
 _OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -628,13 +659,14 @@ def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
     sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
     if sag <= LARGEST_SAG:
         return
-    root = int(model.body_rootid[body])
-    mass = float(model.body_mass[model.body_treeid == tree].sum())
+    of_tool = np.flatnonzero(model.body_treeid == tree)
+    mass = float(model.body_mass[of_tool].sum())
     pull = sag * coupling.stiffness
     yield Fault(
         "heavy tool",
-        case.places.body(root),
+        case.places.body(int(of_tool[0])),  # the first that moves
         f"the tool weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
-        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest",
+        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest; a run carries "
+        "it where the device cannot, and with --no-tool-weight",
         'gravcomp="1" in the body and those below it, or less mass',
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -15,7 +16,12 @@ from hapticbridge.check.contact_faults import (
     start_faults,
 )
 from hapticbridge.check.fault import Fault, number
-from hapticbridge.check.model_faults import constraint_faults, geometry_faults, mass_faults
+from hapticbridge.check.model_faults import (
+    UNITS,
+    constraint_faults,
+    geometry_faults,
+    mass_faults,
+)
 from hapticbridge.check.observe import Observation
 from hapticbridge.check.own_motion import own_motion
 from hapticbridge.errors import choices
@@ -47,6 +53,7 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
             f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
             f"{1 / step:g}",
+            is_note=True,
         )
     for change in case.scene.changes:
         if not change.startswith(_OWN_FAULT):
@@ -54,7 +61,8 @@ def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
                 "changed",
                 places.option("integrator"),
                 f"the scene runs with a change, {change}",
-                "nothing, or see if run --as-is should refuse it",
+                "run --as-is, which refuses the scene",
+                is_note=True,
             )
     concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
     for concern in concerns:
@@ -214,5 +222,13 @@ RULES = (
 
 
 def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:
-    """Returns all faults of a scene from ``open_case``; the scene is reset."""
-    return tuple(fault for rule in RULES for fault in rule(case))
+    """Returns all faults of a scene from ``open_case``; the scene is reset.
+
+    A tool in wrong units has faults of every kind, so that these wait until it is mended.
+    """
+    faults = [fault for rule in RULES for fault in rule(case)]
+    units = [fault for fault in faults if fault.kind == UNITS]
+    if not units or len(faults) == len(units):
+        return tuple(faults)
+    waiting = f"; {len(faults) - len(units)} more findings wait until this is mended"
+    return tuple(replace(fault, sentence=fault.sentence + waiting) for fault in units)

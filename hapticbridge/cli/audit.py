@@ -318,8 +318,8 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  {plain(sentence)}{in_time}")
     if not report.conditions:
         out.print(
-            "  device condition b >= KT/2 + B_law: not applicable, the motion is prescribed or the "
-            "damping unknown"
+            "  device not judged (b >= KT/2 + B_law): its motion is prescribed, or its damping "
+            "unknown, which 'hapticbridge identify' measures"
         )
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified)}")

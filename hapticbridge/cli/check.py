@@ -229,12 +229,22 @@ def print_cost(cost: Cost | None) -> None:
     )
 
 
-def print_faults(faults: tuple[Fault, ...]) -> None:
-    """Prints each fault with its place and the change that mends it."""
-    if not faults:
+def print_faults(findings: tuple[Fault, ...]) -> None:
+    """Prints each fault with its place and the change that mends it, then what is a note."""
+    faults = [each for each in findings if not each.is_note]
+    notes = [each for each in findings if each.is_note]
+    if faults:
+        out.print(f"\n[bold]What is wrong[/]: [yellow]{len(faults)} found[/]")
+        _print_findings(faults, "write")
+    else:
         out.print("\n[bold]What is wrong[/]\n  [green]nothing found[/]")
-        return
-    out.print(f"\n[bold]What is wrong[/]: [yellow]{len(faults)} found[/]")
+    if notes:
+        out.print("\n[bold]Worth knowing[/]")
+        _print_findings(notes, "or")
+
+
+def _print_findings(faults: list[Fault], lead: str) -> None:
+    """Prints each finding; the lead goes before what to write."""
     seen: Counter[str] = Counter()
     for number, fault in enumerate(faults, 1):
         seen[fault.kind] += 1
@@ -245,7 +255,7 @@ def print_faults(faults: tuple[Fault, ...]) -> None:
         whole = re.sub(r'"[^"]*"', lambda quoted: quoted[0].replace(" ", _GLUE), fault.sentence)
         for line in textwrap.wrap(whole, _WIDTH):
             out.print(f"     {plain(line.replace(_GLUE, ' '))}")
-        out.print(f"     [green]write:[/] {plain(fault.change)}")
+        out.print(f"     [green]{lead}:[/] {plain(fault.change)}")
     for kind, count in seen.items():
         if count > MAX_NAMED:
             out.print(f"  and {count - MAX_NAMED} more of '{plain(kind)}': --json lists all")
@@ -271,7 +281,8 @@ class Check:
     """Find what is wrong with a scene, and what a tick of it costs.
 
     Leads the scene through its hand's motion and names every fault with the line to change. Exit
-    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read.
+    code 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read. What is only worth
+    knowing, such as what a run changes by itself, is nothing wrong.
 
     Example:
         hapticbridge check my_tool.xml --lean --plot lean.png --write lean.xml
@@ -370,12 +381,13 @@ class Check:
                 cost = measure_cost(case.scene, case.samples, case.setting, progress=show)
             slow = cost.fault(case)
             faults = faults if slow is None else (*faults, slow)
+        is_sound = all(fault.is_note for fault in faults)
         if not self.as_json:
             print_case(case)
             print_inventory(inventory)
             print_cost(cost)
             print_faults(faults)
-            if not faults:
+            if is_sound:
                 grip = "" if self.grip == "grip" else f" --grip {shlex.quote(self.grip)}"
                 out.print(f"next: hapticbridge run {plain(shlex.quote(self.scene))}{grip}")
         lean = self._looked_for(case, budget) if wants_lean else None
@@ -390,7 +402,7 @@ class Check:
             outcome = "wrote" if figure is not None else "there is nothing to draw in"
             err.print(f"{outcome} {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
-        return 1 if faults or is_worse or (wants_lean and lean is None) else 0
+        return 1 if not is_sound or is_worse or (wants_lean and lean is None) else 0
 
     def _looked_for(self, case: SceneUnderCheck, budget: float) -> Lean | None:
         """Looks for what could go; None, and a sentence, where the scene must be mended first."""

@@ -36,7 +36,6 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.hands import Grasp, GripAxis, check_grasps
-from hapticbridge.kernel.codes import held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.options import (
     AUTO,
@@ -49,7 +48,7 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
-from hapticbridge.rendering import RunCoupling, default_method
+from hapticbridge.rendering import RunCoupling, default_method, static_load
 from hapticbridge.scene import (
     Scene,
     SceneSource,
@@ -217,7 +216,8 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
     ):
         return
     sag = format_si(load / parameters.coupling.stiffness, "m")
-    if load > OTHER_LOAD * _weight_of_tool(setup.scene):
+    others = static_load(setup.scene, parameters, has_weight=False)[:3]
+    if 2.0 * float(np.linalg.norm(others)) > load:
         yield (
             f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
             "it from motors, springs or parts of the scene that push the tool"
@@ -227,18 +227,6 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
             f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "
             "the handle; --no-tool-weight carries it"
         )
-
-
-OTHER_LOAD = 2.0
-"""Load at rest relative to the tool's weight above which most of it is not weight; no unit."""
-
-
-def _weight_of_tool(scene: Scene) -> float:
-    """Returns the weight in N of all that moves with the tool; gravcomp does not count."""
-    model = scene.model
-    trees = model.body_treeid
-    mass = model.body_mass[trees == trees[held_body(model, scene.grip)]]
-    return float(mass.sum() * np.linalg.norm(model.opt.gravity))
 
 
 @dataclass(frozen=True, slots=True)

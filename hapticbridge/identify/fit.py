@@ -344,8 +344,9 @@ DELAY_ERROR = 1e-5
 """Half-width in s added to every delay, for errors common to all parts of a run: a hundredth of a
 tick at 1 kHz."""
 
-MAX_DELAY = 0.02
-"""Largest delay in s of the search. A device with more delay is of no use for haptics."""
+MAX_DELAY = 0.04
+"""Largest delay in s of the search, which stops there. With 1.5 N s/m a device with more bears less
+than 40 N/m."""
 
 _ROUNDS = 12
 """Largest number of iterations of the search for the delay; each solves anew at the last result."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.errors import DeviceError, IdentificationError
+from hapticbridge.guard import JUMP_MARGIN
 from hapticbridge.identify.excitation import (
     FAR,
     FAST,
@@ -32,7 +33,7 @@ from hapticbridge.identify.excitation import (
     signal,
     stretch,
 )
-from hapticbridge.identify.fit import AxisFit, Estimate, fit_axis
+from hapticbridge.identify.fit import MAX_DELAY, AxisFit, Estimate, fit_axis
 from hapticbridge.jit import direct
 from hapticbridge.realtime import real_time
 from hapticbridge.realtime.realtime import warn_of_refusals
@@ -44,9 +45,6 @@ from hapticbridge.units import format_si
 RUNAWAY = 3.0
 """Multiple of the allowed travel at which a run is aborted, without unit. Such a device does not
 follow the commanded force, so zero force is the safer command."""
-
-SPEED_MARGIN = 1.5
-"""Multiple of the device's own top speed that counts as a fault, without unit."""
 
 _PROGRESS_RATE = 10
 """Rate of progress reports in Hz."""
@@ -126,7 +124,7 @@ def move_axis(
     s["present"] = [float(name in device.info.axes) for name in AXES]
     s["force"], s["travel"] = allowance.force, allowance.travel
     s["farthest"] = RUNAWAY * np.asarray(allowance.travel)
-    s["fastest"] = SPEED_MARGIN * np.asarray(allowance.speed)
+    s["fastest"] = JUMP_MARGIN * np.asarray(allowance.speed)
     s["amplitude"] = START_SHARE * allowance.force[index >= 3]
     compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
@@ -388,6 +386,11 @@ def _checked_fit(run: AxisRun, info: DeviceInfo) -> AxisFit:
         fit = fit_axis(run.position, run.force, run.period, 0.0 if turns else step)
     except IdentificationError as error:
         raise IdentificationError(f"{where}: {error}") from None
+    if fit.delay.value >= MAX_DELAY:  # where the search stops; with less, K would be too stiff
+        raise IdentificationError(
+            f"{where}: it answers {1e3 * MAX_DELAY:g} ms late or later, and with that it bears no "
+            "stiffness worth feeling; use a faster link, or one without buffers on the way"
+        )
     if fit.spring.least > UNLIKELY_SPRING[turns]:
         raise IdentificationError(
             f"{where}: a spring of {fit.spring.value:.3g} {spring_unit} holds the device; let go "

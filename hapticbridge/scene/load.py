@@ -305,4 +305,13 @@ def _refused(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, MemoryError, mujoco.FatalError) as error:
-        raise SceneError(f"cannot compile scene '{path}': {clause(error)}") from None
+        raise SceneError(f"cannot compile scene '{path}': {_found_nowhere(path, error)}") from None
+
+
+def _found_nowhere(path: Path, error: Exception) -> str:
+    """Returns MuJoCo's words; of a file that it does not find, with the folder it looked in."""
+    words = clause(error)
+    if words.startswith("Error opening file"):
+        folder = path.resolve().parent
+        words += f", looked for in '{folder}' and its meshdir or texturedir, if it names one"
+    return words
