@@ -13,6 +13,7 @@ from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import AXES, Device, DeviceInfo
+from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import direct
@@ -376,10 +377,6 @@ hand lets go. With more, the force that comes back when the hand takes hold woul
 SWING_ENERGY, RUNAWAY_SPEED = 8e-3, 0.1
 """Energy in J and speed in m/s above which the watch suspects a late or reversed force
 (``kernel.swing_watch`` has the reasons)."""
-
-JUMP_MARGIN = 2.0
-"""Factor on the data sheet's speed limit, without unit. A late sample followed by a punctual one
-shows up to two periods of motion in one."""
 
 FASTEST_TURN = 300.0
 """Largest plausible angular velocity in rad/s. A hand turns a stylus at 30; half a turn within a

@@ -540,7 +540,7 @@ def test_what_a_run_changes_by_itself_and_a_motor_that_pushes_are_notes(tmp_path
         text = mjcf(motors.format(motor, control), body=slide + '<site name="grip"/></body>')
         faults = faults_in(tmp_path, text, STILL)
         notes = [fault for fault in faults if fault.is_note]
-        assert "time step" in kinds(notes)
+        assert "time step" in {note.kind for note in notes}
         sentences = [fault.sentence for fault in notes if fault.kind == "motor"]
         assert [
             told_part in sentence for told_part, sentence in zip(told, sentences, strict=True)

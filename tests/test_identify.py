@@ -99,11 +99,14 @@ def test_a_device_of_another_integrator_is_measured_as_well() -> None:
 
 
 def test_a_long_delay_is_measured_and_one_beyond_the_search_is_refused() -> None:
-    slow = {"damping": 1.5, "friction": 0.1, "delay": 30}
-    assert fitted(SimulatedDevice(hand=None, **slow)).delay.value == pytest.approx(0.03, abs=5e-4)
+    def delay_of(ticks: int) -> float:
+        device = SimulatedDevice(hand=None, damping=1.5, friction=0.1, delay=ticks)
+        return fitted(device).delay.value
+
+    assert delay_of(30) == pytest.approx(0.03, abs=5e-4)
     for ticks in (45, 60):
         with pytest.raises(IdentificationError, match="answers 40 ms late or later"):
-            fitted(SimulatedDevice(hand=None, **slow | {"delay": ticks}))
+            delay_of(ticks)
 
 
 def test_half_a_period_of_delay_is_found_although_no_tick_is_that_long() -> None:

@@ -118,6 +118,10 @@ DATA_SHEET_UNITS = {
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes of a device in its own frame: translation (x, y, z) and rotation (rx, ry, rz)."""
 
+JUMP_MARGIN = 2.0
+"""Factor on the data sheet's speed limit above which a motion is a fault, without unit. A late
+sample followed by a punctual one shows up to two periods of motion in one."""
+
 USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 """Default limits in N, N m and m/s for sheets without a figure of their own. Force and torque are
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device import AXES, Device, DeviceInfo
+from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.errors import DeviceError, IdentificationError
-from hapticbridge.guard import JUMP_MARGIN
 from hapticbridge.identify.excitation import (
     FAR,
     FAST,
