@@ -54,17 +54,13 @@ from hapticbridge.kernel.parameters import (
 )
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
+from hapticbridge.rehearsal import TIPPED, holding_force, start_handle, static_load, toppling_force
 from hapticbridge.rendering import (
-    TIPPED,
     Method,
     default_method,
-    holding_force,
     method_named,
     require_hazard_consent,
     resolve_contact_stiffness,
-    start_handle,
-    static_load,
-    toppling_force,
 )
 from hapticbridge.scene import Scene
 
@@ -364,6 +360,50 @@ def device_for_run(
         yield opened
 
 
+def _usual_coupling(
+    scene: Scene, info: DeviceInfo, options: BridgeOptions, scene_ticks: int, evaluations: int
+) -> Coupling:
+    """Returns the stiffest coupling that is safe, softer where a slow scene shakes with it.
+
+    ``evaluations`` is the number of times that a tick evaluates the coupling's law.
+    """
+    method, period = options.rendering_method, period_of(options.rate)
+    scales = options.workspace.scales
+    usual = default_coupling(info, period, *scales, evaluations, method)
+    if not scene_ticks:
+        return usual
+    scene_period = scene_ticks * period
+    law = method.law_coupling(usual, period)
+    share = min(steady_stiffness(scene, info, scene_period, *scales) / law.stiffness, 1.0)
+    turned = min(
+        share * law.rotational_stiffness,
+        steady_rotational_stiffness(info, scene_period, *scales),
+    )
+    law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)
+    return method.requested_coupling(law, scene_period / options.substeps)
+
+
+def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bool) -> None:
+    """Refuses a button that the device lacks, and marks of a recording that there is none of.
+
+    Raises:
+        RecordingError: A button is to mark moments, and nothing is recorded.
+        DeviceError: The device has fewer buttons.
+    """
+    if options.mark is not None and not is_recorded:
+        raise RecordingError(
+            f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
+            " name a file to record to"
+        )
+    for name in ("clutch", "dead_man", "mark"):
+        button = getattr(options, name)
+        if button is not None and info.buttons is not None and button >= info.buttons:
+            raise DeviceError(
+                f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
+                f"has {info.buttons} buttons, numbered from 0"
+            )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSetup:
     """Scene, device, coupling, method and guard of a run, checked against each other.
@@ -429,56 +469,29 @@ class RunSetup:
         Raises:
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
-        method, period, substeps = (
-            options.rendering_method,
-            period_of(options.rate),
-            options.substeps,
-        )
+        method, period = options.rendering_method, period_of(options.rate)
+        substeps, ticks = options.substeps, options.scene_ticks
         is_real_clock = clock.name == RealClock.name
-        ticks = options.scene_ticks
         if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:
             ticks = scene_ticks_for(substeps * busy_step_time(scene, method, period), period)
-        scales, law_evaluations = (
-            options.workspace.scales,
-            1 if ticks else method.law_evaluations(substeps),
-        )
-        if options.mark is not None and not is_recorded:
-            raise RecordingError(
-                f"button {options.mark} is to mark moments of a recording, but nothing is recorded;"
-                " name a file to record to"
-            )
+        _refuse_buttons(options, info, is_recorded=is_recorded)
         refuse_simulated_time(info, clock)
-        timestep = max(ticks, 1) * period / substeps
+        evaluations = 1 if ticks else method.law_evaluations(substeps)
         if isinstance(coupling, Coupling):
             requested = coupling
         else:
-            requested = default_coupling(info, period, *scales, law_evaluations, method)
-            if ticks:
-                law = method.law_coupling(requested, period)
-                most = steady_stiffness(scene, info, ticks * period, *scales)
-                share = min(most / law.stiffness, 1.0)
-                most_turned = steady_rotational_stiffness(info, ticks * period, *scales)
-                turned = min(share * law.rotational_stiffness, most_turned)
-                law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)
-                requested = method.requested_coupling(law, timestep)
-            requested = replace(requested, **(coupling or {}))
-        law = method.law_coupling(requested, timestep)
-        limits = limits_for(info, options.limits)
+            usual = _usual_coupling(scene, info, options, ticks, evaluations)
+            requested = replace(usual, **(coupling or {}))
+        law = method.law_coupling(requested, max(ticks, 1) * period / substeps)
+        limits, scales = limits_for(info, options.limits), options.workspace.scales
         guard = guard_parameters_for(
             info,
             limits,
             period,
-            needed=required_axis_damping(info, law, period, *scales, law_evaluations, method),
+            needed=required_axis_damping(info, law, period, *scales, evaluations, method),
             scale=scales[0],
             controller=options.controller,
         )
-        for name in ("clutch", "dead_man", "mark"):
-            button = getattr(options, name)
-            if button is not None and info.buttons is not None and button >= info.buttons:
-                raise DeviceError(
-                    f"{name.replace('_', '-')} is button {button}, and the device '{info.name}' "
-                    f"has {info.buttons} buttons, numbered from 0"
-                )
         guard = replace(
             guard,
             clutch=button_mask(options.clutch, "clutch"),

@@ -29,12 +29,12 @@ from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.format import further_hands
+from hapticbridge.rehearsal import static_load
 from hapticbridge.rendering import (
     check_prepared,
     method_named,
     prepare,
     prepare_hands,
-    static_load,
     unguarded_parameters,
 )
 from hapticbridge.run_description import (

@@ -3,40 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from typing import Any
 
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import (
     JOINT,
     WELD_NAME,
     Scheme,
-    added_actuators,
     added_id,
-    coupling_ids,
-    handle_ids,
-    held_body,
 )
 from hapticbridge.kernel.law import GainRule, implicit_gains
-from hapticbridge.kernel.lossless import REACH, tree_of_tool
+from hapticbridge.kernel.lossless import REACH
 from hapticbridge.kernel.parameters import SLOW_SCHEMES, RunParameters, checked_substeps
-from hapticbridge.kernel.rigid_contact import finish_contacts
-from hapticbridge.kernel.state import BoundKernel, Place
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
 from hapticbridge.scene.checks import check_metered, refuse_overlap
 from hapticbridge.scene.contacts import warn_of_contacts
-from hapticbridge.scene.handle import PROBE, measured_weld
+from hapticbridge.scene.handle import measured_weld
 from hapticbridge.scene.scene import has_rigid_contact
 from hapticbridge.theory.bounds import (
     IMPLICIT_SHARE,
@@ -565,313 +555,6 @@ def unguarded_parameters(
         effective=effective,
         contact_stiffness=resolve_contact_stiffness(method, coupling, None),
     )
-
-
-AT_REST = 1e-6
-"""Largest acceleration in m/s² or rad/s² of a tool that rests without a hand. Rounding leaves less;
-a smaller value would start every scene by looking for a load of nothing."""
-
-SETTLING_STEPS = 3000
-"""Largest number of steps in which a tool settles on its coupling. A tool of 1 kg on 2400 N/m takes
-a tenth of it."""
-
-SETTLED = 1e-3
-"""Largest relative change of the coupling's wrench over the last steps of a tool that has
-settled; no unit."""
-
-LIGHT = 0.1
-"""Wrench in N and N m below which changes are measured against it. A tool that rests on a table
-has no load to compare with."""
-
-MAX_WORK, LEAST_STEPS = 6e5, 100
-"""Largest work of one rehearsal in degrees of freedom and constraint rows, summed over its steps,
-and the steps that it always takes. A unit costs 3 to 7 µs: a scene of 130 takes all steps, one of
-400 half of them. More would let heavy scenes start later; a limit in seconds would give another
-start on another machine, and the audit could not repeat it."""
-
-TRIAL_STEPS = 50
-"""Steps in which a load must prove better than none. A longer trial would judge the motion of a
-tool that hangs on its grip, not its start."""
-
-
-class Rehearsal:
-    """The start of a run on a copy of the scene's data, with the handle held still.
-
-    Contacts and limits are those of the run: rigid ones that are violated at the start hold the
-    tool, but do not push it out.
-
-    Args:
-        scene: The prepared scene, at its start; its model is set back at the end of ``steps``.
-        parameters: Parameters of the run.
-    """
-
-    def __init__(self, scene: Scene, parameters: RunParameters) -> None:
-        self.model, self.data = scene.model, mujoco.MjData(scene.model)
-        mujoco.mj_copyData(self.data, scene.model, scene.data)
-        self._parameters = replace(parameters, scheme=Scheme.IMPLICIT, substeps=1)
-        self._place, self._joint = Place(scene.hand), scene.joint
-        own = coupling_ids(self.model, scene.hand)
-        self._actuator, first = own[0], self.model.actuator_outadr[own[0]]
-        self._outputs = slice(first, first + len(own))
-        self._handle = handle_ids(self.model).get(scene.hand, -1)
-
-    def steps(self, handle: tuple[float, ...], count: int) -> Generator[NDArray[np.float64]]:
-        """Yields the coupling's wrench (6,) on the tool in each step, in the handle's axes.
-
-        It ends early if the scene diverges, or after ``MAX_WORK``.
-
-        Args:
-            handle: Pose of the handle.
-            count: Largest number of steps.
-        """
-        data, bias = self.data, self.model.actuator_biasprm[self._actuator].copy()
-        if self._joint < 0:
-            mocap = self.model.body_mocapid[self._handle]
-            data.mocap_pos[mocap], data.mocap_quat[mocap] = handle[:3], handle[3:]
-        else:
-            self.model.actuator_biasprm[self._actuator, 0] = -bias[1] * handle[0]
-        bound = BoundKernel(self.model, data, self._parameters, place=self._place)
-        record, step = bound.state[0], bound.step
-        finish, work = direct(finish_contacts, record), 0
-        try:
-            for done in range(count):
-                step(self.model, data)
-                finish(record)
-                work += self.model.nv + data.nefc
-                is_long = work > MAX_WORK and done >= LEAST_STEPS
-                if is_long or not np.isfinite(data.qvel).all():
-                    return
-                wrench, forces = np.zeros(6), data.actuator_force[self._outputs]
-                wrench[: len(forces)] = forces
-                yield wrench
-        finally:
-            bound.release()
-            self.model.actuator_biasprm[self._actuator] = bias
-
-
-def static_load(
-    scene: Scene, parameters: RunParameters, *, has_weight: bool = True
-) -> NDArray[np.float64]:
-    """Returns the wrench that holds the tool of a prepared scene at rest, (6,) in N and N m.
-
-    World frame, about the grip. The tool settles on the coupling with the handle at its grip; its
-    motion is stopped whenever its kinetic energy has passed a peak (dynamic relaxation with kinetic
-    damping). The scene itself is not changed. Zero if the tool rests without a hand, or does not
-    settle because the scene moves it.
-
-    Args:
-        scene: The prepared scene, at its start.
-        parameters: Parameters of the run.
-        has_weight: If false, gravity is left out.
-    """
-    with _gravity(scene.model, is_on=has_weight):
-        return _settled_load(scene, parameters)
-
-
-@contextmanager
-def _gravity(model: mujoco.MjModel, *, is_on: bool) -> Iterator[None]:
-    """Lets a model have its gravity, or none, for a while."""
-    gravity = model.opt.gravity.copy()
-    try:
-        model.opt.gravity *= is_on
-        yield
-    finally:
-        model.opt.gravity = gravity
-
-
-def _settled_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
-    rehearsal, grip = Rehearsal(scene, parameters), scene.grip_pose()
-    model, data = rehearsal.model, rehearsal.data
-    dofs = tree_of_tool(model, held_body(model, scene.grip)).dofs
-    momentum, last, load = np.zeros(model.nv), 0.0, np.zeros(6)
-    with closing(rehearsal.steps(grip, SETTLING_STEPS)) as steps:
-        for count, wrench in enumerate(steps):
-            velocity = np.where(dofs, data.qvel, 0.0)
-            if np.abs(velocity).max(initial=0.0) < AT_REST * model.opt.timestep:
-                return _turned(grip, wrench)
-            mujoco.mj_mulM(model, data, momentum, velocity)
-            kinetic = 0.5 * float(velocity @ momentum)
-            if kinetic < last:
-                data.qvel[dofs], kinetic = 0.0, 0.0
-            last = kinetic
-            if count % 100 == 99:
-                change, load = np.linalg.norm(wrench - load), wrench
-                if change <= SETTLED * max(float(np.linalg.norm(load)), LIGHT):
-                    return _turned(grip, wrench)
-    return np.zeros(6)
-
-
-def _turned(pose: tuple[float, ...], wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a wrench in the axes of a pose, in those of the world."""
-    result, orientation = np.zeros((2, 3)), np.array(pose[3:])
-    for half, part in zip(result, wrench.reshape(2, 3), strict=True):
-        mujoco.mju_rotVecQuat(half, part, orientation)
-    return result.ravel()
-
-
-def start_handle(
-    scene: Scene, parameters: RunParameters, load: NDArray[np.float64]
-) -> tuple[float, ...]:
-    """Returns the handle pose (7,) at which the coupling carries the tool from the start on.
-
-    The coupling carries a load as far as its force level goes. A tool that can move far while its
-    grip is held, such as a robot that falls beside its foot, needs another wrench at its start than
-    when it has come to rest. The handle then starts at the grip: of both poses the one is taken
-    from which the coupling's energy strays less at first.
-
-    Args:
-        scene: The prepared scene, at its start.
-        parameters: Parameters of the run.
-        load: Result of ``static_load``.
-    """
-    coupling, grip = parameters.coupling, scene.grip_pose()
-    levels = np.array([parameters.force_limit, parameters.torque_limit * parameters.scale])
-    sizes = np.linalg.norm(load.reshape(2, 3), axis=1) * parameters.force_scale
-    shares = np.minimum(levels / np.maximum(sizes, levels), 1.0)
-    carried = load * np.repeat(shares, 3)
-    poses = loaded_handle(grip, carried, coupling), grip
-    if poses[0] == grip:
-        return grip
-    stiffness = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
-    has_spring, strays = stiffness > 0.0, []
-    for pose in poses:
-        wrenches = np.array(list(Rehearsal(scene, parameters).steps(pose, TRIAL_STEPS)))
-        change = (wrenches - wrenches[:1]).reshape(-1, 6)[:, has_spring]
-        strayed = (change**2 / stiffness[has_spring]).sum(axis=1)
-        strays.append(float(strayed.max()) if len(wrenches) == TRIAL_STEPS else math.inf)
-    return poses[int(np.argmin(strays))]
-
-
-HOLDING_STEPS = 1000
-"""Steps in which a device must hold a tool with a still hand. A longer trial would also find tools
-that tip over slowly, and delay every start."""
-
-
-def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool = True) -> float:
-    """Returns the largest force in N with which a still handle holds the tool at first.
-
-    The coupling is not limited, and the tool moves freely on it. The scene is not changed.
-
-    Args:
-        scene: The prepared scene, at its start.
-        parameters: Parameters of the run; a handle with absolute poses is taken at the grip.
-        has_weight: If false, gravity is left out.
-    """
-    handle = parameters.handle_origin
-    if handle == IDENTITY_POSE or not has_weight:
-        handle = scene.grip_pose()
-    with _gravity(scene.model, is_on=has_weight):
-        steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
-        return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
-
-
-TIPPED = 0.1
-"""Distance in m by which the grip of a tool that topples is moved, that of a hand that lets it go.
-Farther away a tool pulls more, and one that a device can hold longer would be carried."""
-
-SLOWEST_TOPPLING = 1.0
-"""Rate in 1/s from which a tool topples. A hand leads a slower one, such as a pole of 15 m."""
-
-LEAST_LEVER = 1e-3
-"""Way of the grip over the way of the joints in a mode, in m, below which the mode leaves the grip
-where it is, and the hand cannot feel it."""
-
-RESTING = 1.0
-"""Acceleration in m/s² of a grip, a tenth of gravity's, below which a tool without hand stands."""
-
-
-def toppling_force(scene: Scene, parameters: RunParameters) -> float:
-    """Returns the force in N with which a still hand holds a tool that has toppled in it.
-
-    A tool stands without a hand if no contact or other constraint holds it and its grip hardly
-    accelerates. It topples if the stiffness of its tree, of gravity, springs and servos but without
-    the coupling,
-
-        K_t = −∂Q/∂q,    K_t φ = λ M φ,    rate = √−λ
-
-    has a rate above ``SLOWEST_TOPPLING``; Q are the generalised forces, M the inertia matrix. The
-    handle then holds the grip at ``TIPPED`` along the fastest mode φ. Zero if it does not topple,
-    or the mode does not move the grip, or a joint is held.
-
-    Args:
-        scene: The prepared scene, at its start; it is not changed.
-        parameters: Parameters of the run.
-    """
-    if scene.joint >= 0:
-        return 0.0
-    rehearsal, site = Rehearsal(scene, parameters), scene.model.site(scene.grip).id
-    model, data = rehearsal.model, rehearsal.data
-    dofs = np.flatnonzero(tree_of_tool(model, int(model.site_bodyid[site])).dofs)
-    jacobian, mass = np.zeros((3, model.nv)), np.zeros((model.nv, model.nv))
-    mujoco.mj_jacSite(model, data, jacobian, None, site)
-    is_held = np.any(data.qfrc_constraint[dofs])
-    if is_held or np.linalg.norm(jacobian[:, dofs] @ data.qacc[dofs]) > RESTING:
-        return 0.0
-    mujoco.mj_fullM(model, data, mass)
-    root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(dofs, dofs)]))
-    stiffness = root @ _stiffness_without_hand(model, data, dofs) @ root.T
-    squares, modes = np.linalg.eigh(0.5 * (stiffness + stiffness.T))
-    mode = np.zeros(model.nv)
-    mode[dofs] = root.T @ modes[:, 0]
-    way = float(np.linalg.norm(jacobian @ mode))
-    if squares[0] > -(SLOWEST_TOPPLING**2) or way < LEAST_LEVER * float(np.linalg.norm(mode)):
-        return 0.0
-    mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
-    mujoco.mj_kinematics(model, data)
-    orientation = np.zeros(4)
-    mujoco.mju_mat2Quat(orientation, data.site_xmat[site])
-    handle = (*data.site_xpos[site].tolist(), *orientation.tolist())
-    wrenches = np.array(list(rehearsal.steps(handle, HOLDING_STEPS)))
-    return float(np.linalg.norm(wrenches.reshape(-1, 6)[:, :3].mean(axis=0)))  # it swings
-
-
-def _stiffness_without_hand(
-    model: mujoco.MjModel, data: mujoco.MjData, dofs: NDArray[np.intp]
-) -> NDArray[np.float64]:
-    """Returns −∂Q/∂q of some degrees of freedom at rest, without the coupling."""
-    start, own, columns = data.qpos.copy(), list(added_actuators(model)), []
-    bias = model.actuator_biasprm[own].copy()
-    model.actuator_biasprm[own] = 0.0
-    try:
-        for unit in np.eye(model.nv)[dofs]:
-            forces = []
-            for size in (-PROBE, PROBE):
-                data.qpos[:] = start
-                mujoco.mj_integratePos(model, data.qpos, unit, size)
-                for stage in (mujoco.mj_fwdKinematics, mujoco.mj_transmission):
-                    stage(model, data)
-                mujoco.mj_fwdVelocity(model, data)
-                mujoco.mj_fwdActuation(model, data)
-                forces.append((data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator)[dofs])
-            columns.append((forces[0] - forces[1]) / (2.0 * PROBE))
-    finally:
-        model.actuator_biasprm[own] = bias
-        data.qpos[:] = start
-    return np.array(columns).T
-
-
-def loaded_handle(
-    grip: tuple[float, ...], load: NDArray[np.float64], coupling: Coupling
-) -> tuple[float, ...]:
-    """Returns the handle pose (7,) at which the coupling carries a load on a tool at rest.
-
-        h = x + f/K,    R_h = exp(τ/K_r) R_x
-
-    ``grip`` is the tool's pose (7,), ``load`` the wrench (6,) in N and N m.
-    """
-    position = np.array(grip[:3]) + load[:3] / coupling.stiffness
-    orientation, turn = np.array(grip[3:]), np.zeros(4)
-    angle = float(np.linalg.norm(load[3:]))
-    if angle > 0.0 and coupling.rotational_stiffness > 0.0:
-        twist = min(angle / coupling.rotational_stiffness, MAX_START_TWIST)
-        mujoco.mju_axisAngle2Quat(turn, load[3:] / angle, twist)
-        mujoco.mju_mulQuat(orientation, turn, np.array(grip[3:]))
-    return (*position.tolist(), *orientation.tolist())
-
-
-MAX_START_TWIST = 1.0
-"""Largest angle in rad by which the handle is turned at the start to carry the tool's weight. A
-heavier tool sags; beyond a right angle the spring would lose its grip."""
 
 
 def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Method) -> None:

@@ -41,7 +41,7 @@ from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.recording.seal import Signer
-from hapticbridge.rendering import start_handle
+from hapticbridge.rehearsal import start_handle
 from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, processor, versions
 
 SCENE = f"{SOURCE_PREFIX}peg_in_hole.xml"

@@ -24,6 +24,7 @@ ORDER = (
         "certificate",
         "identify",
         "realtime",
+        "rehearsal",
         "run_description",
         "slow_scene",
         "theory_plots",

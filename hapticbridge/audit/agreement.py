@@ -25,7 +25,7 @@ from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, gua
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import start_handle, static_load
+from hapticbridge.rehearsal import start_handle, static_load
 from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, start_state
 from hapticbridge.scene import Scene
 

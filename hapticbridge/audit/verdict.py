@@ -259,35 +259,18 @@ def verdict_on(
     outcome = ReplayOutcome("")
     try:
         hands = [AuditedHand(each, AuditedRun.of(each)) for each in recordings]
-        run = hands[0].run
         of_hands = [_device_facts(hand.run, hand.recording) for hand in hands]
         for hand, own in zip(hands, of_hands, strict=True):
             own["coupling_sentences"] += hand.run.events.changes_of_coupling(hand.run.method)
         facts |= _joined(of_hands, recordings)
-        facts["duration"] = recording.count * run.parameters.period
-        facts["unchecked"] = _unchecked(run)
+        facts["duration"] = recording.count * hands[0].run.parameters.period
+        facts["unchecked"] = _unchecked(hands[0].run)
         fault = file_fault(recording) or _hands_fault(hands)
         if fault is None:
+            energies = [PassivityTally(is_watched=own["certified"] is not True) for own in of_hands]
             with comparison(hands, is_trusted=in_process) as replayed:
-                faults = [structure_fault(h.recording.blocks(), h.run.events) for h in hands]
-                fault = next(filter(None, faults), None)
-                if fault is None:
-                    energies = [
-                        PassivityTally(is_watched=own["certified"] is not True) for own in of_hands
-                    ]
-                    timings = [TimingTally(hand.run.parameters) for hand in hands]
-                    fault, facts["duration"] = _check_records(hands, energies, timings)
-                    facts["energies"] = _energies_of_hands(energies)
-                    facts["max_net_energy"] = max(each.max_net_energy for each in energies)
-                    for hand, own, timing in zip(hands, of_hands, timings, strict=True):
-                        own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
-                        fault = fault or first_contradiction(
-                            chain(
-                                metadata_statements(hand.recording, hand.run),
-                                event_statements(hand.recording, timing),
-                            )
-                        )
-                    facts |= _joined(of_hands, recordings)
+                fault = _fault_in_ticks(hands, energies, of_hands, facts)
+                facts |= _joined(of_hands, recordings)
                 if fault is None:
                     outcome = replayed()
                     facts["resimulation"] = outcome.agreement
@@ -302,13 +285,7 @@ def verdict_on(
     if fault is None:
         if not outcome.has_run:
             facts["unchecked"] = facts["unchecked"] or _UNCHECKED_WITHOUT_REPLAY
-        kept = facts.get("timekeeping")
-        doubt = "" if kept is None else kept.fault
-        if facts["certified"] is False and not (kept and kept.refutation):
-            doubt = "the device has less damping than the coupling needs"
-        pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
-        end = unusual_end(recording.events)
-        notes = (found["reason"], doubt, pushed, end, facts["unchecked"])
+        notes = (found["reason"], *_notes(facts, recording.events))
         found["reason"] = "; ".join(note for note in notes if note)
     return AuditReport(**facts, **found)
 
@@ -396,6 +373,44 @@ def _gap(signature: SignatureCheck, outcome: ReplayOutcome) -> str:
     if not outcome.has_run:
         return "; ".join([*reasons, f"the run was {outcome.agreement}; in its records alone"])
     return f"{reasons[0]}; apart from that" if reasons else ""
+
+
+def _fault_in_ticks(
+    hands: Sequence[AuditedHand],
+    energies: Sequence[PassivityTally],
+    of_hands: Sequence[dict[str, Any]],
+    facts: dict[str, Any],
+) -> Fault | None:
+    """Computes all ticks a second time, and compares what the file states with them.
+
+    ``energies`` collect each hand's balance; what is found joins the facts of each hand, and those
+    of the run. Returns the first fault.
+    """
+    faults = [structure_fault(hand.recording.blocks(), hand.run.events) for hand in hands]
+    fault = next(filter(None, faults), None)
+    if fault is not None:
+        return fault
+    timings = [TimingTally(hand.run.parameters) for hand in hands]
+    fault, facts["duration"] = _check_records(hands, energies, timings)
+    facts["energies"] = _energies_of_hands(energies)
+    facts["max_net_energy"] = max(each.max_net_energy for each in energies)
+    for hand, own, timing in zip(hands, of_hands, timings, strict=True):
+        own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
+        stated = metadata_statements(hand.recording, hand.run)
+        fault = fault or first_contradiction(
+            chain(stated, event_statements(hand.recording, timing))
+        )
+    return fault
+
+
+def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
+    kept = facts.get("timekeeping")
+    doubt = "" if kept is None else kept.fault
+    if facts["certified"] is False and not (kept and kept.refutation):
+        doubt = "the device has less damping than the coupling needs"
+    pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
+    return doubt, pushed, unusual_end(events), facts["unchecked"]
 
 
 def _check_records(

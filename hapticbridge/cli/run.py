@@ -48,7 +48,8 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.recording.seal import Signer
-from hapticbridge.rendering import RunCoupling, default_method, static_load
+from hapticbridge.rehearsal import static_load
+from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import (
     Scene,
     SceneSource,
