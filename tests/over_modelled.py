@@ -13,7 +13,7 @@ from hapticbridge.scene import SceneSource, read_scene
 
 GRID = 9
 TRIANGLES = 12 * GRID**2
-"""Of each mesh: 972."""
+"""Triangles of each mesh: 972."""
 
 VISUALS = 40
 ITERATIONS = 100

@@ -1,4 +1,4 @@
-"""Whoever speaks to the page's socket by hand: what a browser would send, and what none would."""
+"""Client of the page's socket: sends what a browser would, and what none would."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from websockets.typing import Subprotocol
 from hapticbridge.view.window import Address
 
 PATIENCE = 60.0
-"""In s, for a page to tell what it holds."""
+"""Time in s for a page to tell what it holds."""
 
 
 class Hand:

@@ -198,4 +198,4 @@ PUSHED = """<mujoco model="push">
 
 
 Made = Callable[[Callable[[Path], Path]], tuple[Recording, AuditReport]]
-"""What the fixture ``made`` gives: it makes a golden recording once, and judges it."""
+"""Type of the fixture ``made``: it makes a golden recording once, and judges it."""

@@ -48,7 +48,7 @@ FAST_SCENES = {
     "open_wrench": ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     "planar_peg": ((0.0, 0.0, -0.045), (1.0, 0.0, 0.0)),
 }
-"""Where a fast hand shakes a scene, in m, and along which direction."""
+"""Place in m at which a fast hand shakes a scene, and the direction."""
 
 VERY_FIRM = Hand(
     mass=0.4, stiffness=3000.0, damping=40.0, rotational_stiffness=5.0, rotational_damping=0.05

@@ -78,7 +78,7 @@ def test_the_report_does_not_depend_on_the_blocks(
 def test_a_device_that_answers_late_is_judged_alike_where_blocks_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a late device is given depends on motion that stands in the next block."""
+    """The energy given to a late device depends on motion that stands in the next block."""
     path, scene = tmp_path / "late.mcap", load_scene("virtual_wall")
     late = device_for(scene, "simulated:damping=0.5")
     assert isinstance(late, SimulatedDevice)

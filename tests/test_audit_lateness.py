@@ -23,7 +23,7 @@ RETREAT = """t,x,y,z,qw,qx,qy,qz
 1.8,0,0,0,1,0,0,0
 2.5,0,0,0,1,0,0,0
 """
-"""In, slowly, while the force is full; out in a tenth of a second."""
+"""Path: in slowly, while the force is full, and out in a tenth of a second."""
 
 LOOSE = Hand(mass=0.01, damping=0.0, stiffness=60.0)
 """A hand that burns nothing: what the coupling creates stays and grows."""

@@ -89,7 +89,7 @@ T = 1e-3
 B = 2.0
 """Damping of ``ScriptedDevice`` in N s/m."""
 STEPS, STEP = 60, 2e-5
-"""How often it steps into the spring, and again out of it, and how far in m."""
+"""Number of steps into the spring and out of it, and their size in m."""
 
 TOUCHING = WALL.replace('pos="0.07 0 0"', 'pos="0.02 0 0"')
 

@@ -1,4 +1,4 @@
-"""What stops or delays a run: zero force comes first, and the recording is whole."""
+"""Stops and delays of a run: zero force comes first, and the recording is whole."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import read_scene, scene_names, scene_path
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
-"""What a planted fault may lead to in the motion."""
+"""Faults in the motion to which a planted one may lead."""
 
 CURED = {
     *("solver iterations", "pyramidal cone", "default contact", "not passive"),

@@ -348,7 +348,7 @@ KEPT = {
     "pliers": {"no friction": "the jaws touch the wire only where a grip axis closes them"},
     "screwdriver": {"no friction": "how much there is can be set in this scene"},
 }
-"""What may go by the planted price, and why it stays in a shipped scene."""
+"""Parts that may go by the planted price, and the reason why they stay in a shipped scene."""
 
 
 @pytest.mark.parametrize("name", model_runs.LOOP_SCENES)

@@ -207,7 +207,7 @@ SIGNALS = pytest.mark.parametrize("name", STOPS)
 
 @pytest.fixture
 def unheeded() -> Iterator[list[int]]:
-    """What Python's own handler would have got; that would end the tests with this one."""
+    """Signals that Python's own handler would have got; that would end the tests with this one."""
     got: list[int] = []
     numbers = [signal.Signals[name] for name in STOPS]
     before = {each: signal.signal(each, lambda number, _: got.append(number)) for each in numbers}

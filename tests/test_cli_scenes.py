@@ -17,7 +17,7 @@ def test_the_next_command_of_a_scene_runs(call: Called) -> None:
 def test_a_scene_of_one_s_own_is_shown_whatever_its_grip_is_called(
     call: Called, tmp_path: Path
 ) -> None:
-    """Nobody holds it here, so no grip is needed; what cannot be compiled is refused as ever."""
+    """Without a hand no grip is needed; a scene that does not compile is refused as ever."""
     path = tmp_path / "chisel.xml"
     text = "<mujoco><worldbody><body><freejoint/><geom size='.01'{}/>{}</body></worldbody></mujoco>"
     for site in ("<site name='hand'/>", ""):

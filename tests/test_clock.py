@@ -80,7 +80,7 @@ def test_missed_deadlines_are_skipped_and_counted_not_caught_up(wall: Wall, miss
 
 
 def test_time_begins_with_the_first_start(wall: Wall) -> None:
-    """What happens before is at 0, not at the hours that the machine has run."""
+    """Events before the start are at 0, not at the hours that the machine has run."""
     clock = RealClock()
     wall.ns += 10_000_000_000
     assert clock.now() == 0

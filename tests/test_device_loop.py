@@ -144,7 +144,7 @@ RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
     "stick": (stick, "without delay, which is unknown"),
     "odd stick": (lambda: stick("odd"), "without delay, which is unknown"),
 }
-"""How each is made, and why no bound holds for it: a force that acts late is bounded at walls."""
+"""Makers of devices, and why no bound holds for each: a late force is bounded at walls."""
 
 
 def rows(recording: Path) -> NDArray[np.void]:

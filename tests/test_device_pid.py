@@ -35,7 +35,7 @@ def started(model: PidStick, **options: object) -> tuple[PidDevice, PidStick, Hi
 
 @pytest.fixture(autouse=True)
 def _no_profiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever runs the tests may have profiles of their own."""
+    """The user may have profiles of their own."""
     monkeypatch.setattr(sheet, "profile_of", lambda device, serial, model: None)
 
 

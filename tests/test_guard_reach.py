@@ -24,7 +24,7 @@ from hapticbridge.recording import read_recording
 
 REACH = 0.02
 HOME = 0.01
-"""Where along x the device is at the start: its frame's origin is not the scene's."""
+"""Position of the device along x at the start: its frame's origin is not the scene's."""
 
 
 def there_and_back(tick: int) -> tuple[float, ...]:

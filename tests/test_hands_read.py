@@ -1,4 +1,4 @@
-"""What reads a recording of several hands: plots, pages, films, tables, repair, comparisons."""
+"""Readers of a recording of several hands: plots, pages, films, tables, repair, comparisons."""
 
 from __future__ import annotations
 

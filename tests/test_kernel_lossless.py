@@ -500,7 +500,7 @@ def test_unequal_damping_makes_a_limit_cycle_that_equal_damping_does_not() -> No
 
 
 OUT_AND_BACK: Array = np.concatenate([np.linspace(0, 0.02, 300), np.linspace(0.02, 0, 300)])
-"""In m along x, a tick each: at ``STOP`` after 150 ticks, and until 450."""
+"""Path along x in m, a tick each: at ``STOP`` after 150 ticks, and until 450."""
 STOP = 0.01
 
 SLIDER = """

@@ -55,7 +55,7 @@ FIRST = {"round_peg": -0.045, "screwdriver": -1e-3, "hex_key": -1e-3}
 """By how much a hand goes up in m before it is random, in scenes that a strong hand shakes."""
 
 TOWARDS = {"bench_pliers": [0.0, -0.02, 0.0], "lock": [-0.02, 0.0, 0.0]}
-"""Where the hand goes while it is random, in m: onto the wire, into the keyway."""
+"""Goal of a random hand in m: onto the wire, into the keyway."""
 
 SEED = {"drawer": 8}
 """First of the four random hands; most hands are too weak for the drawer's friction."""
@@ -156,7 +156,7 @@ def test_both_ends_of_a_parameter_are_strict_in_any_hand(
 
 @dataclass(frozen=True)
 class Done:
-    """What a scene did on its own path: joints and deepest contact by ticks, and how it ended."""
+    """Run of a scene on its own path: joints and deepest contact by ticks, and its end."""
 
     joints: Array
     deepest: Array

@@ -50,7 +50,7 @@ MOVES = {
     "drawer": (0.05, 0.0, 0.0),
     "hammer": (0.0, 0.0, 0.03),
 }
-"""Where the hand goes in m, away from everything, in half a second."""
+"""Goal of the hand in m, away from everything, in half a second."""
 
 
 @pytest.mark.parametrize("name", MOVES)

@@ -1,4 +1,4 @@
-"""What runs ahead of the sample changes no bit: the pipelined tick against the plain one."""
+"""Work done ahead of the sample changes no bit: the pipelined tick against the plain one."""
 
 from __future__ import annotations
 

@@ -13,6 +13,8 @@ ROOT = Path(__file__).parents[1]
 
 SOURCES = sorted((ROOT / "hapticbridge").rglob("*.py"))
 
+HELPERS = sorted([*(ROOT / "tests").rglob("*.py"), *(ROOT / "scripts").rglob("*.py")])
+
 OPENERS = re.compile(r"(What|How|Where|Whether|Which|Who|Whoever|Of|In)\b")
 """First words of a summary that does not name its subject."""
 
@@ -34,7 +36,7 @@ def docstrings(tree: ast.Module) -> list[tuple[int, str]]:
 def test_no_docstring_opens_with_a_relative_clause() -> None:
     offences = [
         f"{path.relative_to(ROOT)}:{line}: {text.splitlines()[0]}"
-        for path in SOURCES
+        for path in [*SOURCES, *HELPERS]
         for line, text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
         if OPENERS.match(text)
     ]

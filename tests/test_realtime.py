@@ -270,7 +270,7 @@ def test_a_run_without_permission_says_so_and_records_it(refusing: Library, tmp_
 
 
 class Heap(ctypes.Structure):
-    """What ``mallinfo2`` of the C library tells, in bytes where it is not a count."""
+    """Answer of ``mallinfo2`` of the C library, in bytes where it is not a count."""
 
     _fields_ = (
         *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd")),

@@ -483,7 +483,7 @@ def test_a_childs_folder_is_its_users_alone_under_any_umask(umask: int) -> None:
 
 
 def test_a_child_reads_only_what_it_is_given_and_has_no_network(tmp_path: Path) -> None:
-    """What the kernel lacks is not asserted; the audit says nothing different then."""
+    """Limits that the kernel lacks are not asserted; the audit says nothing different then."""
     secret, given = tmp_path / "secret", tmp_path / "given"
     secret.write_text("x")
     given.write_text("y")

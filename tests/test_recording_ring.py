@@ -215,7 +215,7 @@ FORMS: dict[str, Callable[[Path, Path], object]] = {
     "folder": lambda path, _: path.mkdir(),
     "file": lambda path, other: path.write_bytes(other.read_bytes()),
 }
-"""What may stand where a ring is looked for, beside a ring that nothing is wrong with."""
+"""Files in the place of a ring, beside a ring that is whole."""
 
 
 @pytest.fixture

@@ -664,7 +664,7 @@ ANGLES = np.geomspace(3e-3, np.pi, 800)
 
 
 def response(angle: float, laws: int, mass: float) -> complex:
-    """What a device feels per displacement, from the n steps of a tick written as one matrix."""
+    """Force on a device per displacement, from the n steps of a tick written as one matrix."""
     z = np.exp(1j * angle)
     handle = 1 - np.arange(laws - 1, -1, -1) / laws * (1 - 1 / z)
     difference = np.eye(laws) - np.eye(laws, k=-1) + 0j

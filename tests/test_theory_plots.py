@@ -1,4 +1,4 @@
-"""What the pictures of the theory show, and the table of alternatives."""
+"""Pictures of the theory, and the table of alternatives."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def test_snapshot_holds_what_is_ours(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)
 def test_in_virtual_time_a_program_that_reads_the_clock_oftener_is_later(tmp_path: Path) -> None:
-    """Why runs that are to be the same must find the same compiled code."""
+    """Reason why runs that are to be equal must find the same compiled code."""
     told = []
     for number, readings in enumerate((0, 0, 1000)):
         reads = f"import time; [time.monotonic() for _ in range({readings})]"

@@ -44,7 +44,7 @@ K, B = "stiffness K (N/m)", "requested damping B (N s/m)"
 KR, BR = "turning stiffness K_r (N m/rad)", "requested turning damping B_r (N m s/rad)"
 
 PATIENCE = 60.0
-"""In s, for anything to happen in a run; it ends by itself after twice as long."""
+"""Time limit in s for anything to happen in a run, which ends after twice as long."""
 
 
 def until(condition: Callable[[], Any]) -> None:

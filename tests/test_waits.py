@@ -91,7 +91,7 @@ REASONS = {
     ),
     "compare.py: for line in stream": "no wait: records of a file",
 }
-"""What ends a wait that has no time limit of its own. A new wait gets a limit, or a line here."""
+"""Ends of the waits without a time limit of their own. A new wait gets a limit, or a line here."""
 
 
 def dotted(node: ast.expr) -> str:

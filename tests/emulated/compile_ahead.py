@@ -23,7 +23,7 @@ from hapticbridge.jit import cache_folder
 from hapticbridge.scene import own_grips, read_scene
 
 _LONG_ENOUGH = 0.01
-"""In s of simulated time: ten ticks call everything that there is to compile."""
+"""Simulated time in s: ten ticks call everything that there is to compile."""
 
 
 @cache

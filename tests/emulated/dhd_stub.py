@@ -12,7 +12,7 @@ from hapticbridge.device.force_dimension.dhd import Dhd
 
 OMEGA3, OMEGA6, OMEGA7, SIGMA7 = 33, 34, 35, 104
 CALL = 100e-6
-"""In s: what each call of the library takes."""
+"""Duration in s of each call of the library."""
 
 
 class Stub(LibraryStub):

@@ -21,8 +21,8 @@ from emulated.usb_device import UsbDevice
 _PR_SET_TIMERSLACK = 29
 
 _SHORTEST = 5e-6
-"""In s. A model that wants to be asked again at once, over and over, would hold virtual time still,
-and the host that it waits for too."""
+"""Shortest time in s. A model that wants to be asked again at once, over and over, would hold
+virtual time still, and the host that it waits for too."""
 
 
 class FrontEnd(abc.ABC):

@@ -49,7 +49,7 @@ def maker_frame(p: NDArray[np.float64]) -> tuple[float, float, float]:
 
 @dataclass
 class Faults:
-    """What goes wrong, for tests."""
+    """Faults of the emulated device, for tests."""
 
     is_mute: bool = False  # takes packets, answers none
     is_deaf: bool = False  # the loader hears nothing

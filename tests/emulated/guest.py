@@ -25,16 +25,16 @@ _MEMORY_MIB = 2048
 compiler beside it, where the host has not compiled ahead."""
 
 PATIENCE = 150.0
-"""In s of this machine's time: a guest that prints nothing for so long is stopped, where it is to
+"""Time in s of this machine: a guest that prints nothing for so long is stopped, where it is to
 print something. The longest check takes a tenth of it on a machine that does nothing else."""
 
 _LOOK = 0.2
-"""In s: how often it is looked whether the guest prints."""
+"""Time in s between two looks at what the guest prints."""
 
 _KILLED = 128 + 9  # exit status of a command that the kernel killed, as a shell tells it
 
 _PIDFF = b"Force feedback for USB HID PID devices"
-"""What hid-pidff prints, so what a kernel's file holds that was built with it."""
+"""Words of hid-pidff, which the file of a kernel with it holds."""
 
 NO_PIDFF = "this kernel has no hid-pidff (CONFIG_HID_PID)"
 
@@ -62,7 +62,7 @@ def has_pidff() -> bool:
 
 @dataclass(frozen=True)
 class GuestRun:
-    """How a command in the guest ended.
+    """End of a command in the guest.
 
     Attributes:
         status: Its exit status; None where the guest ended before it, or took too long.

@@ -11,12 +11,12 @@ from hapticbridge.device import Motion, SimulatedDevice, read_motion
 from hapticbridge.scene import scene_path
 
 STEP = 125e-6
-"""In s: the force is held over each step, which is then exact. An eighth of a loop's period, a
+"""Step in s: the force is held over each one, which is then exact. An eighth of a loop's period, a
 high-speed USB microframe: a force that arrives between two ticks acts at most this much late."""
 
 _ROUNDING = 1e-6
-"""In steps: a time that is this little short of a step's end has reached it. Times are sums of
-periods in binary fractions and miss whole steps by rounding, which must not cost a step."""
+"""Tolerance in steps: a time that is this little short of a step's end has reached it. Times are
+sums of periods in binary fractions and miss whole steps by rounding, which must not cost a step."""
 
 
 class Handle:

@@ -21,10 +21,10 @@ from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import DeviceLost
 
 LAPSE = 0.1
-"""In s. "If you stop sending them, the device returns to idle"; the time is not documented."""
+"""Time in s. "If you stop sending them, the device returns to idle"; the time is not documented."""
 
 CENTRE = np.array([0.0, -0.12, 0.15])
-"""Where the cursor is at first, in m, as in the documentation's example."""
+"""First position of the cursor in m, as in the documentation's example."""
 
 
 class Inverse:

@@ -1,4 +1,4 @@
-"""What every emulated HID device has: a report descriptor, reports in and out, feature reports."""
+"""Emulated HID devices: a report descriptor, reports in and out, feature reports."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class HidDevice(UsbDevice):
 
     @property
     def has_numbered_reports(self) -> bool:
-        """Whether the descriptor numbers the reports (item 0x85, report id)."""
+        """True if the descriptor numbers the reports (item 0x85, report id)."""
         descriptor, place = self.report_descriptor, 0
         while place < len(descriptor):
             if descriptor[place] & 0xFC == 0x84:

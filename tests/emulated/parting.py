@@ -1,4 +1,4 @@
-"""Where two runs that should be one to the bit are not: so that a failure explains itself."""
+"""Differences between runs that should be equal to the bit, so that a failure explains itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emulated.guest import GuestRun
 from hapticbridge.record import COLUMNS, Column
 
 MAX_NAMED = 8
-"""How many columns are named: those in the first record that differs, before the rest is counted.
+"""Number of columns named, of the first record that differs; the rest is counted.
 More than a few differ in each record after it."""
 
 

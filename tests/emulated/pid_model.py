@@ -27,7 +27,7 @@ _CONSTANT, _LOADED, _FULL, _ERROR = 0x26, 0x8C, 0x8D, 0x8E
 
 @dataclass
 class Effect:
-    """What the device keeps of an effect; times in s, ``ends`` None while it does not play."""
+    """An effect as the device keeps it; times in s, ``ends`` None while it does not play."""
 
     kind: int
     magnitude: float = 0.0

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from emulated.hid_device import HidDevice
 
 REPORT_PERIOD = 0.008
-"""In s, while the puck is deflected: 125 Hz."""
+"""Period in s while the puck is deflected: 125 Hz."""
 
 Push = Callable[[float], tuple[float, ...]]
 """Deflection of the six axes at a time in s, -1 to 1 each."""

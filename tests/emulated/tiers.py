@@ -1,4 +1,4 @@
-"""What is run where: the jobs of tiers B and C, what each needs, and what it found.
+"""Jobs of tiers B and C: the commands, the needs and the findings of each.
 
 Tier A, in process, is the project's ordinary tests. Tier B is real hidapi and libusb under
 umockdev's preload library. Tier C is a User-Mode Linux: real libraries on a real kernel. Run as a
@@ -34,16 +34,16 @@ NO_UMOCKDEV = "no umockdev; 'apt-get install umockdev libusb-1.0-0' brings it"
 
 CHECKS = CHECKOUT / "tests/usb_tiers"
 LIMIT = 600.0
-"""In s of this machine's time per job: far beyond what the longest takes."""
+"""Time limit in s per job, far beyond the longest."""
 
 LOOP = 5.0
-"""In s of virtual time: how long the closed loops run; the peg has touched the hole by 4 s."""
+"""Virtual time in s of the closed loops; the peg has touched the hole by 4 s."""
 
 STICK_LOOP = 4.0
 """Likewise, for a stick: until its peg has touched the hole."""
 
 REPEATS, REPEATED_LOOP = 3, 1.0
-"""How many runs must be the same to the bit, and how long each is, in s of virtual time."""
+"""Number of runs that must be equal to the bit, and the length of each in s of virtual time."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _IOCTL, _READ, _WRITE = 1, 7, 8
 _DONE, _READ_MEMORY, _WRITE_MEMORY = 3, 5, 6
 
 GONE = -errno.ENODEV
-"""What a program is told of a device that was pulled out."""
+"""Error that a program gets from a device that was pulled out."""
 
 
 class Client(abc.ABC):

@@ -19,7 +19,7 @@ _LISTS = ("sys/bus/usb/devices", "sys/bus/hid/devices", "sys/class/hidraw", "sys
 
 @dataclass(frozen=True)
 class Nodes:
-    """What stands for a plugged-in device under the test bed's root.
+    """Files of a plugged-in device under the test bed's root.
 
     Attributes:
         folder: Its folder in sysfs.

@@ -1,4 +1,4 @@
-"""What every emulated USB device has: descriptors, a control pipe and endpoints.
+"""Emulated USB devices: descriptors, a control pipe and endpoints.
 
 A model never looks at a clock: whoever calls it (a front end) says what time it is, in seconds of
 any clock that only grows. The same model then stands behind a library call in this process, a fake

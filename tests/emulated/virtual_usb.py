@@ -48,7 +48,7 @@ class VirtualTime:
 
 
 class VirtualLink:
-    """What a driver sees of it: the methods of ``UsbLink``.
+    """Methods of ``UsbLink``, which a driver calls.
 
     Args:
         time: The device and its time.

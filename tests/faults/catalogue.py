@@ -342,7 +342,7 @@ def _stalled_disk(rig: Rig) -> None:
 
 
 def _wall_clock(rig: Rig) -> None:
-    """Somebody sets the time of day; the loop must not look at it."""
+    """The time of day is set; the loop must not look at it."""
 
     def around(stack: ExitStack) -> None:
         real = time.time
@@ -455,7 +455,7 @@ while True:
 
 
 def _watched(how: int) -> Callable[[Rig], None]:
-    """Somebody looks on, and their process gets a signal: killed, or stopped without an end."""
+    """The view is open, and its process gets a signal: killed, or stopped without an end."""
 
     def do(rig: Rig) -> None:
         def around(stack: ExitStack) -> None:
@@ -487,7 +487,7 @@ FINGERS = Hand(mass=0.06, damping=3.5, stiffness=39.0)
 """Two fingers: they take up more energy from a swing than an arm, and move faster."""
 
 PRESSES = {DEFAULT_HAND: 0.0804, FINGERS: 0.181}
-"""Where a hand wants to be in m: it presses on the wall with 9.5 N, fingers with 6.7 N."""
+"""Goal of a hand in m: it presses on the wall with 9.5 N, fingers with 6.7 N."""
 
 TWO_FINGERS_TURN = Hand(
     mass=0.05,
@@ -709,4 +709,4 @@ FAULTS = (
     Fault("Ctrl-Z", acting(_signal(signal.SIGTSTP)), "stops", "SIGTSTP"),
     Fault("time of day set back", _wall_clock, "goes on"),
 )
-"""In the order of the table."""
+"""Faults in the order of the table."""

@@ -89,7 +89,7 @@ HANGS = (
 
 @dataclass(frozen=True)
 class HangOutcome:
-    """What came of a hang.
+    """Outcome of a hang.
 
     Attributes:
         zero_after: Time in s from the last frame with force to the guardian's first without.
@@ -165,7 +165,7 @@ STOPS = {
 
 @dataclass(frozen=True)
 class StopOutcome:
-    """What came of a signal during start-up.
+    """Outcome of a signal during start-up.
 
     Attributes:
         status: Exit status.

@@ -146,7 +146,7 @@ class FaultyDevice:
 
 @dataclass
 class Rig:
-    """What a fault is done to, before it runs.
+    """Bridge and device to which a fault is done, before they run.
 
     Attributes:
         folder: Where the recording goes.
@@ -221,7 +221,7 @@ class Rig:
 
 @dataclass
 class Outcome:
-    """What came of a fault.
+    """Outcome of a fault.
 
     Attributes:
         largest_force: Of all that was written, in N.

@@ -28,7 +28,7 @@ from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 
 LIMIT, MAX_ENERGY = 10.0, 0.05
-"""In N, of the rig, and in J, beyond what the hand put in."""
+"""Force limit of the rig in N, and energy in J beyond what the hand put in."""
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Nan, Inf or huge value")
 

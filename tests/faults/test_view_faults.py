@@ -1,4 +1,4 @@
-"""What becomes of a run when its page, or whoever looks at it, misbehaves: nothing."""
+"""A page or a visitor that misbehaves changes nothing of a run."""
 
 from __future__ import annotations
 

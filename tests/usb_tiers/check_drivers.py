@@ -31,7 +31,7 @@ FORCE, PUSHED = 0.5, 0.2
 """N, and s for which devices are pushed: 11 mm, far beyond their steps and within their travel."""
 
 PATIENCE = 5.0
-"""In s: how long a device is pushed on where the machine is too busy for it to move at once."""
+"""Longest push in s of a device where the machine is too busy for it to move at once."""
 
 
 def _opened(specification: str, count: int = 1) -> Device:
@@ -218,7 +218,7 @@ def test_a_falcon_turns_the_nut_of_a_bolt_that_a_spacemouse_holds(
 
 
 TURN = 0.8
-"""In s: how long the nut is turned, to and fro in 1 s."""
+"""Time in s for which the nut is turned, to and fro in 1 s."""
 
 
 def _pulled_out_of_a_run(

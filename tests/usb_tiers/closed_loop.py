@@ -23,7 +23,7 @@ DEVICES: dict[str, tuple[Callable[[], UsbDevice], str, tuple[str, ...]]] = {
     # a scene in x and z for a stick in x and y
     "pid": (stick, STICK, ("planar_peg", "--axes", *"100", *("0", "0", "-1"), *"010")),
 }
-"""What is plugged in, as what it is opened, and the scene to run."""
+"""Emulated device, the name by which it is opened, and the scene to run."""
 
 
 def run(device: str, seconds: str, file: str) -> int:

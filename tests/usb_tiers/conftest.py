@@ -1,4 +1,4 @@
-"""What plugs emulated devices into the tier that these checks run in.
+"""Fixtures that plug emulated devices into the tier of these checks.
 
 ``HAPTICBRIDGE_TIER`` says where: ``umock`` (under umockdev's preload library) or ``uml`` (inside a
 User-Mode Linux); ``HAPTICBRIDGE_TIME`` may say ``virtual``. The checks are started there by
@@ -32,7 +32,7 @@ FIRST_FRONT_END = tuple(_FRONT_ENDS.get(TIER, {}))[:1]
 """The first way of ``plug_hid`` in this tier, for a check that takes long."""
 
 IS_TIME_VIRTUAL = os.environ.get("HAPTICBRIDGE_TIME") == "virtual"
-"""Whether time passes only while everything waits; then times can be asserted."""
+"""True if time passes only while everything waits; then times can be asserted."""
 
 Plug = Callable[[Callable[[], UsbDevice]], EmulatorProcess]
 
