@@ -198,6 +198,17 @@ def test_run_state_counts_the_records_that_were_dropped() -> None:
     assert str(state).endswith("  0 overruns  6 records dropped")
 
 
+def test_run_state_goes_on_to_say_why_the_force_is_lower() -> None:
+    state, rows = RunState(), numbered(0, 3)
+    rows["flags"] &= ~int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
+    state.add(rows[:1])
+    assert "FORCE" not in str(state)
+    rows["flags"][1] |= TickFlag.SWINGING
+    state.add(rows[1:2])
+    state.add(rows[2:])
+    assert str(state).endswith("FORCE LOWERED: the device answers late")
+
+
 def test_run_state_names_the_forces_of_every_hand_and_counts_a_tick_once() -> None:
     state = RunState((True, False))
     rows = np.repeat(numbered(0, 4), 2)  # a record per hand and tick

@@ -45,6 +45,13 @@ REPRINT = 2.0
 """Time in s between two plain lines."""
 
 
+LOWERED = {
+    int(TickFlag.RUNS_AWAY): "FORCE TAKEN AWAY: the device does not move as it is pushed",
+    int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late",
+}
+"""Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
+
+
 class RunState:
     """State of a run for the status line, collected from records.
 
@@ -55,6 +62,7 @@ class RunState:
         self._are_held = are_held
         self._last: NDArray[np.void] | None = None
         self._last_tick = -1
+        self._flags = 0
         self._overruns = 0
         self._dropped = 0
 
@@ -62,6 +70,7 @@ class RunState:
         """Adds new records, ``TICK_DTYPE``: of n >= 1 ticks, in each tick one per hand."""
         count = len(self._are_held)
         self._last = rows[-count:].copy()
+        self._flags |= int(np.bitwise_or.reduce(rows["flags"]))
         rows = rows[::count]  # counted by the first hand
         self._overruns += int(np.count_nonzero(rows["flags"] & TickFlag.OVERRUN))
         missing = np.diff(rows["tick"], prepend=self._last_tick) - 1
@@ -88,6 +97,7 @@ class RunState:
             f"device {' | '.join(joules)}",
             f"{self._overruns} overruns",
         ]
+        parts += [words for flag, words in LOWERED.items() if self._flags & flag][:1]
         if self._dropped:
             parts.append(f"{self._dropped} records dropped")
         return "  ".join(parts)
