@@ -8,7 +8,7 @@ import json
 import math
 import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from device_benches import PERIOD, FalconBench, HaplyBench, paddle
 from emulated.dhd_stub import OMEGA3, SIGMA7, Stub
 from emulated.evdev_model import WheelModel
 from emulated.hd_stub import HdStub
-from emulated.hid_device import HidDevice
 from emulated.hid_seam import HidSeam, Timed
 from emulated.pid_layouts import ODD
 from emulated.pid_model import PidStick
@@ -30,6 +29,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticbridge as hb
+from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.device import (
     AXES,
     Device,
@@ -47,8 +47,8 @@ from hapticbridge.device.rawhid.serial import open_serial
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.device.wheel.device import open_wheel
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.testing.device_contract import CONTRACT
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.testing.device_contract import CONTRACT, Check
 
 
 def written(path: Path) -> Path:
@@ -72,6 +72,10 @@ def pushed(when: float) -> tuple[float, ...]:
     return (0.5, -0.2, 0.3, 0.4, 0.1, 1.0) if when < 0.2 else (0.0,) * 6
 
 
+Built = tuple[Device, Timed, Callable[[], Iterable[float]]]
+"""A driver, the time of its emulated device, and what the device's motors give."""
+
+
 class Ticking:
     """A real driver and an emulated device as one, moved by one period before each read.
 
@@ -81,22 +85,21 @@ class Ticking:
         build: Makes the driver and what its device is plugged into.
     """
 
-    def __init__(self, build: Callable[[], tuple[Device, Timed]]) -> None:
+    def __init__(self, build: Callable[[], Built]) -> None:
         self.build, self.is_used = build, False
-        self.device, self.seam = build()
+        self.device, self.seam, self.motors = build()
         self.info = self.device.info
 
     def start(self, period: float) -> NDArray[np.void]:
         if self.is_used:
-            self.device, self.seam = self.build()
+            self.device, self.seam, self.motors = self.build()
         sample, self.is_used = self.device.start(period), True
         self.period, self.next = period, self.seam.now
         return sample
 
     def read(self, sample: NDArray[np.void]) -> int:
         if self.is_used:
-            self.seam.advance(self.next)
-            self.next += self.period
+            self._advance()
         return self.device.read(sample)
 
     def write(self, wrench: NDArray[np.float64]) -> None:
@@ -105,69 +108,90 @@ class Ticking:
     def close(self) -> None:
         self.device.close()
 
+    def force(self) -> Iterable[float]:
+        """Returns what the motors give a period later."""
+        self._advance()
+        return self.motors()
 
-def ticking(model: Callable[[], HidDevice], opener: Callable[..., Device]) -> Device:
+    def _advance(self) -> None:
+        self.seam.advance(self.next)
+        self.next += self.period
+
+
+def ticking(
+    model: Callable[[], RawHid | PidStick | SpaceMouse], opener: Callable[..., Device]
+) -> Device:
     """Returns a real driver on an emulated device that lives in virtual time."""
 
-    def build() -> tuple[Device, HidSeam]:
-        seam = HidSeam(model())
-        return opener({}, ignore_message, seam), seam
+    def build() -> Built:
+        plugged = model()
+        seam = HidSeam(plugged)
+        return opener({}, ignore_message, seam), seam, lambda: motors_of(plugged)
 
     return Ticking(build)
+
+
+def motors_of(device: RawHid | PidStick | SpaceMouse) -> Iterable[float]:
+    if isinstance(device, RawHid):
+        return device.wrench
+    return device.force() if isinstance(device, PidStick) else ()
 
 
 def falcon(_: Path) -> Device:
-    bench = FalconBench()
-    device = bench.opened()
-    bench.link.pace = PERIOD
-    return device
-
-
-def haply(_: Path) -> Device:
-    def build() -> tuple[Device, Timed]:
-        bench = HaplyBench()
-        return bench.opened(), bench.time
+    def build() -> Built:
+        bench = FalconBench()
+        return bench.opened(), bench.time, lambda: bench.model.motors
 
     return Ticking(build)
 
 
-def wheel(_: Path) -> Device:
-    def build() -> tuple[Device, Timed]:
-        model = WheelModel(SimulatedDevice())
-        return open_wheel({"max_torque": 2.0, "range": 900.0}, ignore_message, model), model
+def haply(_: Path) -> Device:
+    def build() -> Built:
+        bench = HaplyBench()
+        return bench.opened(), bench.time, lambda: bench.service.devices["049D"].force
 
     return Ticking(build)
 
 
 def verse_grip(_: Path) -> Device:
-    def build() -> tuple[Device, Timed]:
+    def build() -> Built:
         bench = HaplyBench()
         bench.service.orientation = {"w": 0.6, "x": 0.0, "y": 0.8, "z": 0.0}
-        return bench.opened(), bench.time
+        return bench.opened(), bench.time, lambda: bench.service.devices["049D"].force
+
+    return Ticking(build)
+
+
+def wheel(_: Path) -> Device:
+    def build() -> Built:
+        model = WheelModel(SimulatedDevice())
+        device = open_wheel({"max_torque": 2.0, "range": 900.0}, ignore_message, model)
+        return device, model, lambda: [model.torque() if model.files else 0.0]
 
     return Ticking(build)
 
 
 def force_dimension(kind: int) -> Device:
-    def build() -> tuple[Device, Timed]:
+    def build() -> Built:
         stub = Stub(kind)
-        return stub.opened(), stub
+        return stub.opened(), stub, stub.force
 
     return Ticking(build)
 
 
 def touch(_: Path) -> Device:
-    def build() -> tuple[Device, Timed]:
+    def build() -> Built:
         stub = HdStub()
-        return stub.opened(), stub
+        return stub.opened(), stub, stub.force
 
     return Ticking(build)
 
 
 def serial(_: Path) -> Device:
-    def build() -> tuple[Device, Timed]:
-        seam = SerialSeam(RawHid(SimulatedDevice(), Claims(rate=500.0)))
-        return open_serial({}, ignore_message, seam), VirtualPort(seam)
+    def build() -> Built:
+        board = RawHid(SimulatedDevice(), Claims(rate=500.0))
+        seam = SerialSeam(board)
+        return open_serial({}, ignore_message, seam), VirtualPort(seam), lambda: board.wrench
 
     return Ticking(build)
 
@@ -212,20 +236,38 @@ DEVICES: dict[str, Callable[[Path], Device]] = {
 
 @pytest.mark.parametrize("name", DEVICES)
 @pytest.mark.parametrize("check", CONTRACT, ids=lambda check: check.__name__)
-def test_a_device_fulfils_the_contract(
-    check: Callable[[Device], None], name: str, tmp_path: Path
-) -> None:
-    check(DEVICES[name](tmp_path))
+def test_a_device_fulfils_the_contract(check: Check, name: str, tmp_path: Path) -> None:
+    device = DEVICES[name](tmp_path)
+    force = device.force if isinstance(device, Ticking) else None
+    check(device, force=force, clock=SimulatedClock())
+
+
+class OwnTime(SimulatedClock):
+    """Time of a device that moves whether it is read or not."""
+
+    name = RealClock.name
+
+    def spend(self, seconds: float) -> None:
+        self._now += round(1e9 * seconds)
 
 
 class Crooked(SimulatedDevice):
-    """A device with one fault."""
+    """A device with one fault, or with none."""
 
-    def __init__(self, fault: str) -> None:
+    def __init__(self, fault: str, time: OwnTime | None = None) -> None:
         super().__init__()
         self.fault, self.starts, self.closings, self.reads = fault, 0, 0, 0
+        self.time = time or OwnTime()
         if fault == "prescribed":
             self.info = dataclasses.replace(self.info, is_prescribed=True)
+        if fault == "plane":
+            self.info = dataclasses.replace(self.info, axes=("x", "y"))
+        if fault == "turned":
+            self.info = dataclasses.replace(self.info, axes=("x", "y", "z"))
+        if fault == "real":
+            self.info = dataclasses.replace(self.info, is_real=True)
+        if fault == "fast":
+            self.info = dataclasses.replace(self.info, reach=100.0)
 
     def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
         if self.fault == "period":
@@ -251,10 +293,23 @@ class Crooked(SimulatedDevice):
             sample["buttons"] = buttons
         if self.fault == "again":
             sample["position"][0, 0] += 1e-9 * self.starts
-        return flags
+        if self.fault == "plane":
+            sample["position"][0, 2] = 0.01
+        if self.fault in ("millimetres", "fast"):
+            sample["position"] *= 1000.0
+        if self.fault == "waits":
+            self.time.spend(0.05)
+        return None if self.fault == "none" else flags  # type: ignore[return-value]
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        super().write(wrench)
+        if self.fault == "waits to write":
+            self.time.spend(0.05)
 
     def close(self) -> None:
         self.closings += 1
+        if self.fault == "pushes on":
+            return
         if self.fault == "close" and self.closings > 1:
             raise DeviceError("closed twice")
         super().close()
@@ -273,16 +328,90 @@ class Crooked(SimulatedDevice):
         ("close", "closed twice"),
         ("period", "start(0.0) must raise DeviceError"),
         ("before", "read before start() must raise DeviceError"),
+        ("none", "read() returned None; it must be 0, or TickFlag.STALE_SAMPLE"),
+        ("waits", "read() waits: more than 10% of the calls took over 0.5 ms; let a thread wait"),
+        ("waits to write", "write() waits: more than 10% of the calls took over 0.5 ms"),
+        ("pushes on", "close() leaves the force on: write a zero force first"),
+        ("real", "the motors of a real device must be seen: name them as check(device, force="),
+        ("plane", "z reaches 0.01 m, but the data sheet has no axis z"),
+        ("turned", "the quaternion turns about rx, but the data sheet has no axis rx"),
+        ("millimetres", "m from the origin, farther than 2 m: report metres, or state the reach"),
+        ("fast", "over 2 times its speed_limit of 5 m/s: report metres, or state its speed"),
     ],
 )
 def test_the_contract_names_what_a_device_breaks(fault: str, words: str) -> None:
+    assert words in " | ".join(broken_clauses(lambda time: Crooked(fault, time)))
+
+
+def broken_clauses(build: Callable[[OwnTime], Device], **options: Any) -> list[str]:
+    """Returns the messages of the checks that a device fails."""
     broken = []
     for check in CONTRACT:
+        time = OwnTime()
         try:
-            check(Crooked(fault))
+            check(build(time), clock=time, **options)
         except (AssertionError, DeviceError) as error:
             broken.append(str(error))
-    assert words in broken
+    return broken
+
+
+class Streaming(Crooked):
+    """A correct driver of hardware that moves in its own time; a read returns the newest sample."""
+
+    def __init__(self, time: OwnTime, *, lets_go: bool = True) -> None:
+        super().__init__("real", time)
+        self.lets_go, self.newest = lets_go, np.zeros(1, SAMPLE_DTYPE)
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        self.newest = super().start(period, parts)
+        self.seen = self.time.now()
+        return self.newest.copy()
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if not self.starts:
+            raise DeviceError("call start() first")
+        is_new = self.time.now() >= self.seen + 2_000_000  # the hardware is half as fast
+        while self.time.now() >= self.seen + 2_000_000:
+            super().read(self.newest)
+            self.seen += 2_000_000
+        sample[0] = self.newest[0]
+        return 0 if is_new else int(TickFlag.STALE_SAMPLE)
+
+    def force(self) -> list[float]:
+        return self.stepper[0]["written"][0].tolist()  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        if self.lets_go:
+            super().close()
+
+
+def test_a_driver_of_hardware_with_a_time_of_its_own_fulfils_the_contract() -> None:
+    units: list[Streaming] = []
+
+    def build(time: OwnTime, *, lets_go: bool = True) -> Device:
+        units.append(Streaming(time, lets_go=lets_go))
+        return units[-1]
+
+    def force() -> list[float]:
+        return units[-1].force()
+
+    assert broken_clauses(build, force=force) == []
+    assert broken_clauses(Streaming) == [
+        "the motors of a real device must be seen: name them as check(device, force=unit.force)"
+    ]
+    assert broken_clauses(lambda time: build(time, lets_go=False), force=force) == [
+        "close() leaves the force on: write a zero force first"
+    ]
+    assert broken_clauses(build, force=lambda: [0.0] * 6) == [
+        "force= reports no force, although one was written"
+    ]
+
+
+def test_a_failed_check_closes_the_device() -> None:
+    device = Crooked("none")
+    with pytest.raises(AssertionError):
+        CONTRACT[1](device, clock=device.time)
+    assert device.closings == 1
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ ORDER = (
     ("scene", "inputs"),
     ("rendering", "device"),
     (
-        "testing",
         "certificate",
         "identify",
         "realtime",
@@ -30,6 +29,7 @@ ORDER = (
         "theory_plots",
     ),
     ("guard", "summary", "timekeeping", "export", "export_viewers", "dataset", "recorded_scene"),
+    ("testing",),
     ("commands", "check"),
     ("audit", "compare", "options"),
     ("hands",),

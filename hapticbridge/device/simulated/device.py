@@ -316,7 +316,8 @@ class SimulatedDevice:
         return self._states, self._motion
 
     def close(self) -> None:
-        """Does nothing, because the device holds no resources."""
+        """Ends the force."""
+        self._states["written"] = 0.0
 
     @property
     def velocity(self) -> NDArray[np.float64]:
