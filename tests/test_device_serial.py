@@ -198,6 +198,21 @@ def test_a_silent_board_and_one_that_confirms_nothing_are_refused() -> None:
     assert not seam.opened.is_open  # a port that is refused is released
 
 
+def test_a_board_of_another_version_is_told_so() -> None:
+    seam = SerialSeam(hapkit())
+    take = seam.board.take_report
+
+    def newer() -> bytes | None:
+        if (report := take()) is None:
+            return None
+        body = report[:1] + b"\2" + report[2:62]
+        return body + protocol.crc16(body).to_bytes(2, "little")
+
+    seam.board.take_report = newer  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="speaks version 2 of the raw HID protocol; version 1 is"):
+        opened(seam)
+
+
 def test_an_unplugged_or_silent_board_ends_the_run_and_closing_switches_it_off() -> None:
     seam = SerialSeam(hapkit())
     device, sample = opened(seam), np.zeros(1, SAMPLE_DTYPE)
@@ -372,6 +387,15 @@ def test_the_hapkit_sketch_runs_behind_pyserial_and_lets_go_by_itself(board: Boa
     assert board.sketch.sketch_pin(DIRECTION) == 0
     assert board.sketch.sketch_fed() > 1
     until(lambda: board.sketch.sketch_pin(PWM) == 0)  # nothing is written: its watchdog
+    device.close()
+
+
+def test_a_port_named_by_a_link_has_a_guardian_too(board: Board, tmp_path: Path) -> None:
+    link = tmp_path / "usb-Arduino_Uno-if00"
+    link.symlink_to(board.path)
+    device = open_device(f"serial:{link}")
+    assert isinstance(device, RawHidDevice)
+    assert device.last_word is not None
     device.close()
 
 

@@ -104,12 +104,17 @@ def _page(link: FrameLink, name: str, page: int) -> Numbers | GripNumbers | str:
             answer = decoded(report)
             if isinstance(answer, Numbers | GripNumbers | str) and type(answer) is _PAGES[page]:
                 return answer
-            if (version := version_of(report)) not in (None, VERSION):
-                raise DeviceError(
-                    f"{name} speaks version {version} of the raw HID protocol; "
-                    f"version {VERSION} is required, so update its firmware"
-                )
+            refuse_other_version(report, name)
     raise DeviceError(f"{name} does not answer by the protocol of {DOCUMENT}; check its firmware")
+
+
+def refuse_other_version(frame: bytes, name: str) -> None:
+    """Raises DeviceError if a frame is of another version of the protocol."""
+    if (version := version_of(frame)) not in (None, VERSION):
+        raise DeviceError(
+            f"{name} speaks version {version} of the raw HID protocol; "
+            f"version {VERSION} is required, so update its firmware"
+        )
 
 
 def reports(link: FrameLink, timeout_ms: int) -> Iterator[bytes]:

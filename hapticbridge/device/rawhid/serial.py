@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
+import os
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -29,7 +30,13 @@ from hapticbridge.device.driver import (
     Notify,
     access_problem,
 )
-from hapticbridge.device.rawhid.device import CHANGES, GRIP_CHANGES, NO_WRENCH, RawHidDevice
+from hapticbridge.device.rawhid.device import (
+    CHANGES,
+    GRIP_CHANGES,
+    NO_WRENCH,
+    RawHidDevice,
+    refuse_other_version,
+)
 from hapticbridge.device.rawhid.protocol import (
     DOCUMENT,
     NUMBERS_PAGE,
@@ -325,7 +332,8 @@ def connect(
         The link, and the baud rate in bit/s.
 
     Raises:
-        DeviceError: The port cannot be opened, or no board answers within ``BOOT``.
+        DeviceError: The port cannot be opened, no board answers within ``BOOT``, or it has another
+            version of the protocol.
     """
     port = ports.open(plugged.path, bauds[0])
     link = SerialLink(port, str(plugged), ports, log)
@@ -335,7 +343,8 @@ def connect(
             for baud in bauds:
                 _set_baud(port, baud, plugged.path)
                 link.write(b"\0" + ask_frame(NUMBERS_PAGE, NUMBERS_PAGE))
-                if link.wait(LISTENING_MS):
+                if frame := link.wait(LISTENING_MS):
+                    refuse_other_version(frame, str(plugged))
                     return link, baud
         tried = " or ".join(f"{baud}" for baud in bauds)
         if link.received:
@@ -427,11 +436,12 @@ def open_serial(
 def _candidates(options: Mapping[str, object], ports: SystemPorts) -> list[FoundDevice]:
     found = ports.found()
     if (path := options.get("port")) is not None:
+        path = str(path)
+        if Path(path).is_symlink():  # such as those of /dev/serial/by-id
+            path = os.path.realpath(path)
         listed = [port for port in found if port.path == path]
         return listed or [
-            FoundDevice(
-                driver="serial", name=str(path), serial="", path=str(path), transport="serial"
-            )
+            FoundDevice(driver="serial", name=path, serial="", path=path, transport="serial")
         ]
     if (serial := options.get("serial")) is not None:
         found = [port for port in found if port.serial == serial]
