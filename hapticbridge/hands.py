@@ -19,7 +19,7 @@ from hapticbridge.arguments import is_number, shown
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo
-from hapticbridge.device.base import checked_read, checked_write
+from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.codes import JOINT
@@ -323,7 +323,7 @@ class DeviceGroup:
             DeviceError: One of them cannot run at this period.
         """
         starts = zip(self._devices, self._counts, strict=True)
-        return np.concatenate([device.start(period)[:count] for device, count in starts])
+        return np.concatenate([checked_start(device)(period)[:count] for device, count in starts])
 
     def read(self, sample: NDArray[np.void]) -> int:
         """Reads every device's newest sample; returns 0, since each hand has flags of its own.
@@ -373,4 +373,4 @@ class DeviceGroup:
         """Closes every device."""
         with ExitStack() as stack:
             for device in self._devices:
-                stack.callback(device.close)
+                stack.callback(checked_close(device))

@@ -23,7 +23,7 @@ from hapticbridge.clock import Clock, RealClock, slept_ns
 from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
-from hapticbridge.device.base import checked_write
+from hapticbridge.device.base import checked_close, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
 from hapticbridge.hands import DeviceGroup
@@ -332,8 +332,8 @@ class Session:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)
         # first, because waiting for the recorder or the scene may take long
-        resources.callback(self.device.close)
-        sample[:] = self.device.start(setup.period)[: sample.size]
+        resources.callback(checked_close(self.device))
+        sample[:] = checked_start(self.device)(setup.period)[: sample.size]
         for each, own in zip(self._setups, self._samples(), strict=True):
             refuse_implausible_pose(each.info, own)
         self.hand_parameters = self._parameters(effective)

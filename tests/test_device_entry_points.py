@@ -76,12 +76,99 @@ def test_the_template_is_listed_opened_and_run_by_its_name(call: Called) -> None
     assert "test_the_rail_fulfils_the_contract" in names
 
 
+@pytest.mark.usefixtures("rail")
+def test_the_guides_command_runs_the_template(call: Called, tmp_path: Path) -> None:
+    (line,) = re.findall(r"\nhapticbridge (run .*)\n", GUIDE.read_text(encoding="utf-8"))
+    code, out, err = call(*line.replace("rail.mcap", str(tmp_path / "rail.mcap")).split())
+    assert code == 0, err
+    assert "next: hapticbridge audit" in out
+
+
+PACKAGE = """
+import numpy as np
+from hapticbridge import SAMPLE_DTYPE, DeviceInfo
+from hapticbridge.device.driver import Driver, FoundDevice
+
+class Rail:
+    info = DeviceInfo(name="rail", axes=("x",), force_limit=10.0, is_real=False)
+
+    def start(self, period):
+        sample = np.zeros(1, SAMPLE_DTYPE)
+        sample["quaternion"][0, 0] = 1.0
+        return {start}
+
+    def read(self, sample):
+        sample[0] = (0, 0, 0), (1, 0, 0, 0), 0
+        return {read}
+
+    def write(self, wrench):
+        {write}
+
+    def close(self):
+        {close}
+
+DRIVER = Driver(
+    name="rail", about="", ids=(), transport="library", axes="", force="", rate="", options={{}},
+    products="a rail", find=lambda: {find}, medium=lambda: {medium},
+    open=lambda options, notify: {open},
+)
+"""
+SOUND = {
+    "start": "sample", "read": "0", "write": "pass", "close": "pass", "find": "[]", "medium": "''",
+    "open": "Rail()",
+}  # fmt: skip
+OTHER = "[FoundDevice(driver='x', name='x', serial='', path='', transport='hid')]"
+
+
+@pytest.mark.parametrize(
+    ("command", "function", "body", "words"),
+    [
+        ("devices", "find", "1 / 0", "rail: find failed with ZeroDivisionError"),
+        ("devices", "find", "None", "rail: find failed with TypeError"),
+        ("devices", "find", OTHER, "it must list FoundDevice with the driver 'rail'"),
+        ("devices", "medium", "1 / 0", "rail: medium failed with ZeroDivisionError"),
+        ("run", "open", "1 / 0", "rail: open failed with ZeroDivisionError"),
+        ("run", "open", "None", "open failed with TypeError: it must return a device with a"),
+        ("run", "start", "1 / 0", "device 'rail': start failed with ZeroDivisionError"),
+        ("run", "start", "np.zeros(3)", "start returned array([0., 0., 0.]); it must be an array"),
+        ("run", "close", "1 / 0", "device 'rail': close failed with ZeroDivisionError"),
+        ("identify", "start", "1 / 0", "device 'rail': start failed with ZeroDivisionError"),
+        ("identify", "read", "1 / 0", "device 'rail': read failed with ZeroDivisionError"),
+        ("identify", "write", "1 / 0", "device 'rail': write failed with ZeroDivisionError"),
+        ("identify", "close", "1 / 0", "device 'rail': close failed with ZeroDivisionError"),
+    ],
+)
+def test_a_fault_of_another_packages_device_is_one_sentence(
+    call: Called,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    function: str,
+    body: str,
+    words: str,
+) -> None:
+    text = PACKAGE.format(**{**SOUND, function: body})
+    install(tmp_path, "[hapticbridge.devices]\nrail = faulty:DRIVER", faulty=text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "faulty", raising=False)
+    options = {
+        "devices": [],
+        "run": ["point_mass", "--device", "rail", "--duration", "0.01"],
+        "identify": ["rail", "--duration", "2"],
+    }
+    code, out, err = call(command, *options[command])
+    assert code == (0 if command == "devices" else 2)
+    told = " ".join((out + err).split())
+    assert words in told.replace("the device 'rail' of the package hapticbridge-rail", "rail")
+
+
 @pytest.mark.parametrize(
     ("value", "module", "words"),
     [
         ("broken:DRIVER", "1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
         ("broken:DRIVER", "", "cannot be imported: AttributeError"),
         ("missing:DRIVER", "", "cannot be imported: ModuleNotFoundError"),
+        ("broken:DRIVER", "raise SystemExit('bye')", "cannot be imported: SystemExit: bye"),
         ("broken:DRIVER", "DRIVER = 7", "names broken:DRIVER as the device 'rail'; it must be a"),
     ],
 )

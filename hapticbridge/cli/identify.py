@@ -16,6 +16,7 @@ from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, 
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.device import AXES, open_device
+from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify import Identification, identify
@@ -194,7 +195,7 @@ class Identify:
                     ),
                 )
         finally:
-            device.close()
+            checked_close(device)()
         z = safe_width(result)
         profile = measured_profile(
             result,

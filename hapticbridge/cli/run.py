@@ -26,6 +26,7 @@ from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_
 from hapticbridge.clock import Clock, RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
+from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
 from hapticbridge.guard import (
@@ -429,7 +430,8 @@ class Run:
             if not joint:
                 self._refuse_grip_scale()
             device = device_for(scene, self.device, notify, joint)
-            stack.callback(device.close)  # what is refused from here on must not leave it claimed
+            # what is refused from here on must not leave it claimed
+            stack.callback(checked_close(device))
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
             elif joint:

@@ -15,6 +15,7 @@ from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progr
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
+from hapticbridge.device.base import checked_close
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured_points
 from hapticbridge.plotting import check_ending
@@ -95,7 +96,7 @@ class Zwidth:
                     measured = measure_width(device, clock, z, axis=axis, progress=show)
         finally:
             if device is not None:
-                device.close()
+                checked_close(device)()
         # the run command has no low-pass to offer, and without it this corner is not passive
         coupling = recommended(z)
         command = next_command(coupling.stiffness, coupling.damping, self.rate)
@@ -120,7 +121,7 @@ class Zwidth:
         device = open_device(spec, notify=notify)
         here = [name for name in AXES[:3] if name in device.info.axes]
         if device.info.is_prescribed or axis not in here:
-            device.close()
+            checked_close(device)()
             raise HapticBridgeError(
                 f"--axis {axis}: the device moves by force along "
                 f"{choices([] if device.info.is_prescribed else here)}"

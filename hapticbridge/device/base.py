@@ -18,6 +18,7 @@ from hapticbridge.arguments import is_number, shown
 from hapticbridge.errors import DeviceError, choices
 from hapticbridge.files import read_json
 from hapticbridge.pose import Quaternion, canonical
+from hapticbridge.record import SAMPLE_DTYPE
 
 
 @contextmanager
@@ -431,11 +432,71 @@ def _is_ours(device: Device) -> bool:
     return type(device).__module__.startswith("hapticbridge.")
 
 
-def _told(name: str, call: str, error: Exception) -> DeviceError:
+def _told(call: str, error: Exception) -> DeviceError:
     """Returns the error itself if it is a ``DeviceError``, else one that names the failed call."""
     if isinstance(error, DeviceError):
         return error
-    return DeviceError(f"device '{name}': {call} failed with {type(error).__name__}: {error}")
+    return DeviceError(f"{call} failed with {type(error).__name__}: {error}")
+
+
+@contextmanager
+def telling(call: str) -> Iterator[None]:
+    """Turns any error of a call into a ``DeviceError`` that names the call."""
+    try:
+        yield
+    except Exception as error:
+        raise _told(call, error) from error
+
+
+def checked(device: Device) -> Device:
+    """Returns a device of this package, or one with the checked calls of another package's."""
+    return device if _is_ours(device) else _Checked(device)
+
+
+class _Checked:
+    def __init__(self, device: Device) -> None:
+        self.info = device.info
+        self.start, self.read = checked_start(device), checked_read(device)
+        self.write, self.close = checked_write(device), checked_close(device)
+
+
+def checked_start(device: Device) -> Callable[[float], NDArray[np.void]]:
+    """Returns the device's ``start``; for a device of another package, one that checks its answer.
+
+    Raises:
+        DeviceError: By the returned function, if the answer is not an array of samples, or the
+            device raises anything.
+    """
+    if _is_ours(device):
+        return device.start
+
+    def told(period: float) -> NDArray[np.void]:
+        with telling(f"device '{device.info.name}': start"):
+            sample = device.start(period)
+        if not isinstance(sample, np.ndarray) or sample.dtype != SAMPLE_DTYPE or sample.ndim != 1:
+            raise DeviceError(
+                f"device '{device.info.name}': start returned {shown(sample)}; it must be an array "
+                "of SAMPLE_DTYPE with the shape (1,), or (2,) with a grip axis"
+            )
+        return sample
+
+    return told
+
+
+def checked_close(device: Device) -> Callable[[], None]:
+    """Returns the device's ``close``; for a device of another package, one whose errors are told.
+
+    Raises:
+        DeviceError: By the returned function, if the device raises anything.
+    """
+    if _is_ours(device):
+        return device.close
+
+    def told() -> None:
+        with telling(f"device '{device.info.name}': close"):
+            device.close()
+
+    return told
 
 
 def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
@@ -446,15 +507,15 @@ def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
     """
     if _is_ours(device):
         return device.write
-    write, name = device.write, device.info.name
+    write, call = device.write, f"device '{device.info.name}': write"
 
-    def checked(wrench: NDArray[np.float64]) -> None:
-        try:
+    def told(wrench: NDArray[np.float64]) -> None:
+        try:  # as telling(), without an object per tick
             write(wrench)
         except Exception as error:
-            raise _told(name, "write", error) from error
+            raise _told(call, error) from error
 
-    return checked
+    return told
 
 
 def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
@@ -467,12 +528,13 @@ def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
     if _is_ours(device):
         return device.read
     read, name = device.read, device.info.name
+    call = f"device '{name}': read"
 
-    def checked(sample: NDArray[np.void]) -> int:
+    def told(sample: NDArray[np.void]) -> int:
         try:
             flags = read(sample)
         except Exception as error:
-            raise _told(name, "read", error) from error
+            raise _told(call, error) from error
         if not isinstance(flags, int | np.integer):
             raise DeviceError(
                 f"device '{name}': read returned {shown(flags)}; it must be 0 for a new sample, or "
@@ -480,4 +542,4 @@ def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
             )
         return int(flags)
 
-    return checked
+    return told

@@ -8,6 +8,7 @@ from hapticbridge.device.driver import Driver, FoundDevice, UsbId
 from hapticbridge.device.registry import all_drivers, broken_drivers
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_search
+from hapticbridge.errors import DeviceError
 
 RULES_FILE = "/etc/udev/rules.d/70-hapticbridge.rules"
 """Path of the udev rules. The number must be below 73: ``73-seat-late.rules`` turns the tag
@@ -22,7 +23,10 @@ def plugged_devices() -> list[FoundDevice]:
 def plugged_of(driver: Driver) -> list[FoundDevice]:
     """Lists a driver's connected devices, with the reason if one cannot be opened."""
     if driver.find is not None:
-        return driver.find()
+        try:
+            return driver.find()
+        except DeviceError:  # of another package; broken_drivers() has the reason
+            return []
     if driver.transport == "hid":
         return hid_search.find(driver)
     return usb_search.find(driver)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from hapticbridge.device.base import Device, calling_on_error
-from hapticbridge.device.driver import Driver, Notify, Options, ignore_message
+from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, checked_close, telling
+from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
 from hapticbridge.device.simulated.hand import Hand
@@ -75,7 +75,7 @@ def driver_named(name: str) -> Driver | None:
     package = entry.dist.name if entry.dist is not None else entry.module
     try:
         found = entry.load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DeviceError(
             f"the device '{name}' of the package {package} cannot be imported: "
             f"{type(error).__name__}: {error}"
@@ -85,7 +85,40 @@ def driver_named(name: str) -> Driver | None:
             f"the package {package} names {entry.value} as the device '{name}'; it must be a "
             "hapticbridge.device.driver.Driver of that name"
         )
-    return found
+    return _told(found, package)
+
+
+def _told(driver: Driver, package: str) -> Driver:
+    """Returns the driver of a package with every error of its functions as a ``DeviceError``."""
+    about = f"the device '{driver.name}' of the package {package}"
+
+    def found() -> list[FoundDevice]:
+        with telling(f"{about}: find"):
+            devices = list(driver.find() if driver.find is not None else [])
+            if any(getattr(each, "driver", None) != driver.name for each in devices):
+                raise TypeError(f"it must list FoundDevice with the driver '{driver.name}'")
+            return devices
+
+    def medium() -> str:
+        try:
+            with telling(f"{about}: medium"):
+                return str(driver.medium() if driver.medium is not None else "")
+        except DeviceError as error:
+            return str(error)
+
+    def opened(options: Mapping[str, object], notify: Notify) -> Device:
+        with telling(f"{about}: open"):
+            device = driver.open(options, notify)
+            if not isinstance(getattr(device, "info", None), DeviceInfo):
+                raise TypeError("it must return a device with a DeviceInfo as info")
+            return device
+
+    return replace(
+        driver,
+        open=opened,
+        find=None if driver.find is None else found,
+        medium=None if driver.medium is None else medium,
+    )
 
 
 def all_drivers() -> tuple[Driver, ...]:
@@ -102,7 +135,9 @@ def broken_drivers() -> list[str]:
     reasons = []
     for name in installed_drivers():
         try:
-            driver_named(name)
+            driver = driver_named(name)
+            if driver is not None and driver.find is not None:
+                driver.find()
         except DeviceError as error:
             reasons.append(str(error))
     return reasons
@@ -216,7 +251,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
             requested.pop("profile", None)
         profile = None if profile_option in (None, "none") else profile_named(str(profile_option))
         device = driver.open(requested, notify)
-        with calling_on_error(device.close):
+        with calling_on_error(checked_close(device)):
             if profile_option is None:
                 model = device.info.name
                 profile = profile_of(name, device.info.serial, model)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device import AXES, Device, DeviceInfo
-from hapticbridge.device.base import JUMP_MARGIN
+from hapticbridge.device.base import JUMP_MARGIN, checked
 from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import (
     FAR,
@@ -321,6 +321,7 @@ def identify(
         speed=(info.speed_limit, info.speed_limit / 0.025),
     )
     duration = duration_at(period) if duration is None else duration
+    device = checked(device)
     device.start(period)
     clock.start(round(period * 1e9))
     runs, fits = {}, {}

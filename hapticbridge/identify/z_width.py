@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock
 from hapticbridge.device import AXES, Device
+from hapticbridge.device.base import checked
 from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import CALMING, CENTRING
 from hapticbridge.record import SAMPLE_DTYPE
@@ -312,6 +313,7 @@ def measure_width(
     References:
         Colgate & Brown 1994, *Factors affecting the Z-width of a haptic display*.
     """
+    device = checked(device)
     device.start(z.period)
     clock.start(round(z.period * 1e9))
     largest = next(line for line in z.lines if line.is_required).largest_damping
