@@ -107,6 +107,33 @@ def test_buttons_are_the_devices_own_in_order() -> None:
     assert read(device, model)[1]["buttons"] == 0b100
 
 
+def test_what_the_kernel_lost_in_a_long_pause_is_asked_for() -> None:
+    device, model = started(WheelModel(free(), buttons={0x120}))
+    ticks(device, model, 3, TWIST)
+    model.press(0x120, is_down=False)
+    model.advance(model.now + 0.3)  # more events than the kernel's queue holds
+    _, sample = read(device, model)
+    assert sample["buttons"] == 0
+    half = 0.5 * math.radians(900.0) * (model.count() / 65535.0 - 0.5)
+    assert sample["quaternion"][3] == pytest.approx(math.sin(half), abs=1e-12)
+
+
+@pytest.mark.parametrize("when", range(1, 5))
+def test_a_node_that_is_unplugged_while_it_is_opened_is_released(when: int) -> None:
+    model, calls = WheelModel(free()), 0
+    asked = model.ioctl
+
+    def gone(*words: Any) -> None:
+        nonlocal calls
+        calls += 1
+        model.is_plugged = calls < when
+        asked(*words)
+
+    model.ioctl = gone  # type: ignore[method-assign, assignment]
+    assert find(model) == []
+    assert model.files == 0
+
+
 def test_a_torque_ends_with_a_loop_that_hangs_and_lives_on_while_it_runs() -> None:
     device, model = started()
     ticks(device, model, 500, TWIST)

@@ -19,6 +19,7 @@ from hapticbridge.device import SimulatedDevice
 PATH = "/dev/input/event7"
 
 _EV_SYN, _EV_KEY, _EV_ABS, _EV_FF = 0, 1, 3, 0x15
+_SYN_DROPPED, _QUEUE = 3, 64
 _CONSTANT, _RUMBLE, _GAIN, _AUTOCENTER = 0x52, 0x50, 0x60, 0x61
 _ROOM = 4
 """Effects that fit into the device."""
@@ -110,8 +111,11 @@ class WheelModel:
         self._event(_EV_KEY, code, int(is_down))
 
     def _event(self, kind: int, code: int, value: int) -> None:
-        self._events.append(struct.pack("<qqHHi", 0, 0, kind, code, value))
-        self._events.append(struct.pack("<qqHHi", 0, 0, _EV_SYN, 0, 0))
+        news = [struct.pack("<qqHHi", 0, 0, *words) for words in ((kind, code, value), (0, 0, 0))]
+        if len(self._events) + len(news) > _QUEUE:  # all is lost, and said to be
+            self._events = [struct.pack("<qqHHi", 0, 0, _EV_SYN, _SYN_DROPPED, 0)]
+        else:
+            self._events += news
 
     # the kernel's side
 

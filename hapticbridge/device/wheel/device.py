@@ -55,6 +55,7 @@ from hapticbridge.device.wheel.evdev import (
     EV_ABS,
     EV_FF,
     EV_KEY,
+    EV_SYN,
     FF_AUTOCENTER,
     FF_CONSTANT,
     FF_GAIN,
@@ -62,6 +63,7 @@ from hapticbridge.device.wheel.evdev import (
     FIRST_BUTTON,
     FULL,
     LAST_BUTTON,
+    SYN_DROPPED,
     InputNode,
     Kernel,
     Linux,
@@ -173,9 +175,7 @@ class WheelDevice:
         self._every, self._ticks = max(int(RESTART / period), 1), 0
         self._life = round(1e3 * max(LIFE, LIFE_PERIODS * period))
         self._node.events()  # older than the position that is read now
-        self._count = self._node.axis(ABS_X).value
-        down = self._node.buttons_down()
-        self._pressed = sum(bit for code, bit in self._bits.items() if code in down)
+        self._ask_state()
         self._push(0)
         self._node.set(self._effect, 1)
         self._is_started = True
@@ -185,15 +185,22 @@ class WheelDevice:
         return self._sample.copy()
 
     def read(self, sample: NDArray[np.void]) -> int:
-        """Returns the position; a silent device is at rest, because it reports only changes."""
+        """Returns the position; a silent device is at rest, because it reports only changes.
+
+        If the kernel has lost events, such as in a long pause of the loop, it is asked instead.
+        """
         if not self._is_started:
             raise DeviceError(f"{self._name} is read before it was started; call start() first")
+        has_lost = False
         for kind, code, value in self._node.events():
+            has_lost |= (kind, code) == (EV_SYN, SYN_DROPPED)
             if (kind, code) == (EV_ABS, ABS_X):
                 self._count = value
             elif kind == EV_KEY and code in self._bits:
                 bit = self._bits[code]
                 self._pressed = self._pressed | bit if value else self._pressed & ~bit
+        if has_lost:
+            self._ask_state()
         self._fill()
         sample[0] = self._sample[0]
         return 0
@@ -240,6 +247,11 @@ class WheelDevice:
         self.last_word = guard_device_node(
             self._node.path, event(self._effect, 0), event(FF_GAIN, 0)
         )
+
+    def _ask_state(self) -> None:
+        self._count = self._node.axis(ABS_X).value
+        down = self._node.buttons_down()
+        self._pressed = sum(bit for code, bit in self._bits.items() if code in down)
 
     def _push(self, level: int) -> None:
         self._effect = self._node.upload(level, self._life, self._effect)

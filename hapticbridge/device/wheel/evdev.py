@@ -17,13 +17,15 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
+from hapticbridge.device.base import calling_on_error
 from hapticbridge.device.transport.trace import HexLog
 from hapticbridge.errors import DeviceError, DeviceLost
 
-EV_KEY, EV_ABS, EV_FF = 0x01, 0x03, 0x15
-ABS_X = 0x00
+EV_SYN, EV_KEY, EV_ABS, EV_FF = 0x00, 0x01, 0x03, 0x15
+SYN_DROPPED, ABS_X = 0x03, 0x00
 FF_RUMBLE, FF_CONSTANT, FF_GAIN, FF_AUTOCENTER = 0x50, 0x52, 0x60, 0x61
-"""Types and codes of events. The first rotation of a wheel and of a stick is ``ABS_X``."""
+"""Types and codes of events. The first rotation of a wheel and of a stick is ``ABS_X``. The kernel
+reports ``SYN_DROPPED`` if its queue was full and events were lost."""
 
 FIRST_BUTTON, LAST_BUTTON = 0x100, 0x2FF
 """Codes of keys that are buttons of a device and not of a keyboard."""
@@ -148,14 +150,16 @@ class InputNode:
 
     Raises:
         OSError: The node cannot be opened.
+        DeviceLost: The device is gone.
     """
 
     def __init__(self, kernel: Kernel, path: str, log: HexLog | None = None) -> None:
         self.path, self._kernel, self._log = path, kernel, log
         self._file = kernel.open(path)
         self._is_open = True
-        _, self.vendor, self.product, _ = _ID.unpack(self._asked(_GET_ID, _ID.size))
-        self.name = _text(self._asked(_GET_NAME, _TEXT))
+        with calling_on_error(self.close):
+            _, self.vendor, self.product, _ = _ID.unpack(self._asked(_GET_ID, _ID.size))
+            self.name = _text(self._asked(_GET_NAME, _TEXT))
         try:
             self.serial = _text(self._asked(_GET_SERIAL, _TEXT))
         except DeviceLost:  # a device without one answers with an error
