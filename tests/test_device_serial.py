@@ -157,6 +157,27 @@ def test_identify_is_right_within_its_intervals_on_a_hapkit_with_2_ms_of_latency
     assert fit.delay.least <= device.info.delay  # the sheet promises no less than there is
 
 
+def test_a_line_that_stalls_for_a_moment_is_no_jump_of_the_pose() -> None:
+    seam = SerialSeam(hapkit(**mechanics(0)), latency=1e-3)
+    device = opened(seam, speed_limit=0.5)
+    clock = DrivingClock(Stalling(seam))
+    try:
+        run = identify(device, clock, period=2e-3, axes=("x",), duration=6.0)
+    finally:
+        device.close()
+    assert run.fits["x"].mass.value == pytest.approx(mechanics(0)["mass"], rel=0.1)
+
+
+class Stalling(VirtualPort):
+    """A line that delivers nothing for 40 ms of every second."""
+
+    def advance(self, now: float) -> None:
+        self._seam.is_mute = now % 1.0 < 0.04
+        super().advance(now)
+
+    now = property(lambda self: self._seam.time, advance)
+
+
 def test_a_loop_twice_as_fast_as_the_board_is_told_to_be_slower() -> None:
     seam = SerialSeam(hapkit(**mechanics(0)))
     device, clock = opened(seam), DrivingClock(VirtualPort(seam))
@@ -244,6 +265,51 @@ def test_an_unplugged_or_silent_board_ends_the_run_and_closing_switches_it_off()
                 seam.advance(seam.time + 2e-3)
                 device.read(sample)
         device.close()
+
+
+def started() -> tuple[SerialSeam, RawHidDevice, Any]:
+    seam = SerialSeam(hapkit())
+    device = opened(seam)
+    device.start(2e-3)
+    return seam, device, seam.opened
+
+
+def test_a_frame_waits_for_the_one_before_and_only_the_newest_is_sent() -> None:
+    seam, device, port = started()
+    port.out_waiting = 64
+    for force in (1.0, 2.0):
+        device.write(np.array([force, 0, 0, 0, 0, 0]))
+    assert not seam.to_board
+    port.out_waiting = 0
+    device.write(np.array([3.0, 0, 0, 0, 0, 0]))
+    assert len(seam.to_board) == 1
+    seam.advance(seam.time + 2e-3)
+    assert seam.board.wrench[0] == pytest.approx(3.0)
+    device.close()
+
+
+def test_a_port_that_takes_no_bytes_ends_the_run_and_is_released() -> None:
+    seam, device, port = started()
+    port.out_waiting = 64
+    device.write(np.ones(6))
+    seam.advance(seam.time + 0.06)
+    with pytest.raises(DeviceLost, match="accepts no bytes any more; unplug it and plug it in"):
+        device.write(np.ones(6))
+    device.close()
+    assert (port.discarded, port.is_open) == (64, False)
+    _, device, port = started()
+    port.taken = 10
+    with pytest.raises(DeviceLost, match="accepts no bytes any more"):
+        device.write(np.ones(6))
+    device.close()
+
+
+def test_after_a_long_pause_the_pose_is_of_now_and_not_of_a_full_queue() -> None:
+    seam, device, _ = started()
+    seam.advance(seam.time + 0.3)
+    device.read(np.zeros(1, SAMPLE_DTYPE))
+    assert device.states.newest is not None
+    assert device.states.newest.time_us == pytest.approx(1e6 * seam.time, abs=5e3)
 
 
 # Ports of this machine, through pyserial

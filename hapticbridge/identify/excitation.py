@@ -131,7 +131,7 @@ def next_wrench(
         samples: The device's sample, ``SAMPLE_DTYPE``, shape (1,).
         past: Ring of displacements over the last ``SPAN``, shape (n, 6).
         tone: s of this tick.
-        ticks_passed: Periods since the last call.
+        ticks_passed: Periods since the last new sample.
         wrench: Output, shape (6,).
     """
     s = states[0]

@@ -128,18 +128,22 @@ def move_axis(
     s["amplitude"] = START_SHARE * allowance.force[index >= 3]
     compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
-    report_every, stale, place = max(round(1.0 / (_PROGRESS_RATE * period)), 1), 0, s["place"]
+    report_every, place = max(round(1.0 / (_PROGRESS_RATE * period)), 1), s["place"]
+    stale = since_new = 0
     try:
         for k in range(ticks):
             _, wakes[k], skipped = clock.wait()
-            is_new = not device.read(sample) & TickFlag.STALE_SAMPLE and not skipped
-            code = compute(state, sample, past, tones[k], 1 + skipped, wrench)
+            since_new += 1 + skipped
+            has_come = not device.read(sample) & TickFlag.STALE_SAMPLE
+            is_new = has_come and not skipped
+            code = compute(state, sample, past, tones[k], since_new, wrench)
             if code != OK:
                 raise IdentificationError(_fault_message(code, s))
             device.write(wrench)
             position[k] = place[index] if is_new else np.nan
             force[k] = wrench[index]
             stale += not is_new
+            since_new = 0 if has_come else since_new
             if progress is not None and k % report_every == 0:
                 progress(k / ticks)
     finally:

@@ -9,6 +9,9 @@ from emulated.rawhid_model import RawHid, crc
 from hapticbridge.device.driver import FoundDevice
 from hapticbridge.device.rawhid.serial import SerialPort, SystemPorts
 
+QUEUE = 4095
+"""Bytes that a terminal of Linux keeps."""
+
 STEP = 250e-6
 """Time in s between two looks at the board; its frames are late by less."""
 
@@ -26,11 +29,12 @@ class SerialSeam(SystemPorts):
     Attributes:
         now: In s.
         is_there: False once it was unplugged.
+        is_mute: True while the line delivers nothing, as in a stall of USB.
     """
 
     def __init__(self, board: RawHid, latency: float = 1e-3, baud: int = 1_000_000) -> None:
         self.board, self.latency, self.baud = board, latency, baud
-        self.time, self.is_there = 0.0, True
+        self.time, self.is_there, self.is_mute = 0.0, True, False
         self.to_host: deque[tuple[float, bytes]] = deque()
         self.to_board: deque[tuple[float, bytes]] = deque()
         self.opened: _Port | None = None
@@ -50,11 +54,11 @@ class SerialSeam(SystemPorts):
                 self.to_host.append((self.time + self.latency, report))
 
     def arrived(self) -> bytes:
-        """Returns what the host has received."""
+        """Returns what the host has received since the last call; a full queue loses the rest."""
         found = b""
-        while self.to_host and self.to_host[0][0] <= self.time:
+        while not self.is_mute and self.to_host and self.to_host[0][0] <= self.time:
             found += self.to_host.popleft()[1]
-        return found
+        return found[:QUEUE]
 
     # -- the ports of a machine ------------------------------------------------------------------
 
@@ -98,11 +102,10 @@ class VirtualPort:
 class _Port:
     """The open port, as pyserial gives it."""
 
-    out_waiting = 0
-
     def __init__(self, seam: SerialSeam, baud: int) -> None:
         self._seam, self.baudrate = seam, baud
         self._received, self.is_open = b"", True
+        self.out_waiting, self.taken, self.discarded = 0, 64, 0
 
     @property
     def in_waiting(self) -> int:
@@ -125,14 +128,14 @@ class _Port:
         assert struct.unpack_from("<H", frame, 62)[0] == crc(frame[:62])
         if self.baudrate == self._seam.baud:
             self._seam.to_board.append((self._seam.time + self._seam.latency, frame))
-        return len(data)
+        return min(len(data), self.taken)
 
     def reset_input_buffer(self) -> None:
         self._seam.arrived()
         self._received = b""
 
     def reset_output_buffer(self) -> None:
-        pass
+        self.discarded += self.out_waiting
 
     def close(self) -> None:
         self.is_open = False
