@@ -16,7 +16,7 @@ from hapticbridge.device import open_device
 from hapticbridge.device.driver import FoundDevice, ignore_message
 from hapticbridge.device.touch import device as touch
 from hapticbridge.device.touch.device import RealWaiting, TouchDevice, open_touch
-from hapticbridge.device.touch.hd import FILES
+from hapticbridge.device.touch.hd import FILES, Hd
 from hapticbridge.device.touch.servo import Servo
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -53,6 +53,39 @@ def test_a_touch_senses_six_axes_and_obeys_forces_on_three() -> None:
     device.close()
     assert not stub.force().any()
     assert (stub.call("enabled"), stub.call("closed")) == (0, 1)
+
+
+class Watched(Hd):
+    """The library, with the names of its functions in the order in which they are called."""
+
+    def __init__(self, stub: HdStub) -> None:
+        super().__init__(stub.file)
+        self.stub, self.names, self.force_at_disable = stub, [""], -1.0
+
+    def __getitem__(self, name: str) -> Any:
+        self.names.append(name)
+        if name == "hdDisable":
+            self.force_at_disable = float(np.abs(self.stub.force()).max())
+        return super().__getitem__(name)
+
+
+def test_motors_are_clamped_at_the_start_and_off_before_the_memory_goes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    at_exit: list[object] = []
+    monkeypatch.setattr("atexit.register", at_exit.append)
+    stub = HdStub()
+    stub.hd = hd = Watched(stub)
+    device = stub.opened()
+    assert at_exit == [device.close]  # a program that ends without closing it stops the thread
+    device.start(PERIOD)
+    assert stub.call("enabled") == 0b11  # force output and its clamping
+    ticks(device, stub, 20, WRENCH)
+    assert stub.force().any()
+    hd.names.clear()
+    device.close()
+    assert hd.force_at_disable == 0.0
+    assert hd.names == ["hdDisable", "hdStopScheduler", "hdUnschedule", "hdDisableDevice"]
 
 
 def test_position_and_orientation_are_those_of_the_library_in_axes_with_z_up() -> None:

@@ -107,6 +107,59 @@ def test_buttons_are_the_devices_own_in_order() -> None:
     assert read(device, model)[1]["buttons"] == 0b100
 
 
+class Guardian:
+    """The second process, as the driver sees it."""
+
+    def __init__(self) -> None:
+        self.told: list[object] = []
+
+    def expect(self, period: float) -> None:
+        self.told.append(period)
+
+    def beat(self, *, has_force: bool) -> None:
+        self.told.append(has_force)
+
+    def close(self) -> None:
+        self.told.append("closed")
+
+
+def test_a_second_process_is_told_of_every_torque_and_can_end_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, guardian = WheelModel(free()), Guardian()
+    guarded: list[Any] = []
+
+    def guard(*words: object) -> Guardian:
+        guarded.extend(words)
+        return guardian
+
+    monkeypatch.setattr(wheel, "Linux", lambda: model)
+    monkeypatch.setattr(wheel, "guard_device_node", guard)
+    device = open_wheel(SCALE)
+    device.start(PERIOD)
+    ticks(device, model, 2, TWIST)
+    ticks(device, model, 1, np.zeros(6))
+    ticks(device, model, 1, TWIST)
+    assert guardian.told == [PERIOD, True, True, False, True]
+    assert model.torque() != 0.0
+    path, *reports = guarded
+    assert path == PATH
+    for report in reports:  # as the second process writes them
+        model.write(40, report)
+    assert (model.torque(), model.gain) == (0.0, 0)
+    device.close()
+    assert guardian.told[-1] == "closed"
+
+
+def test_a_change_that_the_kernel_dropped_is_made_up_for_within_20_ms() -> None:
+    device, model = started()
+    ticks(device, model, 5, TWIST)
+    (effect,) = model.effects.values()
+    effect.level = 0
+    ticks(device, model, 21, TWIST)
+    assert model.torque() == pytest.approx(0.5, rel=1e-4)
+
+
 def test_what_the_kernel_lost_in_a_long_pause_is_asked_for() -> None:
     device, model = started(WheelModel(free(), buttons={0x120}))
     ticks(device, model, 3, TWIST)
