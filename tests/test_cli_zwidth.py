@@ -72,6 +72,9 @@ def test_a_device_is_closed_whatever_was_refused(
         closed.append(device)
 
     monkeypatch.setattr(SimulatedDevice, "close", close)
+    code, _, err = call("zwidth", "--measure", "mouse")
+    assert code == 2
+    assert "no force moves this device along x, y or z, so it has no walls to try" in err
     for wrong in ("--axis q", "--damping nan"):
         assert call(*f"zwidth --measure {FREE} {wrong}".split())[0] == 2
     assert len(closed) == 2

@@ -122,9 +122,13 @@ class Zwidth:
         here = [name for name in AXES[:3] if name in device.info.axes]
         if device.info.is_prescribed or axis not in here:
             checked_close(device)()
+            if device.info.is_prescribed or not here:
+                raise HapticBridgeError(
+                    f"--measure {spec}: no force moves this device along x, y or z, so it has no "
+                    "walls to try"
+                )
             raise HapticBridgeError(
-                f"--axis {axis}: the device moves by force along "
-                f"{choices([] if device.info.is_prescribed else here)}"
+                f"--axis {axis}: the device moves by force along {choices(here)}"
             )
         return device
 

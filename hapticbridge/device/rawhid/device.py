@@ -447,6 +447,7 @@ DRIVER = Driver(
     "to the protocol",
     has_guardian=True,
     usage=(0xFFAB, 0x0200),
+    products="a board of any vendor with the HID usage page ffab",
     document=DOCUMENT,
 )
 """Driver of home-made devices with Teensy's raw HID interface. Its second interface (usage page
