@@ -38,9 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock
-from hapticbridge.device.base import AXES, Device, DeviceInfo
+from hapticbridge.device.base import AXES, JUMP_MARGIN, Device, DeviceInfo
 from hapticbridge.errors import DeviceError
-from hapticbridge.guard import JUMP_MARGIN
 from hapticbridge.kernel.tick_guard import FARTHEST
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
