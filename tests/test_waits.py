@@ -90,8 +90,8 @@ REASONS = {
         "asyncio.wait_for in it"
     ),
     "compare.py: for line in stream": "no wait: records of a file",
-    "testing/device_contract.py: bench.clock.wait()": "until the next tick",
-    "testing/device_contract.py: self.clock.wait()": "until the next tick",
+    "testing/device_contract.py: bench.clock.wait()": "a clock's: at most one period",
+    "testing/device_contract.py: self.clock.wait()": "a clock's: at most one period",
 }
 """Ends of the waits without a time limit of their own. A new wait gets a limit, or a line here."""
 
