@@ -25,7 +25,12 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_close, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import refuse_implausible_pose, refuse_stretched_start, wait_until_still
+from hapticbridge.guard import (
+    refuse_implausible_pose,
+    refuse_stretched_start,
+    trip_remedy,
+    wait_until_still,
+)
 from hapticbridge.hands import DeviceGroup
 from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
@@ -605,10 +610,20 @@ class Session:
         return ""
 
     def trip(self, reason: str) -> SafetyTrip:
-        """Records a trip; returns its exception, which carries the records of the last second."""
+        """Records a trip; returns its exception, with the records of the last second and a remedy.
+
+        The remedy is a note of the exception. Its message is the bare reason, as in the recording.
+        """
         self.stopped_by = "trip"
         self.event("trip", reason=reason)
-        return SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
+        trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
+        work, created = (
+            float(trip.records[name][-1]) if len(trip.records) else 0.0
+            for name in ("actuator_work", "environment_energy")
+        )
+        if remedy := trip_remedy(reason, work, created):
+            trip.add_note(remedy)
+        return trip
 
     def event(self, event: str, **details: Any) -> None:
         """Records an event before the present tick."""

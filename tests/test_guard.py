@@ -233,8 +233,10 @@ def test_a_device_catches_up_after_a_silence_and_jumps_at_no_other_time(
 
     with hb.Bridge("point_mass", Link(), clock=hb.SimulatedClock()) as bridge:
         if is_refused:
-            with pytest.raises(hb.SafetyTrip, match="jumped farther"):
+            with pytest.raises(hb.SafetyTrip, match="jumped farther") as stopped:
                 bridge.run(0.5)
+            (remedy,) = stopped.value.__notes__
+            assert remedy.startswith("check the unit (m)")
         else:
             assert bridge.run(0.5).ticks == 500
             after = bridge.latest_records(500)[begin + silent : begin + silent + 10]

@@ -91,14 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sentence, code = stop_words(getattr(interrupt, "number", signal.SIGINT))
         print(sentence, file=sys.stderr)
     except SafetyTrip as trip:
-        from hapticbridge.guard import trip_remedy  # noqa: PLC0415 - imports numba
-
-        work, created = (
-            float(trip.records[name][-1]) if len(trip.records) else 0.0
-            for name in ("actuator_work", "environment_energy")
-        )
-        parts = str(trip), trip_remedy(str(trip), work, created)
-        code = _say("safety trip", "; ".join(filter(None, parts)), SAFETY_TRIP)
+        parts = str(trip), *getattr(trip, "__notes__", ())
+        code = _say("safety trip", "; ".join(parts), SAFETY_TRIP)
     except HapticBridgeError as error:
         code = _say("error", error)
     except BrokenPipeError:  # as in 'hapticbridge --help | head'
