@@ -374,7 +374,7 @@ class Summary:
             yield from self.conditions
         if self.is_certified is False and method_named(self.method).has_law:
             judge = "the audit" if self.recording else "with --record FILE the audit"
-            yield f"{judge} counts if the hand got energy; the run has only --energy-limit for it"
+            yield f"{judge} counts what the hand got; in a run only --energy-limit bounds it"
 
     @property
     def verdict(self) -> str:

@@ -19,6 +19,7 @@ from chromium import browser
 from PIL import Image
 from report_runs import Made
 
+import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
@@ -276,6 +277,20 @@ def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -
     still = [event for event in recording.events if event["event"] != "input"]
     assert cause_of(recording, report).kind == "inputs"
     assert cause_of(recording, report, events=still).kind == "contact setting"
+
+
+def test_a_joint_that_pumps_is_named_as_the_cause(tmp_path: Path) -> None:
+    path, scene = tmp_path / "run.mcap", tmp_path / "drawer.xml"
+    scene.write_text(
+        """<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0" damping="-30"/>
+        <geom size="0.02" mass="0.5"/><site name="grip"/></body></worldbody></mujoco>"""
+    )
+    device = ScriptedDevice(lambda tick: (1e-4 * min(tick, 20), 0, 0, 1, 0, 0, 0))
+    limits = hb.Limits(force=10.0, torque=0.5, energy=np.inf, stretch=np.inf)
+    recorded(path, str(scene), device, duration=0.1, limits=limits)
+    cause = cause_of(read_recording(path), audit(path))
+    assert cause.kind == "pump"
+    assert "joint 'rail' has a damping of -30" in cause.evidence
 
 
 def test_missed_deadlines_are_the_cause_where_the_device_bears_the_coupling(made: Made) -> None:

@@ -409,6 +409,9 @@ def test_a_trip_is_shown_beside_what_does_not_trip(tmp_path: Path) -> None:
     tripped = len(found.runs[0].ticks)
     # a softer spring is as long sooner
     assert len(found.runs[1].ticks) < tripped
+    stiffer = what_if(path, {"stiffness": 5000}).runs[1]  # goes on where the recorded run stopped
+    assert stiffer.report.verdict != "invalid"
+    assert len(stiffer.ticks) == tripped + 1
 
 
 def text_of(page: Path) -> str:

@@ -152,11 +152,12 @@ class Audit:
     what_if: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
     ] = ()
-    """Simulate the recorded hand again with this changed, as often as wanted: stiffness, damping,
-    rotational_stiffness, rotational_damping, method, rate, substeps, scene_rate, scale,
-    force_scale, contact_stiffness, controller, or a parameter of the scene; GRIP:stiffness and the
-    like for one of several hands. Twice: with the recorded motion, and, where the device is known,
-    with a model hand. --plot and --report show all runs side by side (one file only)."""
+    """Simulate the recorded hand again with this changed; several of them add up to one change.
+    NAME is stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
+    scene_rate, scale, force_scale, contact_stiffness, controller, or a parameter of the scene;
+    GRIP:stiffness and the like are of one of several hands. The change is simulated with the
+    recorded motion and, where the device is known, with a model hand that yields. --plot and
+    --report show all runs side by side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""

@@ -240,7 +240,7 @@ def print_faults(findings: tuple[Fault, ...]) -> None:
         out.print("\n[bold]What is wrong[/]\n  [green]nothing found[/]")
     if notes:
         out.print("\n[bold]Worth knowing[/]")
-        _print_findings(notes, "or")
+        _print_findings(notes, "to change it")
 
 
 def _print_findings(faults: list[Fault], lead: str) -> None:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Literal
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +34,15 @@ from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.contacts import check_contacts, geom_name
 
 Kind = Literal[
-    "method", "contact setting", "inputs", "delay", "rate", "damping", "quantisation", "unknown"
+    "method",
+    "contact setting",
+    "pump",
+    "inputs",
+    "delay",
+    "rate",
+    "damping",
+    "quantisation",
+    "unknown",
 ]
 
 WINDOW = 0.2
@@ -359,6 +368,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
+    if pump := _pumping_joint(evidence.model):
+        return Cause("pump", f"{pump}; {where}", "a damping of 0 or more there")
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
@@ -368,6 +379,15 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         return _method_cause(method, f"{where}, whose setting is as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
+
+
+def _pumping_joint(model: mujoco.MjModel | None) -> str:
+    """Returns a clause on the first joint that pushes what moves already; empty without one."""
+    if model is None or not np.any(model.dof_damping < 0.0):
+        return ""
+    dof = int(np.argmax(model.dof_damping < 0.0))
+    name, damping = model.joint(int(model.dof_jntid[dof])).name, float(model.dof_damping[dof])
+    return f"joint '{name}' has a damping of {damping:g}, and pushes what moves already"
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:

@@ -41,7 +41,8 @@ _STALE = int(TickFlag.STALE_SAMPLE)
 class RecordedClock:
     """Clock that replays the times of a recording.
 
-    Its device reports reading and writing.
+    Its device reports reading and writing. The tick that follows the recorded ones, in which a
+    guard stopped the run, comes a period after them.
     """
 
     name = SimulatedClock.name
@@ -54,6 +55,8 @@ class RecordedClock:
         skipped = np.where(late, np.maximum(between, 1), 0)
         columns = deadline, ticks["wake_ns"], skipped, ticks["read_ns"], ticks["write_ns"]
         self._rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        after = [int(column[-1]) + round(1e9 * period) for column in columns]
+        self._rows.append((after[0], after[1], 0, after[3], after[4]))
         self._tick, self._now = -1, 0
 
     def start(self, period_ns: int) -> None:
