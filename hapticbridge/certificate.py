@@ -298,7 +298,7 @@ class DampingCondition:
             return f"{text}; {self.remedy}"
         if self.delay is None:
             return f"{text}, if it answers without delay, which is unknown"
-        late = f", for a wall behind a delay of {self.delay} ticks: no bound holds for any scene"
+        late = f", for a wall; with a delay of {self.delay} ticks none suffices for every scene"
         return f"{text}{late}" if self.delay else text
 
 
