@@ -329,7 +329,7 @@ class Crooked(SimulatedDevice):
         ("period", "start(0.0) must raise DeviceError"),
         ("before", "read before start() must raise DeviceError"),
         ("none", "read() returned None; it must be 0, or TickFlag.STALE_SAMPLE"),
-        ("waits", "read() waits: more than 10% of the calls took over 0.5 ms; take what has arrived"),
+        ("waits", "read() waits: more than 10% of the calls took over 0.5 ms; take what"),
         ("waits to write", "write() waits: more than 10% of the calls took over 0.5 ms"),
         ("pushes on", "close() leaves the force on: write a zero force first"),
         ("real", "the motors of a real device must be seen: name them as check(device, force="),
