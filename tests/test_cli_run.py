@@ -101,6 +101,26 @@ def test_a_run_repeats_the_worst_faults_of_its_scene(
     assert all("arm.xml:" in line for line in told)
 
 
+RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
+<body name="block" pos="0 0 0.03">
+<freejoint/><geom type="box" size="0.02 0.02 0.03" mass="0.2"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+
+
+def test_one_damping_is_printed_before_the_run_after_it_and_by_the_audit(
+    call: Called, tmp_path: Path
+) -> None:
+    """A tool that is always near a contact meets B_law + K T instead; that is said beside it."""
+    scene, record = tmp_path / "block.xml", tmp_path / "block.mcap"
+    scene.write_text(RESTING)
+    _, out, err = call("run", scene, "--fast", "--duration", 0.1, "--record", record)
+    usual = "K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7"
+    assert f"{usual})\n" in err
+    held = f"{usual}, near contact or held, as here: 2.9)\n"
+    assert held in out
+    assert held in call("audit", record)[1]
+
+
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
     path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")
