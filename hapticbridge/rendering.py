@@ -274,8 +274,13 @@ class RunCoupling:
         def at_fingers(own: Coupling | None) -> Coupling | None:
             return own and Coupling(ratio * own.stiffness, ratio * own.damping, 0.0, 0.0)
 
-        of_tool = self.requested, self.law, self.effective, self.near_contact
-        return RunCoupling(*map(at_fingers, of_tool), remark="at the fingers")
+        return RunCoupling(
+            at_fingers(self.requested),
+            at_fingers(self.law),
+            at_fingers(self.effective),
+            at_fingers(self.near_contact),
+            "at the fingers",
+        )
 
     def sentences(self) -> tuple[str, ...]:
         """Returns a sentence on translation, and one on rotation if it has a spring.
