@@ -249,6 +249,12 @@ class Summary:
     device: str = ""
     hands: tuple[Summary, ...] = ()
 
+    def at(self, record: np.void) -> Summary:
+        """Returns the summary with the energies of a tick's record."""
+        names = record.dtype.names or ()
+        found = {name: float(record[name]) for name in self.energies if name in names}
+        return replace(self, energies=self.energies | found)
+
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
         """Returns the summary of a run of several hands; the rest is that of the first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import os
@@ -101,6 +102,17 @@ def test_a_run_repeats_the_worst_faults_of_its_scene(
     assert all("arm.xml:" in line for line in told)
 
 
+def test_warnings_of_a_run_are_in_its_audit_and_on_its_page(call: Called, tmp_path: Path) -> None:
+    scene, record, page = (tmp_path / name for name in ("arm.xml", "arm.mcap", "arm.html"))
+    scene.write_text(FELT_WRONG.format(turn='frictionloss="0.5"', reach=0.15, width=0.01))
+    _, _, err = call("run", scene, "--fast", "--duration", 0.01, "--record", record)
+    warning = next(line for line in err.splitlines() if "creeps by" in line)
+    sentence = warning.removeprefix("warning: ")
+    _, out, _ = call("audit", record, "--report", page, "--in-process")
+    assert f"the run warned: {sentence}" in out
+    assert f"The run warned: {sentence}." in html.unescape(page.read_text("utf-8"))
+
+
 RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body name="block" pos="0 0 0.03">
 <freejoint/><geom type="box" size="0.02 0.02 0.03" mass="0.2"/><site name="grip"/></body>
@@ -143,6 +155,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     scene, record = tmp_path / "driven.xml", tmp_path / "driven.mcap"
     scene.write_text(DRIVEN)
     code, out, err = call("run", scene, "--fast", "--duration", 0.2, "--record", record)
+    summary = out
     assert code == 3
     assert "most of it from motors, springs or parts of the scene" in err
     assert "this tool weighs" not in err
@@ -153,6 +166,10 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
     assert "no guarantee covers motors that push" in out
+    for energy in ("kinetic", "actuator work", "coupling work", "device energy"):
+        row = next(line for line in summary.splitlines() if line.startswith(energy))
+        assert f"{energy} {row.removeprefix(energy).strip()}" in out
+    assert "the tick that tripped is not among them" in out
     assert "what to change: the scene's motors did " in out
     scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))  # as the remedy says
     assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0

@@ -59,6 +59,7 @@ class AuditReport:
         max_net_energy: Largest energy in J that the hand had got beyond what it put in and what
             the device's damping burned; of several hands that of the one with most.
         events: Number of events of each kind.
+        findings: Faults of the scene of which the run warned, as sentences.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
         hands: Name of each hand's grip, if several hold the scene; else empty. The environment is
             judged over all of them, and each device by itself; ``certified`` is False if one lacks
@@ -90,6 +91,7 @@ class AuditReport:
     energies: dict[str, float] = field(default_factory=dict)
     max_net_energy: float = 0.0
     events: dict[str, int] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
     accepts_unverified: bool = False
     hands: tuple[str, ...] = ()
 

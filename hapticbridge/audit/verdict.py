@@ -252,6 +252,11 @@ def verdict_on(
         "is_trusted": signature.is_trusted,
         "ticks": recording.count,
         "events": _event_counts(recording),
+        "findings": tuple(
+            str(event.get("sentence", ""))[:MAX_FINDING]
+            for event in recording.events
+            if event.get("event") == "finding"
+        ),
         "certified": None,
         "accepts_unverified": accepts_unverified,
     }
@@ -480,6 +485,10 @@ def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
         outcome.tick,
         outcome.field,
     )
+
+
+MAX_FINDING = 500
+"""Largest number of characters of a recorded warning, which is read from a foreign file."""
 
 
 def _event_counts(recording: RecordingFile) -> dict[str, int]:

@@ -103,7 +103,7 @@ def print_what_if(found: WhatIf) -> None:
 SCENE_SIZE = 640, 400
 """Width and height of a page's picture in pixels. It takes 150 kB; a larger one delays the page."""
 
-_USUAL_EVENTS = ("start", "stop", "input")
+_USUAL_EVENTS = ("start", "stop", "input", "finding")
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,6 +310,8 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
+    for sentence in report.findings:
+        out.print(f"  [yellow]the run warned:[/yellow] {plain(sentence)}")
     kept = report.timekeeping
     for sentence in report.coupling_sentences:
         if ": K = " in f": {sentence}":  # of several hands, behind the hand's grip
@@ -335,7 +337,13 @@ def _print_report(report: AuditReport) -> None:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
     rate = f", {kept.remark}" if kept is not None and kept.remark else ""
-    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}")
+    unfinished = (
+        "; the tick that tripped is not among them: only the run's summary counts what the hand "
+        "got in it"
+        if "trip" in report.events
+        else ""
+    )
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
     energies = [
         f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
     ]

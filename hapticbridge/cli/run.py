@@ -198,11 +198,12 @@ MOST_FAULTS = 2
 """Number of a scene's faults that a run repeats."""
 
 
-def _warn_of_faults(source: SceneSource, scene: Scene) -> None:
-    """Prints the worst of what ``hapticbridge check`` finds without a motion."""
-    for fault in islice(worst_faults(source, scene), MOST_FAULTS):
-        told = f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
-        err.print(f"[yellow]warning:[/yellow] {plain(told)}")
+def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
+    """Returns the worst of what ``hapticbridge check`` finds without a motion."""
+    return tuple(
+        f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
+        for fault in islice(worst_faults(source, scene), MOST_FAULTS)
+    )
 
 
 HEAVY = 0.25
@@ -419,8 +420,7 @@ class Run:
             with err.status("trying the scene …"):
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
-                if not self.as_json:
-                    _warn_of_faults(source, scene)
+                self._warn_of_faults(source, scene)
                 chosen = (
                     self
                     if self.substeps is not None
@@ -437,10 +437,19 @@ class Run:
             elif joint:
                 grasp = self._grasp(self.grip, joint, device)
                 grasp = replace(grasp, clutch=self.clutch, dead_man=self.dead_man)
+                found = scene.findings
                 scene = compile_scene(source, grasp.grips, as_is=self.as_is, warns=False)
+                scene.findings = found
                 one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
                 return one._feel(scene, [grasp], clock, stack, window, interrupts)
             return chosen._feel(scene, device, clock, stack, window, interrupts)
+
+    def _warn_of_faults(self, source: SceneSource, scene: Scene) -> None:
+        """Prints the worst faults of the scene, and keeps them for the recording."""
+        scene.findings = _findings(source, scene)
+        if not self.as_json:
+            for sentence in scene.findings:
+                err.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
 
     def _refuse_grip_scale(self) -> None:
         if self.grip_scale is not None:
@@ -518,6 +527,7 @@ class Run:
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
         with err.status("trying the scene …"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
+            self._warn_of_faults(source, scene)
         grasps = []
         for grip, joint, name in held:
             own = scene.of_hand(grips.index(grip))
