@@ -6,7 +6,8 @@ import json
 import math
 import shlex
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -85,19 +86,42 @@ def print_what_if(found: WhatIf) -> None:
     """Prints what was changed, the runs side by side, and what to know of them."""
     for name, before, after in changes(found):
         out.print(plain(f"{name}: {before} -> {after}"))
-    table = TextTable(box=None, pad_edge=False)
-    table.add_column(plain(found.path.name))
-    for run in found.runs:
-        table.add_column(run.name)
-    for name, texts in rows(found):
-        table.add_row(name, *map(plain, texts))
-    out.print(table)
+    _print_runs(found)
     for run in found.runs[1:]:
         out.print(f"{run.name}: {RUN_WORDS[run.name]}")
         for text in (*sentences(run), *run.report.conditions):
             out.print(f"  {plain(text)}")
     for note in found.notes:
         err.print(f"note: {plain(note)}")
+
+
+def print_alternatives(found: Sequence[WhatIf]) -> None:
+    """Prints the recorded run beside one run of each change, and what to know of them.
+
+    It is the closed loop where there is one, else the run with the prescribed motion.
+    """
+    kind = found[0].runs[-1].name
+    runs = [found[0].runs[0]]
+    for each in found:
+        changed = ", ".join(f"{name} {after}" for name, _, after in changes(each))
+        runs.append(replace(each.runs[-1], name=changed))
+    _print_runs(replace(found[0], runs=tuple(runs)))
+    out.print(f"each column: {RUN_WORDS[kind]}")
+    for run in runs[1:]:
+        for text in sentences(run):
+            out.print(f"  {plain(f'{run.name}: {text}')}")
+    for note in dict.fromkeys(note for each in found for note in each.notes):
+        err.print(f"note: {plain(note)}")
+
+
+def _print_runs(found: WhatIf) -> None:
+    table = TextTable(box=None, pad_edge=False)
+    table.add_column(plain(found.path.name))
+    for run in found.runs:
+        table.add_column(plain(run.name))
+    for name, texts in rows(found):
+        table.add_row(name, *map(plain, texts))
+    out.print(table)
 
 
 SCENE_SIZE = 640, 400
@@ -120,6 +144,7 @@ class Audit:
         hapticbridge audit run.mcap --plot run.png
         hapticbridge audit runs/ --jobs 4 --table runs.parquet
         hapticbridge audit run.mcap --what-if stiffness=3000 --what-if rate=500
+        hapticbridge audit run.mcap --what-if stiffness=400,800,1600
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]
@@ -153,11 +178,12 @@ class Audit:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
     ] = ()
     """Simulate the recorded hand again with this changed; several of them add up to one change.
-    NAME is stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
+    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is
+    stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
     scene_rate, scale, force_scale, contact_stiffness, controller, or a parameter of the scene;
     GRIP:stiffness and the like are of one of several hands. The change is simulated with the
     recorded motion and, where the device is known, with a model hand that yields. --plot and
-    --report show all runs side by side (one file only)."""
+    --report show all runs of one change side by side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""
@@ -250,14 +276,27 @@ class Audit:
             print_written(self.table)
 
     def _ask(self, file: Path) -> int:
+        asked = changes_from(self.what_if)
+        if len(asked) > 1 and (self.plot or self.report):
+            raise RecordingError("--plot and --report show one change; give one value of each")
         with progress("what if") as show:
-            found = what_if(
-                file,
-                changes_from(self.what_if),
-                strict=self.strict,
-                in_process=self.in_process,
-                progress=show,
+            found, *others = (
+                what_if(
+                    file,
+                    changed,
+                    strict=self.strict,
+                    in_process=self.in_process,
+                    progress=show,
+                )
+                for changed in asked
             )
+        if others:
+            every = [found, *others]
+            if self.as_json:
+                out.print_json(json.dumps([json.loads(each.to_json()) for each in every]))
+            else:
+                print_alternatives(every)
+            return max(each.exit_code for each in every)
         if self.as_json:
             out.print_json(found.to_json())
         else:
