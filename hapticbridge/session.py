@@ -297,6 +297,7 @@ class Session:
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
+        self._start_potential = 0.0
         self.stopped_by = self.signal = ""
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
@@ -494,6 +495,8 @@ class Session:
         period = self.setup.period
         if duration is not None and (not np.isfinite(duration) or duration <= 0):
             raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
+        if not self.tick:
+            self._start_potential = float(self.kernel.state["energy"]["potential"][0])
         self._is_timed = duration is not None
         length = self.device.info.duration
         if duration is not None:
@@ -651,6 +654,7 @@ class Session:
             stopped_by=self.stopped_by,
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
+            start_potential=self._start_potential,
         )
         hands = [
             Summary.of(

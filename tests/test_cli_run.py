@@ -133,6 +133,29 @@ def test_one_damping_is_printed_before_the_run_after_it_and_by_the_audit(
     assert held in call("audit", record)[1]
 
 
+LIFTED = RESTING.replace("0 0 0.03", "0 0 {height}")
+
+
+def test_the_potential_is_told_as_its_change_since_the_start(call: Called, tmp_path: Path) -> None:
+    """Its zero is arbitrary: a scene that is built a metre higher has the same words."""
+    told = []
+    for height in (0.2, 1.2):
+        scene, record = tmp_path / f"{height}.xml", tmp_path / f"{height}.mcap"
+        scene.write_text(LIFTED.format(height=height))
+        hand = tmp_path / "hand.csv"
+        hand.write_text("t,x,y,z\n0,0,0,0\n0.2,0,0,0.01\n0.4,0,0,0.01\n")
+        asked = ("--device", f"trajectory:{hand}", "--record", record)
+        _, out, _ = call("run", scene, "--fast", *asked)
+        rows = [line.split()[-2:] for line in out.splitlines() if line.startswith("potential ch")]
+        told += rows
+        assert f"potential change {' '.join(rows[0])}" in call("audit", record)[1]
+    assert told[0] == told[1]
+    millijoules, unit = told[0]
+    assert unit == "mJ"
+    # m g h of 1 cm; the bridge carries the weight, so the tool does not sag
+    assert float(millijoules) == pytest.approx(1e3 * 0.2 * 9.81 * 0.01, rel=0.01)
+
+
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
     path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")

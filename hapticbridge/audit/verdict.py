@@ -43,7 +43,7 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import requested_of
+from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
 from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
 from hapticbridge.units import format_energy
@@ -398,6 +398,7 @@ def _fault_in_ticks(
     timings = [TimingTally(hand.run.parameters) for hand in hands]
     fault, facts["duration"] = _check_records(hands, energies, timings)
     facts["energies"] = _energies_of_hands(energies)
+    facts["start_potential"] = meta_start(hands[0].recording.meta, "start_potential")[0]
     facts["max_net_energy"] = max(each.max_net_energy for each in energies)
     for hand, own, timing in zip(hands, of_hands, timings, strict=True):
         own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))

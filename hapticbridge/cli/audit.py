@@ -35,7 +35,7 @@ from hapticbridge.report import check_page_name, plot_recording, telling_time, w
 from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep.results import Interrupted, Table
-from hapticbridge.units import format_energy
+from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
 from hapticbridge.whatif.what_if import RUN_WORDS
@@ -383,10 +383,7 @@ def _print_report(report: AuditReport) -> None:
         else ""
     )
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
-    energies = [
-        f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
-    ]
-    if energies:
+    if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
         out.print(f"  {', '.join(energies)}")
 
 
