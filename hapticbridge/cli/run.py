@@ -404,10 +404,9 @@ class Run:
         clock = SimulatedClock() if self.fast else RealClock()
         held = self._held()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
-        is_viewed = self.view or self.device.partition(":")[0] == "mouse"
-        if self.port is not None and not is_viewed:
+        if self.port is not None and not self._is_viewed:
             raise HapticBridgeError("--port without --view has no effect")
-        window = self._window() if is_viewed else None
+        window = self._window() if self._is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
@@ -443,6 +442,11 @@ class Run:
                 one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
                 return one._feel(scene, [grasp], clock, stack, window, interrupts)
             return chosen._feel(scene, device, clock, stack, window, interrupts)
+
+    @property
+    def _is_viewed(self) -> bool:
+        """True if a page shows the run, with its state; plain lines would repeat it every 2 s."""
+        return self.view or self.device.partition(":")[0] == "mouse"
 
     def _warn_of_faults(self, source: SceneSource, scene: Scene) -> None:
         """Prints the worst faults of the scene, and keeps them for the recording."""
@@ -619,22 +623,22 @@ class Run:
             summary = bridge.run(self._duration(bridge.device.info))
         except SafetyTrip:
             stack.close()
-            self._print(bridge.summary(), is_viewed=window is not None)
+            self._print(bridge.summary())
             raise
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
-        self._print(summary, is_viewed=window is not None)
+        self._print(summary)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
-    def _print(self, summary: Summary, *, is_viewed: bool) -> None:
+    def _print(self, summary: Summary) -> None:
         if self.as_json:
             print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
             return
         for line in str(summary).splitlines():
             out.print(plain(line))
-        if is_viewed and self.record is not None:
+        if self._is_viewed and self.record is not None:
             notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 
     def _duration(self, info: DeviceInfo) -> float | None:
@@ -679,7 +683,7 @@ class Run:
             dead_man=self.dead_man,
             mark=self.mark,
             tool_weight=self.tool_weight,
-            live=not self.as_json and (err.is_terminal or not self.fast),
+            live=not self.as_json and (err.is_terminal or not (self.fast or self._is_viewed)),
             realtime=self.realtime or None,
             sign=self.sign,
         )
