@@ -24,7 +24,7 @@ from hapticbridge.audit.batch import (
     worst_exit_code,
     write_audits,
 )
-from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress
+from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress, working
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.guard import trip_remedy
@@ -206,7 +206,7 @@ class Audit:
                 raise RecordingError("--trust judges the recording, --what-if other runs: one each")
             return self._ask(files[0])
         first = "the first audit on a machine compiles for up to a minute"
-        with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
+        with working(f"auditing {plain(str(files[0]))} ({first})"):
             report = audit(
                 files[0],
                 strict=self.strict,
@@ -279,7 +279,7 @@ class Audit:
         asked = changes_from(self.what_if)
         if len(asked) > 1 and (self.plot or self.report):
             raise RecordingError("--plot and --report show one change; give one value of each")
-        with progress("what if") as show:
+        with progress("simulating the changed runs") as show:
             found, *others = (
                 what_if(
                     file,
@@ -305,7 +305,7 @@ class Audit:
             draw_what_if(found, self.plot)
         if self.report is not None:
             before = found.runs[0]
-            with err.status("drawing …"):
+            with working("drawing"):
                 scene = self._scene_picture(before.recording, before.report)
                 write_what_if(found, self.report, scene)
         print_written(self.plot, self.report)
@@ -313,7 +313,7 @@ class Audit:
 
     def _draw(self, report: AuditReport) -> None:
         recording, *others = read_hands(report.path)
-        with err.status("drawing …"):
+        with working("drawing"):
             if self.plot is not None:
                 plot_recording(self.plot, recording, *others)
             if self.report is not None:
