@@ -28,7 +28,7 @@ from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import FREE_CAMERA, STATES
-from hapticbridge.kernel.codes import JOINT, added_actuators
+from hapticbridge.kernel.codes import JOINT, added_actuators, held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recorded_scene import bounds_for
@@ -165,6 +165,7 @@ class Stage:
             on_compiled()
         self.model = self._run.model
         _light(self.model)
+        tell_apart(self.model, *(own.grip for own in self._hands))
         self.data = mujoco.MjData(self.model)
         self._rest = _blocks_of(hands)
         self._block = next(self._rest)
@@ -319,6 +320,28 @@ def _light(model: mujoco.MjModel) -> None:
     if not model.nlight and is_usual:
         headlight.ambient[:] = HEADLIGHT_AMBIENT
         headlight.diffuse[:] = HEADLIGHT_DIFFUSE
+
+
+COLOURLESS = 0.5, 0.5, 0.5, 1.0
+"""MuJoCo's colour of a geom that the scene gives none: red, green, blue and opacity, 0 to 1."""
+
+TOOL_COLOUR, MOVING_COLOUR, FIXED_COLOUR = (0.8, 0.5, 0.25), (0.5, 0.65, 0.55), (0.6, 0.62, 0.65)
+"""Colours of colourless geoms on the tool, on other moving bodies and on fixed ones, 0 to 1.
+Without them, tool and floor are grey on grey."""
+
+
+def tell_apart(model: mujoco.MjModel, *grips: str) -> None:
+    """Colours the geoms to which the scene gives neither colour nor material.
+
+    ``grips`` are the names of what the hands hold. Only the drawing depends on the colours.
+    """
+    tools = [int(model.body_weldid[held_body(model, grip)]) for grip in grips]
+    for geom in range(model.ngeom):
+        if model.geom_matid[geom] >= 0 or not np.allclose(model.geom_rgba[geom], COLOURLESS):
+            continue
+        body = int(model.body_weldid[model.geom_bodyid[geom]])
+        moving = MOVING_COLOUR if body else FIXED_COLOUR
+        model.geom_rgba[geom, :3] = TOOL_COLOUR if body in tools else moving
 
 
 GLOW = 0.6

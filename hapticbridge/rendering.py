@@ -208,13 +208,16 @@ class RunCoupling:
             smaller than the requested B if the integration adds damping by itself. None without a
             coupling law.
         effective: K and B that a hand meets away from contact, to first order in the time step;
-            None if the method gives no number.
-        remark: Reason of an effective coupling that the method's name does not suggest, or empty.
+            None if the method gives no number. Known before a run, and equal after it.
+        near_contact: K and B of a lossless coupling that was implicit in each tick, because the
+            tool was always near a contact, or held by friction or a constraint; else None.
+        remark: Where K and B are meant, if not at the tool; or empty.
     """
 
     requested: Coupling | None
     law: Coupling | None
     effective: Coupling | None
+    near_contact: Coupling | None = None
     remark: str = ""
 
     @classmethod
@@ -238,8 +241,8 @@ class RunCoupling:
             requested: The requested coupling; None if unknown.
             law: K and B of the law; None computes it from ``requested``.
             measured: Effective coupling of a weld.
-            is_always_implicit: True if the tool of a lossless coupling is never free. The coupling
-                is then always implicit and adds the implicit form's damping.
+            is_always_implicit: True if a lossless coupling is implicit in every tick, because the
+                tool is never free or always near a contact. It then acts as ``implicit``.
         """
         if not method.has_law:
             return cls(requested, None, measured)
@@ -247,19 +250,15 @@ class RunCoupling:
             if requested is None:
                 raise HapticBridgeError("a coupling needs its requested or its law's gains")
             law = method.law_coupling(requested, timestep)
-        adds, remark = method.added_share, ""
-        if is_always_implicit and method.scheme == Scheme.MIDPOINT:
-            adds, remark = IMPLICIT_SHARE, "implicit in each tick, because the tool is never free"
-        if adds is None:
+        if method.added_share is None:
             return cls(requested, law, None)
-        effective = replace(
+        is_implicit = is_always_implicit and method.scheme == Scheme.MIDPOINT
+        return cls(
+            requested,
             law,
-            damping=effective_damping(law.stiffness, law.damping, timestep, adds),
-            rotational_damping=effective_damping(
-                law.rotational_stiffness, law.rotational_damping, timestep, adds
-            ),
+            _acting(law, timestep, method.added_share),
+            _acting(law, timestep, IMPLICIT_SHARE) if is_implicit else None,
         )
-        return cls(requested, law, effective, remark)
 
     def felt_at(self, grip: str, scale: float, force_scale: float) -> RunCoupling:
         """Returns the coupling as a hand feels it: for a joint, at the fingers in N/m and N s/m.
@@ -275,8 +274,13 @@ class RunCoupling:
         def at_fingers(own: Coupling | None) -> Coupling | None:
             return own and Coupling(ratio * own.stiffness, ratio * own.damping, 0.0, 0.0)
 
-        requested, law, effective = map(at_fingers, (self.requested, self.law, self.effective))
-        return RunCoupling(requested, law, effective, "at the fingers")
+        return RunCoupling(
+            at_fingers(self.requested),
+            at_fingers(self.law),
+            at_fingers(self.effective),
+            at_fingers(self.near_contact),
+            "at the fingers",
+        )
 
     def sentences(self) -> tuple[str, ...]:
         """Returns a sentence on translation, and one on rotation if it has a spring.
@@ -285,6 +289,7 @@ class RunCoupling:
         coupling the next name comes first.
         """
         named = {name: getattr(self, name) for name in ("effective", "law", "requested")}
+        named["near contact or held, as here:"] = self.near_contact
         known = {name: coupling for name, coupling in named.items() if coupling is not None}
         if not known:
             return ()
@@ -296,6 +301,18 @@ class RunCoupling:
             for symbols in (_TRANSLATION, _ROTATION)
             if getattr(known[first], symbols[0]) > 0
         )
+
+
+def _acting(law: Coupling, timestep: float, share: float) -> Coupling:
+    """Returns the law's coupling with the damping that its integration adds."""
+    damping, rotational = (
+        effective_damping(stiffness, damping, timestep, share)
+        for stiffness, damping in (
+            (law.stiffness, law.damping),
+            (law.rotational_stiffness, law.rotational_damping),
+        )
+    )
+    return replace(law, damping=damping, rotational_damping=rotational)
 
 
 _TRANSLATION = "stiffness", "damping", "K", "B", "N/m", "N s/m"

@@ -297,7 +297,9 @@ class Session:
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
+        self._start_potential = 0.0
         self.stopped_by = self.signal = ""
+        self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
         self.slow: SlowScene | None = None
@@ -354,8 +356,7 @@ class Session:
         bound = self.kernel.bound
         self._refuse_stretched_start()
         if self.stream.is_read:
-            self.stream.start(self._description(), attachments(scene))
-            self.event("start")
+            self._start_stream()
         if self.output.observer is not None:
             self.commands.warm_up()
         self._applier = EventApplier(
@@ -473,6 +474,13 @@ class Session:
             stacklevel=2,
         )
 
+    def _start_stream(self) -> None:
+        scene = self.setup.scene
+        self.stream.start(self._description(), attachments(scene))
+        self.event("start")
+        for sentence in scene.findings:
+            self.event("finding", sentence=sentence)
+
     def _close_stream(self) -> None:
         """Finishes the recording, or removes it if start-up failed or a signal came before."""
         is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
@@ -487,6 +495,8 @@ class Session:
         period = self.setup.period
         if duration is not None and (not np.isfinite(duration) or duration <= 0):
             raise HapticBridgeError(f"duration is {duration!r} s; it must be finite and > 0")
+        if not self.tick:
+            self._start_potential = float(self.kernel.state["energy"]["potential"][0])
         self._is_timed = duration is not None
         length = self.device.info.duration
         if duration is not None:
@@ -499,6 +509,7 @@ class Session:
             (self.kernel.hands or self.kernel.bound).resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
+        self._before_trip = np.empty(0, TICK_DTYPE)
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
         self.kernel.is_ahead = (
@@ -616,6 +627,7 @@ class Session:
         """
         self.stopped_by = "trip"
         self.event("trip", reason=reason)
+        self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
         trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
         work, created = (
             float(trip.records[name][-1]) if len(trip.records) else 0.0
@@ -642,8 +654,9 @@ class Session:
             stopped_by=self.stopped_by,
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
+            start_potential=self._start_potential,
         )
-        first, *others = (
+        hands = [
             Summary.of(
                 self.kernel.state[hand : hand + 1],
                 self.hand_parameters[hand],
@@ -653,5 +666,8 @@ class Session:
                 outcome,
             )
             for hand, setup in enumerate(self._setups)
-        )
+        ]
+        if len(self._before_trip):  # the tick that tripped is half done and not recorded
+            hands = [each.at(at) for each, at in zip(hands, self._before_trip, strict=True)]
+        first, *others = hands
         return Summary.of_hands((first, *others)) if others else first

@@ -27,7 +27,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
 from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
-from hapticbridge.units import format_energy, format_share, format_si, format_wrenches
+from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
 
@@ -147,6 +147,7 @@ class RunOutcome:
             ``Bridge.stop``.
         recording: The recording, or None.
         is_realtime: True if real time was requested from the system.
+        start_potential: Potential energy in J before the first tick.
     """
 
     ticks: int
@@ -156,6 +157,7 @@ class RunOutcome:
     stopped_by: str
     recording: Path | None
     is_realtime: bool
+    start_potential: float
 
 
 WELD = "the weld in its stiffest directions at the start"
@@ -213,6 +215,7 @@ class Summary:
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
         max_net_energy: Largest energy in J that the hand had got beyond what it put in and what the
             device's damping burned; 0 without a hand.
+        start_potential: Potential energy in J before the first tick; its zero is arbitrary.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
@@ -245,9 +248,16 @@ class Summary:
     reach: float | None
     has_hand: bool
     max_net_energy: float = 0.0
+    start_potential: float = 0.0
     grip: str = ""
     device: str = ""
     hands: tuple[Summary, ...] = ()
+
+    def at(self, record: np.void) -> Summary:
+        """Returns the summary with the energies of a tick's record."""
+        names = record.dtype.names or ()
+        found = {name: float(record[name]) for name in self.energies if name in names}
+        return replace(self, energies=self.energies | found)
 
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
@@ -343,9 +353,7 @@ class Summary:
         yield "peak", peak + reached
         if self.reach is not None:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
-        for name, joules in self.energies.items():
-            if joules:  # exactly 0 without motors or springs
-                yield name.replace("_", " "), format_energy(joules)
+        yield from energy_rows(self.energies, self.start_potential)
         if self.max_net_energy > INSTANT:
             yield "net to the hand", f"{format_energy(self.max_net_energy)} at most, {self._origin}"
 
@@ -450,6 +458,7 @@ class Summary:
             max_net_energy=0.0
             if info.is_prescribed
             else float(state["observer"]["max_guarded_energy"][0]),
+            start_potential=outcome.start_potential,
             grip=parameters.grip,
             device=info.name,
         )

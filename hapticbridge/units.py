@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 
 _PREFIXES = (
     (1e6, "M"),
@@ -63,6 +64,27 @@ def format_share(share: float) -> str:
 def format_energy(joules: float) -> str:
     """Formats an energy; below 1 pJ is the rounding of the sums, which counts as 0."""
     return format_si(joules if abs(joules) >= ROUNDING else 0.0, "J")
+
+
+def shown_energies(energies: Mapping[str, float], start_potential: float) -> dict[str, float]:
+    """Returns energies in J under the names that are printed.
+
+    The potential has an arbitrary zero, so its change since the start of the run is shown.
+    """
+    shown = {}
+    for name, joules in energies.items():
+        if name == "potential":
+            shown["potential change"] = joules - start_potential
+        else:
+            shown[name.replace("_", " ")] = joules
+    return shown
+
+
+def energy_rows(energies: Mapping[str, float], start_potential: float) -> Iterator[tuple[str, str]]:
+    """Yields name and text of each energy that is not exactly 0, as one without motors is."""
+    for name, joules in shown_energies(energies, start_potential).items():
+        if joules:
+            yield name, format_energy(joules)
 
 
 ROUNDING = 1e-12

@@ -168,6 +168,14 @@ def test_line_of_growth_is_the_planted_one_where_rare_counts_are_left_out() -> N
     assert [step[:2] for step in growth.steps] == [(0, 100), (3, 40), (6, 20)]
     assert growth.base == pytest.approx(4e-6)
     assert growth.per_one == pytest.approx(0.5e-6)
+    assert growth.is_measurable
+
+
+@pytest.mark.parametrize("per_one", [-3.2e-17, 0.0, 2e-9])
+def test_a_growth_within_the_noise_is_none(per_one: float) -> None:
+    """A falling line would be told as a negative time per row."""
+    counts = np.repeat([0, 3, 6], 40)
+    assert not costs.growth_of(counts, 4e-6 + per_one * counts).is_measurable
 
 
 def test_motion_that_ends_in_nothing_finite_is_an_error() -> None:

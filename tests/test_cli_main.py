@@ -19,7 +19,7 @@ import mujoco
 import pytest
 from cli_cases import Called, one_sentence
 
-from hapticbridge.cli import main
+from hapticbridge.cli import main, terminal
 from hapticbridge.cli.main import COMMANDS, command_class
 from hapticbridge.signals import StopSignal, interrupting_on_signals, leaving_on_signals
 
@@ -300,3 +300,21 @@ def test_a_signal_that_a_library_swallowed_comes_again(monkeypatch: pytest.Monke
         with contextlib.suppress(StopSignal):
             signal.raise_signal(signal.SIGTERM)
         threading.Event().wait(60.0)
+
+
+def test_long_work_is_named_once_where_nothing_is_animated(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines, has_told = list[str](), threading.Event()
+
+    def note(words: str) -> None:
+        lines.append(words)
+        has_told.set()
+
+    monkeypatch.setattr(terminal.err, "print", note)
+    monkeypatch.setattr(terminal, "SILENCE", 0.0)
+    with terminal.working("drawing"):
+        assert has_told.wait(60.0)
+    assert lines == ["drawing …"]
+    monkeypatch.setattr(terminal, "SILENCE", 1e6)
+    with terminal.progress("judging"):
+        pass
+    assert lines == ["drawing …"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 import os
@@ -101,6 +102,60 @@ def test_a_run_repeats_the_worst_faults_of_its_scene(
     assert all("arm.xml:" in line for line in told)
 
 
+def test_warnings_of_a_run_are_in_its_audit_and_on_its_page(call: Called, tmp_path: Path) -> None:
+    scene, record, page = (tmp_path / name for name in ("arm.xml", "arm.mcap", "arm.html"))
+    scene.write_text(FELT_WRONG.format(turn='frictionloss="0.5"', reach=0.15, width=0.01))
+    _, _, err = call("run", scene, "--fast", "--duration", 0.01, "--record", record)
+    warning = next(line for line in err.splitlines() if "creeps by" in line)
+    sentence = warning.removeprefix("warning: ")
+    _, out, _ = call("audit", record, "--report", page, "--in-process")
+    assert f"the run warned: {sentence}" in out
+    assert f"The run warned: {sentence}." in html.unescape(page.read_text("utf-8"))
+
+
+RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
+<body name="block" pos="0 0 0.03">
+<freejoint/><geom type="box" size="0.02 0.02 0.03" mass="0.2"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+
+
+def test_one_damping_is_printed_before_the_run_after_it_and_by_the_audit(
+    call: Called, tmp_path: Path
+) -> None:
+    """A tool that is always near a contact meets B_law + K T instead; that is said beside it."""
+    scene, record = tmp_path / "block.xml", tmp_path / "block.mcap"
+    scene.write_text(RESTING)
+    _, out, err = call("run", scene, "--fast", "--duration", 0.1, "--record", record)
+    usual = "K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7"
+    assert f"{usual})\n" in err
+    held = f"{usual}, near contact or held, as here: 2.9)\n"
+    assert held in out
+    assert held in call("audit", record)[1]
+
+
+LIFTED = RESTING.replace("0 0 0.03", "0 0 {height}")
+
+
+def test_the_potential_is_told_as_its_change_since_the_start(call: Called, tmp_path: Path) -> None:
+    """Its zero is arbitrary: a scene that is built a metre higher has the same words."""
+    told = []
+    for height in (0.2, 1.2):
+        scene, record = tmp_path / f"{height}.xml", tmp_path / f"{height}.mcap"
+        scene.write_text(LIFTED.format(height=height))
+        hand = tmp_path / "hand.csv"
+        hand.write_text("t,x,y,z\n0,0,0,0\n0.2,0,0,0.01\n0.4,0,0,0.01\n")
+        asked = ("--device", f"trajectory:{hand}", "--record", record)
+        _, out, _ = call("run", scene, "--fast", *asked)
+        rows = [line.split()[-2:] for line in out.splitlines() if line.startswith("potential ch")]
+        told += rows
+        assert f"potential change {' '.join(rows[0])}" in call("audit", record)[1]
+    assert told[0] == told[1]
+    millijoules, unit = told[0]
+    assert unit == "mJ"
+    # m g h of 1 cm; the bridge carries the weight, so the tool does not sag
+    assert float(millijoules) == pytest.approx(1e3 * 0.2 * 9.81 * 0.01, rel=0.01)
+
+
 def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> None:
     path = tmp_path / "millimetres.csv"
     path.write_text("t,x,y,z\n0,0,0,0\n0.1,50,0,0\n")
@@ -123,6 +178,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     scene, record = tmp_path / "driven.xml", tmp_path / "driven.mcap"
     scene.write_text(DRIVEN)
     code, out, err = call("run", scene, "--fast", "--duration", 0.2, "--record", record)
+    summary = out
     assert code == 3
     assert "most of it from motors, springs or parts of the scene" in err
     assert "this tool weighs" not in err
@@ -133,6 +189,10 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
     assert "no guarantee covers motors that push" in out
+    for energy in ("kinetic", "actuator work", "coupling work", "device energy"):
+        row = next(line for line in summary.splitlines() if line.startswith(energy))
+        assert f"{energy} {row.removeprefix(energy).strip()}" in out
+    assert "the tick that tripped is not among them" in out
     assert "what to change: the scene's motors did " in out
     scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))  # as the remedy says
     assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0

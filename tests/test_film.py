@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import threading
 import time
@@ -104,6 +105,19 @@ def test_a_scene_without_a_light_is_lit_and_one_with_its_own_stays(
 
     assert floor(dark, "dark") > 180, "MuJoCo's own headlight gives 141"
     assert floor(chosen, "chosen") < 60, "a headlight that the file sets is the author's"
+
+
+def test_tool_and_fixture_of_a_scene_without_colours_are_told_apart(
+    sway: Path, tmp_path: Path
+) -> None:
+    scene, record, picture = (tmp_path / f"grey.{ending}" for ending in ("xml", "mcap", "png"))
+    scene.write_text(re.sub(' rgba="[^"]*"', "", SCENE))
+    recorded(record, str(scene), f"trajectory:{sway.parent / 'hand.csv'}")
+    drawn_or_skip(record, picture, Shot(at=0.0, camera="above", width=160, height=120))
+    pixels = np.asarray(Image.open(picture).convert("RGB"), dtype=float)
+    warmth = pixels[..., 0] - pixels[..., 2]  # red beyond blue; MuJoCo's grey has none
+    assert np.median(warmth[20:30, 110:120]) < 0, "the floor is a cool grey"
+    assert warmth.max() > 40, "the tool is copper"
 
 
 # imageio-ffmpeg leaves its pipes to the garbage collector

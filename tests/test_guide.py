@@ -162,7 +162,8 @@ def test_the_command_lists_topics_and_prints_a_page(call: Called) -> None:
     ("topic", "advice"),
     [
         ("passiv", "did you mean 'passivity'"),
-        ("../../etc", "'hapticbridge guide' lists the topics"),
+        ("tank", "the word is in 'glossary', "),
+        ("../../etc", "choose one of 'active-verdict', "),
     ],
 )
 def test_a_wrong_topic_is_one_sentence(call: Called, topic: str, advice: str) -> None:

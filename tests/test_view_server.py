@@ -127,6 +127,7 @@ def test_every_answer_forbids_frames_foreign_scripts_and_addresses(
             nonce = policy["script-src"].split("'")[1].removeprefix("nonce-")
             nonces.add(nonce)
             assert body.count(nonce) == 2
+            assert "Loading the scene" in body  # until viser's scripts draw the page
             assert policy["script-src"] == f"'nonce-{nonce}' 'wasm-unsafe-eval'"
             assert policy["connect-src"] == f"'self' ws://127.0.0.1:{port} data: blob:"
             assert policy["frame-ancestors"] == policy["base-uri"] == "'none'"

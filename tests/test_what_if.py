@@ -30,6 +30,7 @@ from hapticbridge.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene import load_scene
+from hapticbridge.units import format_si
 from hapticbridge.whatif import WhatIf, WhatIfRun, what_if, write_what_if
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import Repetition, intended
@@ -430,3 +431,23 @@ def test_the_page_of_a_run_made_active_has_a_likely_cause_for_each(tmp_path: Pat
     for run in found.runs:
         is_active = run.report.verdict == "active"
         assert (f"<h2>The moment ({run.name})</h2>" in text) is is_active
+
+
+def test_several_values_of_a_setting_stand_side_by_side(wall: Path, call: Called) -> None:
+    asked = ("audit", wall, "--in-process", "--what-if", "stiffness=500,900")
+    code, out, _ = call(*asked, "--what-if", "damping=0.7")
+    assert code == 0
+    assert "stiffness 500" in out
+    assert "stiffness 900" in out
+    alone = [
+        what_if(wall, {"stiffness": k, "damping": 0.7}, in_process=True).runs[-1]
+        for k in (500, 900)
+    ]
+    for run in alone:
+        assert format_si(run.peaks["force on tool"], "N") in out
+    code, _, err = call("audit", wall, "--what-if", "stiffness=5,9", "--what-if", "damping=1,2")
+    assert (code, "one setting at a time" in err) == (2, True)
+    code, _, err = call(
+        "audit", wall, "--what-if", "stiffness=5,9", "--plot", wall.with_name("a.png")
+    )
+    assert (code, "show one change" in err) == (2, True)

@@ -56,9 +56,11 @@ class AuditReport:
             that the run kept, 1 − needed / b over the kinds of axis. It is negative if more is
             needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
+        start_potential: Potential energy before the first tick in J; its zero is arbitrary.
         max_net_energy: Largest energy in J that the hand had got beyond what it put in and what
             the device's damping burned; of several hands that of the one with most.
         events: Number of events of each kind.
+        findings: Faults of the scene of which the run warned, as sentences.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
         hands: Name of each hand's grip, if several hold the scene; else empty. The environment is
             judged over all of them, and each device by itself; ``certified`` is False if one lacks
@@ -88,8 +90,10 @@ class AuditReport:
     timekeeping: Timekeeping | None = None
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
+    start_potential: float = 0.0
     max_net_energy: float = 0.0
     events: dict[str, int] = field(default_factory=dict)
+    findings: tuple[str, ...] = ()
     accepts_unverified: bool = False
     hands: tuple[str, ...] = ()
 

@@ -43,7 +43,7 @@ from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import requested_of
+from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
 from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
 from hapticbridge.units import format_energy
@@ -252,6 +252,11 @@ def verdict_on(
         "is_trusted": signature.is_trusted,
         "ticks": recording.count,
         "events": _event_counts(recording),
+        "findings": tuple(
+            str(event.get("sentence", ""))[:MAX_FINDING]
+            for event in recording.events
+            if event.get("event") == "finding"
+        ),
         "certified": None,
         "accepts_unverified": accepts_unverified,
     }
@@ -393,6 +398,7 @@ def _fault_in_ticks(
     timings = [TimingTally(hand.run.parameters) for hand in hands]
     fault, facts["duration"] = _check_records(hands, energies, timings)
     facts["energies"] = _energies_of_hands(energies)
+    facts["start_potential"] = meta_start(hands[0].recording.meta, "start_potential")[0]
     facts["max_net_energy"] = max(each.max_net_energy for each in energies)
     for hand, own, timing in zip(hands, of_hands, timings, strict=True):
         own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
@@ -480,6 +486,10 @@ def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
         outcome.tick,
         outcome.field,
     )
+
+
+MAX_FINDING = 500
+"""Largest number of characters of a recorded warning, which is read from a foreign file."""
 
 
 def _event_counts(recording: RecordingFile) -> dict[str, int]:

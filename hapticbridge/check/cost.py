@@ -63,6 +63,11 @@ class TimingStats:
         return cls(int(times.size), float(np.median(times)), float(np.percentile(times, 99)))
 
 
+NOISE = 0.02
+"""Share of a tick's time below which a difference is the machine's, no unit. A falling line of
+medians would else be told as a negative growth."""
+
+
 @dataclass(frozen=True, slots=True)
 class Growth:
     """Growth of the tick's time with the number of constraint rows or contacts.
@@ -77,6 +82,14 @@ class Growth:
     steps: tuple[tuple[int, int, float], ...]
     base: float | None
     per_one: float | None
+
+    @property
+    def is_measurable(self) -> bool:
+        """True if the times rise by more than ``NOISE`` from the lowest to the highest count."""
+        if self.per_one is None:
+            return False
+        first, last = self.steps[0][0], self.steps[-1][0]
+        return self.per_one * (last - first) > NOISE * self.steps[-1][2]
 
 
 def growth_of(counts: NDArray[np.int64], times: NDArray[np.float64]) -> Growth:
@@ -334,7 +347,9 @@ def draw_cost(cost: Cost, title: str) -> Figure:
             ends,
             [1e6 * (base + per_one * rows) for rows in ends],
             color=_LINE,
-            label=f"{1e6 * base:.3g} µs + {1e6 * per_one:.2g} µs per row",
+            label=f"{1e6 * base:.3g} µs + {1e6 * per_one:.2g} µs per row"
+            if cost.by_rows.is_measurable
+            else "no growth that can be measured",
         )
     growth.set_xlabel("constraint rows in the tick")
     growth.set_ylabel("median time per tick in µs")

@@ -6,7 +6,8 @@ import json
 import math
 import shlex
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +24,7 @@ from hapticbridge.audit.batch import (
     worst_exit_code,
     write_audits,
 )
-from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress
+from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress, working
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, still
 from hapticbridge.guard import trip_remedy
@@ -34,7 +35,7 @@ from hapticbridge.report import check_page_name, plot_recording, telling_time, w
 from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep.results import Interrupted, Table
-from hapticbridge.units import format_energy
+from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
 from hapticbridge.whatif.what_if import RUN_WORDS
@@ -85,13 +86,7 @@ def print_what_if(found: WhatIf) -> None:
     """Prints what was changed, the runs side by side, and what to know of them."""
     for name, before, after in changes(found):
         out.print(plain(f"{name}: {before} -> {after}"))
-    table = TextTable(box=None, pad_edge=False)
-    table.add_column(plain(found.path.name))
-    for run in found.runs:
-        table.add_column(run.name)
-    for name, texts in rows(found):
-        table.add_row(name, *map(plain, texts))
-    out.print(table)
+    _print_runs(found)
     for run in found.runs[1:]:
         out.print(f"{run.name}: {RUN_WORDS[run.name]}")
         for text in (*sentences(run), *run.report.conditions):
@@ -100,10 +95,39 @@ def print_what_if(found: WhatIf) -> None:
         err.print(f"note: {plain(note)}")
 
 
+def print_alternatives(found: Sequence[WhatIf]) -> None:
+    """Prints the recorded run beside one run of each change, and what to know of them.
+
+    It is the closed loop where there is one, else the run with the prescribed motion.
+    """
+    kind = found[0].runs[-1].name
+    runs = [found[0].runs[0]]
+    for each in found:
+        changed = ", ".join(f"{name} {after}" for name, _, after in changes(each))
+        runs.append(replace(each.runs[-1], name=changed))
+    _print_runs(replace(found[0], runs=tuple(runs)))
+    out.print(f"each column: {RUN_WORDS[kind]}")
+    for run in runs[1:]:
+        for text in sentences(run):
+            out.print(f"  {plain(f'{run.name}: {text}')}")
+    for note in dict.fromkeys(note for each in found for note in each.notes):
+        err.print(f"note: {plain(note)}")
+
+
+def _print_runs(found: WhatIf) -> None:
+    table = TextTable(box=None, pad_edge=False)
+    table.add_column(plain(found.path.name))
+    for run in found.runs:
+        table.add_column(plain(run.name))
+    for name, texts in rows(found):
+        table.add_row(name, *map(plain, texts))
+    out.print(table)
+
+
 SCENE_SIZE = 640, 400
 """Width and height of a page's picture in pixels. It takes 150 kB; a larger one delays the page."""
 
-_USUAL_EVENTS = ("start", "stop", "input")
+_USUAL_EVENTS = ("start", "stop", "input", "finding")
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +144,7 @@ class Audit:
         hapticbridge audit run.mcap --plot run.png
         hapticbridge audit runs/ --jobs 4 --table runs.parquet
         hapticbridge audit run.mcap --what-if stiffness=3000 --what-if rate=500
+        hapticbridge audit run.mcap --what-if stiffness=400,800,1600
     """
 
     files: tyro.conf.Positional[tuple[Path, ...]]
@@ -153,11 +178,12 @@ class Audit:
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
     ] = ()
     """Simulate the recorded hand again with this changed; several of them add up to one change.
-    NAME is stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
+    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is
+    stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
     scene_rate, scale, force_scale, contact_stiffness, controller, or a parameter of the scene;
     GRIP:stiffness and the like are of one of several hands. The change is simulated with the
     recorded motion and, where the device is known, with a model hand that yields. --plot and
-    --report show all runs side by side (one file only)."""
+    --report show all runs of one change side by side (one file only)."""
 
     def execute(self) -> int:
         """Audits; returns the exit code."""
@@ -180,7 +206,7 @@ class Audit:
                 raise RecordingError("--trust judges the recording, --what-if other runs: one each")
             return self._ask(files[0])
         first = "the first audit on a machine compiles for up to a minute"
-        with err.status(f"auditing {plain(str(files[0]))} ({first}) …"):
+        with working(f"auditing {plain(str(files[0]))} ({first})"):
             report = audit(
                 files[0],
                 strict=self.strict,
@@ -250,14 +276,27 @@ class Audit:
             print_written(self.table)
 
     def _ask(self, file: Path) -> int:
-        with progress("what if") as show:
-            found = what_if(
-                file,
-                changes_from(self.what_if),
-                strict=self.strict,
-                in_process=self.in_process,
-                progress=show,
+        asked = changes_from(self.what_if)
+        if len(asked) > 1 and (self.plot or self.report):
+            raise RecordingError("--plot and --report show one change; give one value of each")
+        with progress("simulating the changed runs") as show:
+            found, *others = (
+                what_if(
+                    file,
+                    changed,
+                    strict=self.strict,
+                    in_process=self.in_process,
+                    progress=show,
+                )
+                for changed in asked
             )
+        if others:
+            every = [found, *others]
+            if self.as_json:
+                out.print_json(json.dumps([json.loads(each.to_json()) for each in every]))
+            else:
+                print_alternatives(every)
+            return max(each.exit_code for each in every)
         if self.as_json:
             out.print_json(found.to_json())
         else:
@@ -266,7 +305,7 @@ class Audit:
             draw_what_if(found, self.plot)
         if self.report is not None:
             before = found.runs[0]
-            with err.status("drawing …"):
+            with working("drawing"):
                 scene = self._scene_picture(before.recording, before.report)
                 write_what_if(found, self.report, scene)
         print_written(self.plot, self.report)
@@ -274,7 +313,7 @@ class Audit:
 
     def _draw(self, report: AuditReport) -> None:
         recording, *others = read_hands(report.path)
-        with err.status("drawing …"):
+        with working("drawing"):
             if self.plot is not None:
                 plot_recording(self.plot, recording, *others)
             if self.report is not None:
@@ -310,6 +349,8 @@ def _print_report(report: AuditReport) -> None:
         out.print(f"  [yellow]{plain(report.resimulation)}[/]")
     elif report.resimulation:
         out.print(f"  simulated again: {report.resimulation}")
+    for sentence in report.findings:
+        out.print(f"  [yellow]the run warned:[/yellow] {plain(sentence)}")
     kept = report.timekeeping
     for sentence in report.coupling_sentences:
         if ": K = " in f": {sentence}":  # of several hands, behind the hand's grip
@@ -335,11 +376,14 @@ def _print_report(report: AuditReport) -> None:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
     rate = f", {kept.remark}" if kept is not None and kept.remark else ""
-    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}")
-    energies = [
-        f"{name.replace('_', ' ')} {format_energy(e)}" for name, e in report.energies.items() if e
-    ]
-    if energies:
+    unfinished = (
+        "; the tick that tripped is not among them: only the run's summary counts what the hand "
+        "got in it"
+        if "trip" in report.events
+        else ""
+    )
+    out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
+    if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
         out.print(f"  {', '.join(energies)}")
 
 

@@ -224,8 +224,9 @@ def print_cost(cost: Cost | None) -> None:
         if sentence := _growth(growth, unit):
             out.print(f"  {sentence}")
     out.print(
-        f"  highest rate: {cost.highest_rate:,.0f} Hz, where 99 of 100 ticks leave "
-        f"{100 * (1 - TICK_SHARE):g} % of the period to the device and to late wake-ups"
+        f"  highest rate: {cost.highest_rate:,.0f} Hz by arithmetic: 99 of 100 ticks leave "
+        f"{100 * (1 - TICK_SHARE):g} % of the period to the device and to late wake-ups; what the "
+        "machine keeps, 'hapticbridge doctor' measures"
     )
 
 
@@ -269,6 +270,8 @@ def _growth(growth: Growth, unit: str) -> str:
     if growth.base is None or growth.per_one is None:
         return ""
     most = growth.steps[-1]
+    if not growth.is_measurable:
+        return f"does not grow measurably up to {most[0]} {unit}s"
     none = f"{format_si(growth.base, 's')} with none, " if growth.base > 0 else ""  # not a line
     return (
         f"grows by {format_si(growth.per_one, 's')} per {unit}: {none}"

@@ -9,7 +9,7 @@ import tyro
 from rich.markdown import Markdown
 
 from hapticbridge.cli.terminal import out
-from hapticbridge.errors import HapticBridgeError, nearest
+from hapticbridge.errors import HapticBridgeError, choices, nearest
 
 FOLDER = Path(__file__).parent.parent / "guide"
 """Folder of the pages, one Markdown file each, named after its topic."""
@@ -49,10 +49,14 @@ def page(topic: str) -> str:
         HapticBridgeError: There is no such topic.
     """
     topics = [name for names in TOPICS.values() for name in names]
-    if topic not in topics:
-        advice = nearest(topic, topics).rstrip() or "'hapticbridge guide' lists the topics"
-        raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
-    return (FOLDER / f"{topic.replace('-', '_')}.md").read_text(encoding="utf-8")
+    if topic in topics:
+        return (FOLDER / f"{topic.replace('-', '_')}.md").read_text(encoding="utf-8")
+    advice = nearest(topic, topics).rstrip()
+    if not advice:
+        found = [name for name in topics if topic.lower() in page(name).lower()]
+        told = "the word is in" if topic and found else "choose one of"
+        advice = f"{told} {choices(found or topics)}"
+    raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,11 +198,12 @@ MOST_FAULTS = 2
 """Number of a scene's faults that a run repeats."""
 
 
-def _warn_of_faults(source: SceneSource, scene: Scene) -> None:
-    """Prints the worst of what ``hapticbridge check`` finds without a motion."""
-    for fault in islice(worst_faults(source, scene), MOST_FAULTS):
-        told = f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
-        err.print(f"[yellow]warning:[/yellow] {plain(told)}")
+def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
+    """Returns the worst of what ``hapticbridge check`` finds without a motion."""
+    return tuple(
+        f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
+        for fault in islice(worst_faults(source, scene), MOST_FAULTS)
+    )
 
 
 HEAVY = 0.25
@@ -403,10 +404,9 @@ class Run:
         clock = SimulatedClock() if self.fast else RealClock()
         held = self._held()
         refuse_simulated_time(self.device, clock)  # before the user is asked to home it
-        is_viewed = self.view or self.device.partition(":")[0] == "mouse"
-        if self.port is not None and not is_viewed:
+        if self.port is not None and not self._is_viewed:
             raise HapticBridgeError("--port without --view has no effect")
-        window = self._window() if is_viewed else None
+        window = self._window() if self._is_viewed else None
         with ExitStack() as stack:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
@@ -419,8 +419,7 @@ class Run:
             with err.status("trying the scene …"):
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
-                if not self.as_json:
-                    _warn_of_faults(source, scene)
+                self._warn_of_faults(source, scene)
                 chosen = (
                     self
                     if self.substeps is not None
@@ -437,10 +436,24 @@ class Run:
             elif joint:
                 grasp = self._grasp(self.grip, joint, device)
                 grasp = replace(grasp, clutch=self.clutch, dead_man=self.dead_man)
+                found = scene.findings
                 scene = compile_scene(source, grasp.grips, as_is=self.as_is, warns=False)
+                scene.findings = found
                 one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
                 return one._feel(scene, [grasp], clock, stack, window, interrupts)
             return chosen._feel(scene, device, clock, stack, window, interrupts)
+
+    @property
+    def _is_viewed(self) -> bool:
+        """True if a page shows the run, with its state; plain lines would repeat it every 2 s."""
+        return self.view or self.device.partition(":")[0] == "mouse"
+
+    def _warn_of_faults(self, source: SceneSource, scene: Scene) -> None:
+        """Prints the worst faults of the scene, and keeps them for the recording."""
+        scene.findings = _findings(source, scene)
+        if not self.as_json:
+            for sentence in scene.findings:
+                err.print(f"[yellow]warning:[/yellow] {plain(sentence)}")
 
     def _refuse_grip_scale(self) -> None:
         if self.grip_scale is not None:
@@ -518,6 +531,7 @@ class Run:
         grips = check_grasps([Grasp(grip, grip_axis=axes.get(grip)) for grip, *_ in held])
         with err.status("trying the scene …"), compiling(self.scene):
             scene = compile_scene(source, grips, as_is=self.as_is)
+            self._warn_of_faults(source, scene)
         grasps = []
         for grip, joint, name in held:
             own = scene.of_hand(grips.index(grip))
@@ -609,22 +623,22 @@ class Run:
             summary = bridge.run(self._duration(bridge.device.info))
         except SafetyTrip:
             stack.close()
-            self._print(bridge.summary(), is_viewed=window is not None)
+            self._print(bridge.summary())
             raise
         stack.close()
         if not summary.ticks and (name := bridge.session.signal):
             raise StopSignal(Signals[name])
-        self._print(summary, is_viewed=window is not None)
+        self._print(summary)
         is_good = summary.verdict == "passive" and summary.is_certified is not False
         return 0 if is_good else 1
 
-    def _print(self, summary: Summary, *, is_viewed: bool) -> None:
+    def _print(self, summary: Summary) -> None:
         if self.as_json:
             print_json(summary.to_dict() | {"recording": str(self.record or "") or None})
             return
         for line in str(summary).splitlines():
             out.print(plain(line))
-        if is_viewed and self.record is not None:
+        if self._is_viewed and self.record is not None:
             notify(f"the page ends with the run; 'hapticbridge view {self.record}' plays it")
 
     def _duration(self, info: DeviceInfo) -> float | None:
@@ -669,7 +683,7 @@ class Run:
             dead_man=self.dead_man,
             mark=self.mark,
             tool_weight=self.tool_weight,
-            live=not self.as_json and (err.is_terminal or not self.fast),
+            live=not self.as_json and (err.is_terminal or not (self.fast or self._is_viewed)),
             realtime=self.realtime or None,
             sign=self.sign,
         )

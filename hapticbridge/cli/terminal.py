@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,11 +81,36 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object) -
         err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
 
 
+SILENCE = 2.0
+"""Time in s after which work is named where nothing can be animated. Shorter work needs no word."""
+
+
+@contextmanager
+def working(words: str) -> Iterator[None]:
+    """Names work while it is done, on stderr: at once on a terminal, else once if it takes long.
+
+    Args:
+        words: Description of the work, as the console's markup.
+    """
+    if err.is_terminal:
+        with err.status(f"{words} …"):
+            yield
+        return
+    timer = threading.Timer(SILENCE, err.print, (f"{words} …",))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 @contextmanager
 def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., None]]:
     """Shows a bar on stderr; yields a function of the work done, the whole work and a name.
 
-    Without a terminal there is no bar, because rich would leave an empty line of it in a file.
+    Without a terminal there is no bar, because rich would leave an empty line of it in a file. Long
+    work is named once.
 
     Args:
         words: Description of the work.
@@ -99,7 +125,8 @@ def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., 
 
     count = [TextColumn("{task.completed}/{task.total}")] if is_counted else []
     columns = TextColumn("{task.description}"), BarColumn(), *count, TimeRemainingColumn()
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+    quiet = nullcontext() if err.is_terminal else working(words)
+    with quiet, Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(words, total=None)
 
         def show(done: int, total: int, name: str = "") -> None:
@@ -113,7 +140,7 @@ def write_figure(figure: Figure, path: Path) -> None:
     """Writes a picture and says so on stderr."""
     from hapticbridge.plotting import write_picture  # noqa: PLC0415 - imports matplotlib
 
-    with err.status("drawing …"):
+    with working("drawing"):
         write_picture(figure, path)
     print_written(path)
 

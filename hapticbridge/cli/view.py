@@ -127,7 +127,7 @@ class Render:
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
 
             shot = replace(shot, at=telling_time(read_recording(self.file, 0)))
-        with err.status("drawing …"), progress("drawing") as show:
+        with progress("drawing") as show:
             renderer = draw(self.file, self.output, shot, show, in_process=self.in_process)
         out.print(f"wrote {plain(str(self.output))} (drawn with {renderer})")
         return 0

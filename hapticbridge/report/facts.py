@@ -16,7 +16,7 @@ from hapticbridge.files import read_json
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.record import TickFlag
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.units import format_share, format_si, format_wrenches
+from hapticbridge.units import energy_rows, format_share, format_wrenches
 
 Facts = list[tuple[str, str]]
 
@@ -204,18 +204,9 @@ def _controller_words(evidence: Evidence) -> str:
 
 
 def balance_of(report: AuditReport) -> str:
-    """Returns the energies at the end of a run; those of rounding are left out."""
-    facts = [
-        f"{_with_spaces(name)} {format_si(energy, 'J')}"
-        for name, energy in report.energies.items()
-        if abs(energy) > ROUNDING
-    ]
-    return ", ".join(facts) or "nothing"
-
-
-ROUNDING = 1e-12
-"""Energy in J below which a value is left out: a thousandth of the verdict's tolerance for
-rounding."""
+    """Returns the energies at the end of a run."""
+    rows = energy_rows(report.energies, report.start_potential)
+    return ", ".join(" ".join(row) for row in rows) or "nothing"
 
 
 def percent(is_on: NDArray[np.bool_]) -> str:

@@ -108,12 +108,14 @@ def _excess_sentence(report: AuditReport, joules: str) -> str:
 
 
 def notes(report: AuditReport) -> list[str]:
-    """Returns notes on the verdict: reason of a stop, unchecked parts, and the device condition."""
+    """Returns notes on the verdict: reason of a stop, device condition, warnings of the run."""
     if report.verdict == "invalid":
         return []
+    warned = [f"The run warned: {sentence}." for sentence in report.findings]
     remarks = report.reason.partition("; ")[2]
     # a run that was passive only because its force was switched off must not look like any other
-    return [*([f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []), *_device_notes(report)]
+    stop = [f"{remarks[:1].upper()}{remarks[1:]}."] if remarks else []
+    return [*stop, *_device_notes(report), *warned]
 
 
 def is_warned(report: AuditReport) -> bool:

@@ -78,6 +78,8 @@ class Scene:
         is_carried: True if the weight of the tool is compensated (``carry_tool``).
         other_grips: Names of the sites that further hands hold.
         hand: Number of the hand that holds ``grip``, from 0 (``of_hand``).
+        findings: Sentences on faults of the scene that the user was warned of. The recording keeps
+            them as events.
     """
 
     path: Path
@@ -91,6 +93,7 @@ class Scene:
     is_carried: bool = False
     other_grips: tuple[str, ...] = ()
     hand: int = 0
+    findings: tuple[str, ...] = ()
 
     _spec: mujoco.MjSpec | None = None
     _is_claimed: bool = False

@@ -410,11 +410,14 @@ class Page:
         self._plots: list[viser.GuiUplotHandle] = []
 
     def add_curves(self) -> None:
-        """Adds the curves and the legend of the colours below the controls."""
+        """Adds the force's curve above the controls, and below them legend and other curves.
+
+        All curves would be below the lower edge of a usual window.
+        """
         gui = self._server.gui
         self._words = gui.add_markdown("")
         self._explain()
-        for title, names in PLOTS:
+        for number, (title, names) in enumerate(PLOTS):
             series: list[dict[str, Any]] = [{"label": "time (s)"}]
             series += [
                 {"label": name, "stroke": colour, "width": 1.5}
@@ -431,6 +434,7 @@ class Page:
                     scales={"x": {"time": False}},
                     axes=_AXES,
                     legend={"show": len(names) > 1},
+                    order=None if number else self.status.order + 0.5,
                 )
             )
         gui.add_markdown(self._caption)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film_process import MIN_REFERENCE, is_held
+from hapticbridge.film_process import MIN_REFERENCE, is_held, tell_apart
 from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import force_on_hand
 from hapticbridge.recorded_scene import compile_recorded
@@ -77,6 +77,7 @@ class LiveRun:
         metas = [run.meta | own for own in further_hands(run.meta)]
         self._hands = self.parameters, *map(parameters_of, metas)
         self.model = compile_recorded(run, *self._hands).model
+        tell_apart(self.model, *(own.grip for own in self._hands))
         grips = [own.grip for own in self._hands if not own.grip.startswith(JOINT)]
         self.scenery = Scenery.of(self.model, *grips)
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)

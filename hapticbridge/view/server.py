@@ -167,9 +167,16 @@ _SCRIPTS = (
 """Places in viser's page that make a script, and what stands there instead."""
 
 
+_LOADING = (
+    '<div id="root"></div>',
+    '<div id="root"><p style="font:16px sans-serif;margin:2em">Loading the scene …</p></div>',
+)
+"""Place of viser's page that its scripts fill, and what stands there until they are loaded."""
+
+
 def _protected(response: Response, host: str) -> Response:
     """Lets a page run viser's scripts alone, and connect to its own host alone."""
-    nonce, page = secrets.token_urlsafe(18), response.body.decode()
+    nonce, page = secrets.token_urlsafe(18), response.body.decode().replace(*_LOADING)
     for place, named in _SCRIPTS:
         if page.count(place) != 1:
             return _plain(500, "Unknown Page", "hapticbridge: this viser has unknown scripts\n")

@@ -26,7 +26,7 @@ from hapticbridge.report.evidence import (
 )
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import BINS as PLOT_BINS
-from hapticbridge.units import format_share, format_si
+from hapticbridge.units import format_energy, format_share, format_si, shown_energies
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
 if TYPE_CHECKING:
@@ -59,10 +59,11 @@ def rows(found: WhatIf) -> Iterator[Row]:
     for name in runs[0].peaks:
         unit = _PEAK_UNITS[name.split()[0]]
         yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
-    for name in runs[0].report.energies:
-        joules = [run.report.energies.get(name, 0.0) for run in runs]
+    shown = [shown_energies(run.report.energies, run.report.start_potential) for run in runs]
+    for name in shown[0]:
+        joules = [each.get(name, 0.0) for each in shown]
         if any(joules):
-            yield name.replace("_", " "), tuple(format_si(e, "J") for e in joules)
+            yield name, tuple(map(format_energy, joules))
     yield "slack used", tuple(format_share(run.report.slack_share) for run in runs)
     yield "device bears it", tuple(map(_certified, runs))
     yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)

@@ -174,13 +174,16 @@ def changed_of_hands(
     return news, tuple(told)
 
 
-def changes_from(words: Iterable[str]) -> dict[str, Value]:
+def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
     """Parses changes such as ``stiffness=3000`` and ``method=explicit``.
 
+    One setting may have several values, as ``stiffness=400,800`` or by its name again: each of them
+    gives a change of its own, beside the other settings.
+
     Raises:
-        RecordingError: A word is not a name and a value, or a name occurs twice.
+        RecordingError: A word is not a name and a value, or two settings have several values.
     """
-    changes: dict[str, Value] = {}
+    values: dict[str, list[Value]] = {}
     for word in words:
         name, sign, text = (part.strip() for part in word.partition("="))
         if not (name and sign and text):
@@ -188,10 +191,17 @@ def changes_from(words: Iterable[str]) -> dict[str, Value]:
                 f"cannot change '{word:.80}'; write a name and a value, such as stiffness=3000; "
                 f"names: {choices(UNITS)}, and the scene's parameters"
             )
-        if name in changes:
-            raise RecordingError(f"'{name}' is changed twice; change it once")
-        changes[name] = text
-    return changes
+        values.setdefault(name, []).extend(part.strip() for part in text.split(","))
+    several = [name for name, each in values.items() if len(each) > 1]
+    if len(several) > 1:
+        raise RecordingError(
+            f"{choices(several)} have several values each; one setting at a time may have them"
+        )
+    count = max(map(len, values.values()), default=1)
+    return [
+        {name: each[index if len(each) > 1 else 0] for name, each in values.items()}
+        for index in range(count)
+    ]
 
 
 def _convert(name: str, value: Value) -> Value:

@@ -30,6 +30,7 @@ from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_reco
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import read_hands
 from hapticbridge.scene import Scene
+from hapticbridge.units import format_si
 from hapticbridge.whatif.recorded import RecordedRun, scene_of
 from hapticbridge.whatif.replayed_hand import (
     IdentifiedDevice,
@@ -236,7 +237,7 @@ class _Experiment:
             self.progress(3, 4, "the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
-                f"with nothing changed the model hand is {1e3 * hand_error:.3g} mm off the "
+                f"with nothing changed the model hand is {format_si(hand_error, 'm')} off the "
                 "recorded motion (root mean square); its response to changed forces is assumed"
             )
         return WhatIf(
