@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 
 from hapticbridge.certificate import DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
@@ -47,7 +48,8 @@ SILENT_PERIODS = 10.0
 after ten, a hand has met a tool that stands still."""
 
 SWUNG = "its force came late, reversed or in steps"
-"""Words for what the watch found (``kernel.swing_watch``)."""
+UNKNOWN = "it is not known whether its motors push the right way"
+"""Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,13 @@ def watch_sentence(flags: int) -> str:
             "the force was lowered because the device answered late, or in coarse steps, and "
             "swung: lower --stiffness, and measure the device's delay and resolution "
             "('hapticbridge identify')"
+        )
+    if flags & int(TickFlag.UNANSWERED):
+        force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
+        return (
+            f"the device was pushed with {force} ({torque}) or more for {format_si(STAND, 's')} "
+            f"and did not move, also when the force was lowered: {UNKNOWN}; move the handle away "
+            "from its stop and start again"
         )
     return ""
 
@@ -197,7 +206,7 @@ class Timekeeping:
         if self.is_kept is False:
             return NOT_KEPT
         if self.watch:
-            return SWUNG
+            return UNKNOWN if UNKNOWN in self.watch else SWUNG
         is_cause = self.has_tripped and self.is_kept is not None
         return "the guard stopped the run" if is_cause else ""
 

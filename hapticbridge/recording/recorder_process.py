@@ -48,6 +48,7 @@ REPRINT = 2.0
 LOWERED = {
     int(TickFlag.RUNS_AWAY): "FORCE TAKEN AWAY: the device does not move as it is pushed",
     int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late",
+    int(TickFlag.UNANSWERED): "FORCE LOWERED: the device does not move; move it off its stop",
 }
 """Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
 
