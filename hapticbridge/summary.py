@@ -307,7 +307,7 @@ class Summary:
         used = f", {format_share(self.slack_share)} of the slack used" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
-        until = " until the guard tripped" if self.stopped_by == "trip" else ""
+        until = ", then the guard stopped the run" if self.stopped_by == "trip" else ""
         yield f"{judged}{self.verdict} ({port or self.environment}){until}{since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"

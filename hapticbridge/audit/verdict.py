@@ -190,7 +190,7 @@ def _decide_on_records(
     fault: Fault | None, energies: PassivityTally | None, *, strict: bool
 ) -> Decision:
     if fault is not None or energies is None:
-        fault = fault or Fault("the recording holds no tick")
+        fault = fault or Fault("the recording is empty: the run had no tick")
         return Decision("invalid", None, fault.reason, fault.tick, fault.port, fault.joules)
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
     if excess is not None and not (active is not None and active[0] <= excess[0]):
@@ -509,7 +509,7 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
             "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
             "coupling": coupling,
-            "coupling_sentences": coupling.sentences(),
+            "coupling_sentences": coupling.sentences(info),
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
