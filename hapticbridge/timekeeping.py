@@ -69,6 +69,8 @@ class RunTimes:
         has_tripped: True if the guard stopped the run.
         scene_steps: Results that a scene slower than the loop has given.
         scene_silence: Longest time in s without a new one.
+        silence: Longest time in s without a new sample of the device.
+        silent_tick: Last tick of that time.
     """
 
     ticks: int
@@ -82,6 +84,20 @@ class RunTimes:
     has_tripped: bool = False
     scene_steps: int = 0
     scene_silence: float = 0.0
+    silence: float = 0.0
+    silent_tick: int = 0
+
+
+def silence_sentence(times: RunTimes, parameters: RunParameters) -> str:
+    """Describes a silence of the device after which the force fades; empty without one."""
+    period, most = parameters.period, parameters.guarding.stale_ticks
+    if not most or times.silence <= (most + 0.5) * period:
+        return ""
+    begin = max((times.silent_tick + 1) * period - times.silence, 0.0)
+    return (
+        f"the device gave no new sample for {format_si(times.silence, 's')} (at {begin:.1f} s), "
+        "and the force faded"
+    )
 
 
 def watch_sentence(flags: int) -> str:
@@ -139,6 +155,7 @@ class Timekeeping:
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
         scene_speed: Share of them that it gave, 0 to 1.
         scene_silence: Longest time in s without a new one.
+        silence: Longest silence of the device, in a sentence; empty if no force faded for it.
     """
 
     rate: float
@@ -157,6 +174,7 @@ class Timekeeping:
     scene_rate: float | None
     scene_speed: float
     scene_silence: float
+    silence: str
 
     @classmethod
     def of(
@@ -185,6 +203,7 @@ class Timekeeping:
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
             scene_speed=_scene_speed(times, parameters.scene_ticks),
             scene_silence=times.scene_silence,
+            silence=silence_sentence(times, parameters),
         )
 
     def certified(self, verdict: bool | None) -> bool | None:

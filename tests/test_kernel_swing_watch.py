@@ -25,6 +25,7 @@ from hapticbridge.device import (
 )
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
+from hapticbridge.recording.recorder_process import RunState
 
 
 @pytest.mark.parametrize("name", LOOP_SCENES)
@@ -257,3 +258,24 @@ def test_motion_that_no_force_changes_is_an_alarm_only_if_its_device_claims_a_ha
         flags = int(np.bitwise_or.reduce(bridge.latest_records(1000)["flags"]))
     is_alarm = flags & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY) != 0
     assert is_alarm != is_prescribed
+
+
+def test_a_silence_of_the_device_is_named_in_summary_audit_and_live_line(tmp_path: Path) -> None:
+    device, path = SimulatedDevice(), tmp_path / "run.mcap"
+    inner, ticks = device.read, iter(range(10000))
+
+    def read(sample: NDArray[np.void]) -> int:
+        if 300 <= next(ticks) < 800:
+            return int(TickFlag.STALE_SAMPLE)
+        return inner(sample)
+
+    device.read = read  # type: ignore[method-assign]
+    with hb.Bridge("point_mass", device, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(1.2)
+    words = "the device gave no new sample for 500 ms (at 0.3 s)"
+    assert words in str(summary)
+    assert words in audit(path).reason
+    state = RunState()
+    for part in np.array_split(hb.read_recording(path).ticks, 7):
+        state.add(part)
+    assert "NO NEW SAMPLE for 0.5 s" in str(state)

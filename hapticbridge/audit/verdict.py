@@ -410,7 +410,7 @@ def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tup
     if facts["certified"] is False and not (kept and kept.refutation):
         doubt = "the device has less damping than the coupling needs"
     pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
-    return doubt, pushed, unusual_end(events), facts["unchecked"]
+    return kept.silence if kept else "", doubt, pushed, unusual_end(events), facts["unchecked"]
 
 
 def _check_records(
@@ -538,6 +538,8 @@ def _time_facts(
         has_tripped=any(event.get("event") == "trip" for event in recording.events),
         scene_steps=timing.scene_steps,
         scene_silence=run.parameters.period * timing.longest_silence,
+        silence=timing.silence,
+        silent_tick=timing.silent_tick,
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)
