@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,10 @@ out = Console(highlight=False, soft_wrap=True)
 
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 """Progress, warnings and errors, on stderr, so that a pipe gets results alone."""
+
+
+REPRINT = 2.0
+"""Time in s between two plain lines of progress."""
 
 
 def plain(text: str) -> str:
@@ -84,7 +89,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object) -
 def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., None]]:
     """Shows a bar on stderr; yields a function of the work done, the whole work and a name.
 
-    Without a terminal there is no bar, because rich would leave an empty line of it in a file.
+    Without a terminal there is no bar but a plain line every ``REPRINT`` seconds, as in a run.
 
     Args:
         words: Description of the work.
@@ -100,11 +105,15 @@ def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., 
     count = [TextColumn("{task.completed}/{task.total}")] if is_counted else []
     columns = TextColumn("{task.description}"), BarColumn(), *count, TimeRemainingColumn()
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(words, total=None)
+        task, printed = bar.add_task(words, total=None), time.monotonic()
 
         def show(done: int, total: int, name: str = "") -> None:
             description = f"{words}: {plain(name)}" if name else words
             bar.update(task, completed=done, total=total, description=description)
+            nonlocal printed
+            if not err.is_terminal and time.monotonic() - printed >= REPRINT:
+                printed = time.monotonic()
+                err.print(f"{description}  {100 * done / total:.0f} %")
 
         yield show
 
