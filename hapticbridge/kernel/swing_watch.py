@@ -39,9 +39,9 @@ the limit. A probe is no alarm. The next one waits 0.5 s, then twice as long eac
 the findings above need no probe and wait for nothing.
 
 A handle on its mechanical stop cannot answer: a reversed motor presses it there and nothing swings.
-One that stands for 0.2 s, within 10 µm, against 1.5 N (0.075 N m) is probed, too. If it then moves
-against the force, a hand pushed it and the motor is right, for the rest of the run. If it stands
-through the probe, r stays at the quarter until the handle is 2 mm away, and the flag
+One that stands for 0.2 s, with equal samples, against 1.5 N (0.075 N m) is probed, too. If it then
+moves against the force, a hand pushed it and the motor is right, for the rest of the run. If it
+stands through the probe, r stays at the quarter until the handle is 2 mm away, and the flag
 ``UNANSWERED`` stays.
 
 The margins, in 856 runs of honest hands of 0.05 to 2 kg and up to 3000 N/m that tap, hammer and
@@ -140,10 +140,11 @@ PROBE, PROBE_SHARE, REST, LONGEST_REST = 0.15, 0.25, 0.5, 8.0
 """Duration in s of a probe, its share of the ratio, and the first and longest rest after it in s.
 At a quarter of the ratio a swing has a sixteenth of the stiffness and ends."""
 
-STAND, STILL, AWAY = 0.2, 1e-5, 2e-3
-"""Time in s and distance in m within which a handle stands, and distance in m at which it has
-left. A hand moves by more than 10 µm in 0.2 s; friction or a coarse encoder may hide it, and the
-answer to the probe is larger. Angles are ``USUAL_ARM`` times as many rad."""
+STAND, AWAY = 0.2, 2e-3
+"""Time in s for which all samples of a handle that stands are equal, and distance in m at which it
+has left. No hand holds still within one step of a fine encoder for 0.2 s. Friction or a coarse
+encoder may hide its motion, and the answer to the probe is larger. Angles are ``USUAL_ARM`` times
+as many rad."""
 
 PUSH = 1.5, 0.075
 """Least force in N and torque in N m under which a handle that stands is suspicious. A probe takes
@@ -358,7 +359,7 @@ def _stands(s: State, kind: int) -> bool:
         along += stray[i] * watch.wrench[i]
         square += watch.wrench[i] * watch.wrench[i]
     way = math.sqrt(way) / (1.0 if kind == 0 else USUAL_ARM)
-    if way > (AWAY if watch.is_held[kind] else STILL):
+    if way > (AWAY if watch.is_held[kind] else 0.0):
         is_probed = watch.blocks < watch.probe_end
         if is_probed and watch.stood[kind] >= watch.stand_blocks and along < 0.0:
             watch.is_right[kind] = 1
