@@ -32,7 +32,7 @@ from hapticbridge.errors import (
     SceneError,
     choices,
 )
-from hapticbridge.guard import trip_reason
+from hapticbridge.guard import Limits, trip_reason
 from hapticbridge.hands import (
     DeviceGroup,
     Grasp,
@@ -47,6 +47,7 @@ from hapticbridge.options import (
     BridgeOptions,
     OptionChanges,
     RunSetup,
+    Workspace,
     device_for_run,
 )
 from hapticbridge.realtime import real_time
@@ -61,6 +62,16 @@ OnTick = Callable[[int], None]
 """Function called with a tick's number before the tick, for scripted inputs."""
 
 _NOT_OPEN = "the bridge is not open; open it with 'with Bridge(...)' first"
+
+
+def _no_option(name: str) -> str:
+    """Returns a sentence on a keyword that is no option of a bridge."""
+    if name in Coupling.__match_args__:
+        return f"'{name}' is a gain of the coupling: write coupling={{'{name}': …}}"
+    for option, holder in (("limits", Limits), ("workspace", Workspace)):
+        if name in holder.__dataclass_fields__:
+            return f"'{name}' belongs to the option {option}: write it in hb.{holder.__name__}(…)"
+    return f"a bridge has no option '{name}'; it has {choices(OptionChanges.__annotations__)}"
 
 
 class Bridge:
@@ -111,6 +122,8 @@ class Bridge:
         observer: RingObserver | None = None,
         **changes: Unpack[OptionChanges],
     ) -> None:
+        for name in set(changes) - set(OptionChanges.__annotations__):
+            raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
         if options.sign is not None and path is None:

@@ -16,6 +16,7 @@ from hapticbridge.kernel.law import SLACK_SHARE
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
+from hapticbridge.units import format_si
 
 # Additional device damping required by the device's own update rate and delay
 
@@ -262,6 +263,7 @@ class DampingCondition:
         available: The device's damping b; None if unknown.
         remedy: Change that helps if the condition fails.
         delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
+        tick: Length of such a tick in s.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
             there without work of its own, so no damping bounds what it gets back along the axes
             with a motor (Barbagli & Salisbury 2003).
@@ -272,6 +274,7 @@ class DampingCondition:
     available: float | None
     remedy: str = "lower stiffness or damping, or raise the rate"
     delay: int | None = 0
+    tick: float = 0.0
     is_felt: bool = True
 
     @property
@@ -298,8 +301,11 @@ class DampingCondition:
             return f"{text}; {self.remedy}"
         if self.delay is None:
             return f"{text}, if it answers without delay, which is unknown"
-        late = f", for a wall; with a delay of {self.delay} ticks none suffices for every scene"
-        return f"{text}{late}" if self.delay else text
+        if not self.delay:
+            return text
+        late = format_si(self.delay * self.tick, "s")
+        ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
+        return f"{text}, for a wall; with a delay of {late} ({ticks}) none suffices for every scene"
 
 
 def device_conditions(
@@ -334,7 +340,7 @@ def device_conditions(
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
     conditions = []
-    delay = delay_ticks(info, period)
+    delay, tick = delay_ticks(info, period), device_period(info, period)
     is_known = info.damping is not None or not info.moves
     if info.moves and info.damping is not None:
         needed = (
@@ -343,7 +349,9 @@ def device_conditions(
             * required_damping_with_delay(info, coupling, period, law_evaluations)
         )
         remedy = _remedy(method, coupling.damping)
-        conditions.append(DampingCondition("translation", needed, info.damping, remedy, delay))
+        conditions.append(
+            DampingCondition("translation", needed, info.damping, remedy, delay, tick)
+        )
     if info.turns and is_known:
         needed = (
             force_scale
@@ -352,7 +360,7 @@ def device_conditions(
         )
         remedy = _remedy(method, coupling.rotational_damping)
         conditions.append(
-            DampingCondition("rotation", needed, info.rotational_damping, remedy, delay)
+            DampingCondition("rotation", needed, info.rotational_damping, remedy, delay, tick)
         )
     if info.sensed and is_known:
         conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))

@@ -154,7 +154,7 @@ class Stage:
         self.recording: RecordingFile = opened
         reason = obstacle(self.recording)
         if not self.recording.count:
-            reason = "it holds no tick"
+            reason = "it is empty: the run had no tick"
         if reason:
             raise RecordingError(f"'{opened.path}' cannot be drawn: {reason}")
         self._hands = tuple(AuditedRun.of(each).parameters for each in hands)

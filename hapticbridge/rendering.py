@@ -12,6 +12,7 @@ import mujoco
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.coupling import Coupling
+from hapticbridge.device.base import AXES, DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import (
     JOINT,
@@ -282,8 +283,10 @@ class RunCoupling:
             "at the fingers",
         )
 
-    def sentences(self) -> tuple[str, ...]:
+    def sentences(self, info: DeviceInfo | None = None) -> tuple[str, ...]:
         """Returns a sentence on translation, and one on rotation if it has a spring.
+
+        A device ``info`` that neither turns nor senses rotation has none on it.
 
         ``K = 2400 N/m, B = 1.7 N s/m effective (law 0.5, requested 1.7)``. Without an effective
         coupling the next name comes first.
@@ -299,6 +302,7 @@ class RunCoupling:
         return tuple(
             _sentence(first, known, symbols, notes)
             for symbols in (_TRANSLATION, _ROTATION)
+            if symbols is _TRANSLATION or info is None or {*info.axes, *info.sensed} & {*AXES[3:]}
             if getattr(known[first], symbols[0]) > 0
         )
 

@@ -166,7 +166,15 @@ WELD = "the weld in its stiffest directions at the start"
 _NAME_WIDTH = 20
 """Characters of a row's name in the text of a summary, with the space after it."""
 
-_OF_A_HAND = ("peak", "reach", "coupling work", "device energy", "net to the hand", "slack")
+_OF_A_HAND = (
+    "silence",
+    "peak",
+    "reach",
+    "coupling work",
+    "device energy",
+    "net to the hand",
+    "slack",
+)
 """Rows of the text of a summary that each of several hands has of its own."""
 
 _PEAKS = ("peak_force", "peak_torque", "peak_tool_force", "peak_tool_torque")
@@ -317,7 +325,7 @@ class Summary:
         used = f", {format_share(self.slack_share)} of the slack used" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
-        until = " until the guard tripped" if self.stopped_by == "trip" else ""
+        until = ", then the guard stopped the run" if self.stopped_by == "trip" else ""
         yield f"{judged}{self.verdict} ({port or self.environment}){until}{since}{used}"
         if self.method != default_method().name:
             yield f"method {self.method}: {self.about}"
@@ -343,6 +351,8 @@ class Summary:
         yield "overruns", f"{self.overruns}{skipped}, records dropped {self.dropped}"
         if remark := self.timekeeping.remark:
             yield "time kept", remark
+        if silence := self.timekeeping.silence:
+            yield "silence", silence
         hand = self.peak_force, self.peak_torque
         tool = self.peak_tool_force, self.peak_tool_torque
         reached = " and ".join(f"{name} limit" for name in self.limits_reached)
@@ -416,6 +426,8 @@ class Summary:
             has_tripped=outcome.stopped_by == "trip",
             scene_steps=int(state["shown"]["scene_step"][0]),
             scene_silence=parameters.period * int(state["shown"]["longest_silence"][0]),
+            silence=float(state["guard"]["longest_silence"][0]),
+            silent_tick=int(state["guard"]["silent_tick"][0]),
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
         timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())

@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 
 from hapticbridge.certificate import DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
@@ -47,7 +48,8 @@ SILENT_PERIODS = 10.0
 after ten, a hand has met a tool that stands still."""
 
 SWUNG = "its force came late, reversed or in steps"
-"""Words for what the watch found (``kernel.swing_watch``)."""
+UNKNOWN = "it is not known whether its motors push the right way"
+"""Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,8 @@ class RunTimes:
         has_tripped: True if the guard stopped the run.
         scene_steps: Results that a scene slower than the loop has given.
         scene_silence: Longest time in s without a new one.
+        silence: Longest time in s without a new sample of the device.
+        silent_tick: Last tick of that time.
     """
 
     ticks: int
@@ -80,6 +84,20 @@ class RunTimes:
     has_tripped: bool = False
     scene_steps: int = 0
     scene_silence: float = 0.0
+    silence: float = 0.0
+    silent_tick: int = 0
+
+
+def silence_sentence(times: RunTimes, parameters: RunParameters) -> str:
+    """Describes a silence of the device after which the force fades; empty without one."""
+    period, most = parameters.period, parameters.guarding.stale_ticks
+    if not most or times.silence <= (most + 0.5) * period:
+        return ""
+    begin = max((times.silent_tick + 1) * period - times.silence, 0.0)
+    return (
+        f"the device gave no new sample for {format_si(times.silence, 's')} (at {begin:.1f} s), "
+        "and the force faded"
+    )
 
 
 def watch_sentence(flags: int) -> str:
@@ -99,6 +117,13 @@ def watch_sentence(flags: int) -> str:
             "the force was lowered because the device answered late, or in coarse steps, and "
             "swung: lower --stiffness, and measure the device's delay and resolution "
             "('hapticbridge identify')"
+        )
+    if flags & int(TickFlag.UNANSWERED):
+        force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
+        return (
+            f"the device was pushed with {force} ({torque}) or more for {format_si(STAND, 's')} "
+            f"and did not move, also when the force was lowered: {UNKNOWN}; move the handle away "
+            "from its stop and start again"
         )
     return ""
 
@@ -130,6 +155,7 @@ class Timekeeping:
         scene_rate: Results per second in Hz that a slower scene was to give; None for another.
         scene_speed: Share of them that it gave, 0 to 1.
         scene_silence: Longest time in s without a new one.
+        silence: Longest silence of the device, in a sentence; empty if no force faded for it.
     """
 
     rate: float
@@ -148,6 +174,7 @@ class Timekeeping:
     scene_rate: float | None
     scene_speed: float
     scene_silence: float
+    silence: str
 
     @classmethod
     def of(
@@ -176,6 +203,7 @@ class Timekeeping:
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
             scene_speed=_scene_speed(times, parameters.scene_ticks),
             scene_silence=times.scene_silence,
+            silence=silence_sentence(times, parameters),
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
@@ -197,7 +225,7 @@ class Timekeeping:
         if self.is_kept is False:
             return NOT_KEPT
         if self.watch:
-            return SWUNG
+            return UNKNOWN if UNKNOWN in self.watch else SWUNG
         is_cause = self.has_tripped and self.is_kept is not None
         return "the guard stopped the run" if is_cause else ""
 

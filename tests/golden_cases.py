@@ -633,7 +633,7 @@ def consoles_of(width: int) -> Iterator[None]:
     """Gives the consoles a width; they are made once, with the width of that moment."""
     consoles = (terminal.out, terminal.err)
     before = [console.width for console in consoles]
-    never = patch.object(terminal, "SILENCE", 1e6)  # a slow machine has no other words
+    never = patch.object(terminal, "REPRINT", 1e6)  # a slow machine has no other words
     never.start()
     try:
         for console in consoles:

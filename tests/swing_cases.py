@@ -147,3 +147,44 @@ def bunched(
         flags = bridge.latest_records(summary.ticks)["flags"]
     found = int(np.bitwise_or.reduce(flags)) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
     return found, late.max_net_energy()
+
+
+class OnItsStop:
+    """Handle on a rail that a hand pushes to the end of its way, with one motor.
+
+    Args:
+        end: The mechanical stop in m.
+        sign: 1 for a motor that pushes as it is told, −1 for one that is reversed.
+        push: Force of the hand in N.
+        leaves: Time in s at which it pulls the handle back with 2 N.
+    """
+
+    info = hb.DeviceInfo(
+        name="rail", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
+    )
+
+    def __init__(self, end: float, sign: float, push: float, leaves: float = np.inf) -> None:
+        self._end, self._sign, self._push, self._leaves = end, sign, push, leaves
+
+    def start(self, period: float) -> NDArray[np.void]:
+        self._period, self._tick = period, 0
+        self._place = self._speed = self._force = 0.0
+        return np.array([((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)], hb.SAMPLE_DTYPE)
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        if self._tick > 0:
+            hand = self._push if self._tick * self._period < self._leaves else -2.0
+            push = hand + self._sign * self._force - 2.0 * self._speed
+            self._speed += self._period * push / 0.6
+            self._place += self._period * self._speed
+            if self._place > self._end:
+                self._place, self._speed = self._end, min(self._speed, 0.0)
+        self._tick += 1
+        sample[0] = ((self._place, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+        return 0
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self._force = wrench[0]
+
+    def close(self) -> None:
+        self._force = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from audit_cases import COUPLING, TAP, ScriptedDevice, recorded
 from bridge_runs import fast, still
 from numpy.typing import NDArray
 
+import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
@@ -277,6 +279,20 @@ class Silent(ScriptedDevice):
     def read(self, sample: np.ndarray) -> int:
         super().read(sample)
         return None  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("stiffness", "gain of the coupling: write coupling={'stiffness': …}"),
+        ("reach", "belongs to the option limits: write it in hb.Limits"),
+        ("scale", "belongs to the option workspace"),
+        ("speed", "no option 'speed'; it has 'clutch', "),
+    ],
+)
+def test_a_keyword_that_is_no_option_is_refused_in_a_sentence(name: str, message: str) -> None:
+    with pytest.raises(HapticBridgeError, match=re.escape(message)):
+        hb.Bridge("point_mass", **{name: 3})  # type: ignore[arg-type]
 
 
 def test_what_is_no_scene_device_or_clock_is_refused_in_a_sentence() -> None:

@@ -75,7 +75,7 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
     assert is_certified(prompt) is True
     assert is_certified(late) is None
     assert is_certified(unknown) is None
-    assert "for a wall; with a delay of 2 ticks none suffices for every scene" in (
+    assert "for a wall; with a delay of 2 ms (2 ticks) none suffices for every scene" in (
         late[0].sentence()
     )
     assert "without delay, which is unknown" in unknown[0].sentence()

@@ -258,7 +258,7 @@ def test_a_tripped_run_is_not_called_passive_alone(call: Called, tmp_path: Path)
     assert call(*run)[0] == 3
     code, out, _ = call("audit", path)
     assert code == 1
-    assert out.splitlines()[0].endswith("passive (strict) until the guard tripped")
+    assert out.splitlines()[0].endswith("passive (strict), then the guard stopped the run")
     assert "likely cause" not in out
     assert "what to change: check the motion's unit (m) and speed" in out
     assert out.splitlines()[-1] == "next: hapticbridge guide faults"

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from hapticbridge.cli import main
+from hapticbridge.certificate import default_coupling
+from hapticbridge.cli import main, terminal
+from hapticbridge.device import open_device
 from hapticbridge.device.profile import read_profile
 
 FREE = "simulated:hand=none,damping=1.5,friction=0.1,resolution=2e-5"
@@ -31,6 +33,27 @@ def test_it_prints_draws_and_saves_what_it_measured(
     assert damping.value == pytest.approx(1.5, rel=0.01)
     assert damping.interval is not None and damping.interval[0] < 1.5 < damping.interval[1]
     assert found.quantities["rotational_damping"].value == pytest.approx(2e-3, rel=0.01)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_it_recommends_the_coupling_that_a_run_takes_with_its_profile(
+    delay: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device, path = f"{FREE},delay={delay}", tmp_path / "p.toml"
+    words = ["identify", device, "--axes", "x", "--duration", "5", "--save", str(path), "--json"]
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)["coupling"]["requested"]["stiffness"]
+    sheet = read_profile(path).fill(open_device(device).info)
+    assert sheet.delay == pytest.approx(1e-3 * delay, abs=2e-4)
+    assert told == default_coupling(sheet, 1e-3).stiffness
+
+
+def test_progress_is_printed_in_plain_lines_without_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "REPRINT", 0.0)
+    assert main(["identify", FREE, "--axes", "x", "--duration", "5", "--json"]) == 0
+    assert "identifying: axis x  50 %\n" in capsys.readouterr().err
 
 
 def test_a_profile_that_cannot_be_written_costs_no_measurement(

@@ -310,11 +310,11 @@ def test_long_work_is_named_once_where_nothing_is_animated(monkeypatch: pytest.M
         has_told.set()
 
     monkeypatch.setattr(terminal.err, "print", note)
-    monkeypatch.setattr(terminal, "SILENCE", 0.0)
+    monkeypatch.setattr(terminal, "REPRINT", 0.0)
     with terminal.working("drawing"):
         assert has_told.wait(60.0)
     assert lines == ["drawing …"]
-    monkeypatch.setattr(terminal, "SILENCE", 1e6)
+    monkeypatch.setattr(terminal, "REPRINT", 1e6)
     with terminal.progress("judging"):
         pass
     assert lines == ["drawing …"]

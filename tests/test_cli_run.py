@@ -184,7 +184,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert "this tool weighs" not in err
     assert "than the limit; the scene's motors did " in err
     assert "lower --stiffness" not in err
-    assert "passive (strict) until the guard tripped" in out
+    assert "passive (strict), then the guard stopped the run" in out
     assert "mJ at most, beyond what it put in: the scene's motors did " in out
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
@@ -404,3 +404,10 @@ def test_existing_recording_is_kept_unless_overwriting_is_asked_for(
     assert path.read_text() == "precious"
     assert call(*command, "--overwrite")[0] == 0
     assert audit(path).verdict == "passive"
+
+
+def test_a_device_that_does_not_turn_has_no_rotational_coupling_in_the_text(call: Called) -> None:
+    for dof, is_told in ((3, False), (6, True)):
+        device = f"simulated:dof={dof}"
+        _, _, err = call("run", "point_mass", "--device", device, "--fast", "--duration", 0.05)
+        assert ("K_r = " in err) == is_told

@@ -131,15 +131,15 @@ def touch() -> Rig:
 
 
 RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
-    "falcon": (falcon, "for a wall; with a delay of 2 ticks"),
+    "falcon": (falcon, "(2 ticks) none suffices"),
     # its own period and 1 ms each way on the bus
-    "rawhid": (rawhid, "with a delay of 3 ticks"),
+    "rawhid": (rawhid, "(3 ticks) none suffices"),
     # a delay of calls that is no whole tick counts as one
-    "haply": (haply, "with a delay of 1 ticks"),
-    "omega.3": (force_dimension, "with a delay of 1 ticks"),
-    "sigma.7": (lambda: force_dimension(SIGMA7), "with a delay of 1 ticks"),
+    "haply": (haply, "(1 tick)"),
+    "omega.3": (force_dimension, "(1 tick)"),
+    "sigma.7": (lambda: force_dimension(SIGMA7), "(1 tick)"),
     # up to a servo tick each way
-    "touch": (touch, "with a delay of 2 ticks"),
+    "touch": (touch, "(2 ticks) none suffices"),
     # what the firmware adds in delay nobody says
     "stick": (stick, "without delay, which is unknown"),
     "odd stick": (lambda: stick("odd"), "without delay, which is unknown"),

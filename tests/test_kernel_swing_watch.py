@@ -11,7 +11,7 @@ from faults.catalogue import FINGERS
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from random_hands import random_motion
-from swing_cases import GRIPS, VERY_FIRM, alarms, bunched, shakes, taps
+from swing_cases import GRIPS, VERY_FIRM, OnItsStop, alarms, bunched, shakes, taps
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
@@ -25,6 +25,7 @@ from hapticbridge.device import (
 )
 from hapticbridge.guard import Limits
 from hapticbridge.record import TickFlag
+from hapticbridge.recording.recorder_process import RunState
 
 
 @pytest.mark.parametrize("name", LOOP_SCENES)
@@ -82,6 +83,48 @@ def test_a_probe_lowers_the_force_for_a_moment_and_is_no_alarm(tmp_path: Path) -
     report = audit(path)
     assert report.verdict == summary.verdict
     assert report.resimulation == "bit for bit"
+
+
+def test_a_reversed_motor_that_holds_the_handle_on_its_stop_is_said_to_be_unknown(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    device = OnItsStop(0.012, -1.0, push=0.3)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(2.3)
+    assert summary.is_certified is False
+    assert "move the handle away from its stop" in str(summary)
+    ticks = hb.read_recording(path).ticks
+    assert np.abs(ticks["wrench_on_device"][:, 0]).max() > 4.0
+    assert (ticks["share"][1500:] == 0.25).all()  # the force does not come back
+    report = audit(path)
+    assert report.resimulation == "bit for bit"
+    assert report.certified is False
+    assert "not known whether its motors push the right way" in report.reason
+
+
+@pytest.mark.parametrize(("sign", "push"), [(1.0, 8.0), (-1.0, 0.3)])
+def test_the_force_comes_back_off_the_stop_if_the_motor_is_right(sign: float, push: float) -> None:
+    device = OnItsStop(0.012, sign, push, leaves=1.8)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+        bridge.run(2.3)
+        ticks = bridge.latest_records(2300)
+    assert ticks["share"][1790] == 0.25
+    assert ticks["device_position"][-1, 0] < 0.009
+    assert ticks["share"][-1] == (1.0 if sign > 0.0 else 0.0)
+
+
+def test_a_hand_that_friction_holds_at_a_wall_is_acquitted_once() -> None:
+    """It stands still, and moves against the force when that is lowered."""
+    path = Motion([0.0, 0.5, 4.0], [(x, 0.0, 0.0) for x in (0.0, 0.05, 0.05)])
+    device = SimulatedDevice(path=path, hand=DEFAULT_HAND, friction=0.5)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock()) as bridge:
+        summary = bridge.run(4.0)
+        flags = bridge.latest_records(4000)["flags"]
+    is_probed = flags & int(TickFlag.PROBED) != 0
+    assert np.count_nonzero(np.diff(is_probed.astype(int)) == 1) == 1
+    assert summary.is_certified
+    assert not summary.timekeeping.watch
 
 
 @pytest.mark.parametrize("limit", [2.0, 10.0])
@@ -215,3 +258,24 @@ def test_motion_that_no_force_changes_is_an_alarm_only_if_its_device_claims_a_ha
         flags = int(np.bitwise_or.reduce(bridge.latest_records(1000)["flags"]))
     is_alarm = flags & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY) != 0
     assert is_alarm != is_prescribed
+
+
+def test_a_silence_of_the_device_is_named_in_summary_audit_and_live_line(tmp_path: Path) -> None:
+    device, path = SimulatedDevice(), tmp_path / "run.mcap"
+    inner, ticks = device.read, iter(range(10000))
+
+    def read(sample: NDArray[np.void]) -> int:
+        if 300 <= next(ticks) < 800:
+            return int(TickFlag.STALE_SAMPLE)
+        return inner(sample)
+
+    device.read = read  # type: ignore[method-assign]
+    with hb.Bridge("point_mass", device, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(1.2)
+    words = "the device gave no new sample for 500 ms (at 0.3 s)"
+    assert words in str(summary)
+    assert words in audit(path).reason
+    state = RunState()
+    for part in np.array_split(hb.read_recording(path).ticks, 7):
+        state.add(part)
+    assert "NO NEW SAMPLE for 0.5 s" in str(state)

@@ -100,7 +100,7 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     if recording.seal_fault:
         return Fault(recording.seal_fault)
     if not recording.count:
-        return Fault("the recording holds no tick")
+        return Fault("the recording is empty: the run had no tick")
     last = recording.last_tick
     # the last rows may be lost although a later event is kept, if that was in an earlier chunk
     may_lack = recording.is_cut or any(e.get("event") == "repaired" for e in recording.events)
@@ -243,6 +243,7 @@ def _flag_faults(
         (TickFlag.SWINGING, none, every & math.isfinite(guarding.swing_energy)),
         (TickFlag.RUNS_AWAY, none, every & math.isfinite(guarding.runaway_speed)),
         (TickFlag.PROBED, none, every & math.isfinite(guarding.runaway_speed)),
+        (TickFlag.UNANSWERED, none, every & math.isfinite(guarding.runaway_speed)),
     ):
         has = has_flag(ticks, flag)
         name = (flag.name or "").lower()

@@ -41,6 +41,8 @@ class TimingTally:
         scene_steps: Results of a slower scene so far.
         newest_result: Number of the tick that took over the newest of them.
         longest_silence: Largest number of ticks without a new one so far.
+        silence: Longest time in s without a new sample so far.
+        silent_tick: Last tick of that time.
         fresh: Number of records with a new sample so far.
         due: Number of deadlines so far.
         overruns: Number of records after skipped deadlines so far.
@@ -61,6 +63,8 @@ class TimingTally:
     scene_steps: int = 0
     newest_result: int = 0
     longest_silence: int = 0
+    silence: float = 0.0
+    silent_tick: int = 0
     fresh: int = 0
     due: int = 0
     overruns: int = 0
@@ -80,7 +84,12 @@ class TimingTally:
         self.ticks += len(ticks)
         if parameters.scene_ticks:
             self._add_results(ticks)
-        self.fresh += int(np.count_nonzero(~has_flag(ticks, TickFlag.STALE_SAMPLE)))
+        is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
+        self.fresh += int(np.count_nonzero(~is_stale))
+        waited = np.where(is_stale, block.interval, 0.0)
+        if waited.max() > self.silence:
+            self.silence = float(waited.max())
+            self.silent_tick = int(ticks["tick"][waited.argmax()])
         self.due = max(round(1e-9 * int(ticks["deadline_ns"][-1]) / parameters.period), self.ticks)
         self.overruns += int(np.count_nonzero(has_flag(ticks, TickFlag.OVERRUN)))
         rows = np.concatenate([block.state.row, ticks])

@@ -190,7 +190,7 @@ def _decide_on_records(
     fault: Fault | None, energies: PassivityTally | None, *, strict: bool
 ) -> Decision:
     if fault is not None or energies is None:
-        fault = fault or Fault("the recording holds no tick")
+        fault = fault or Fault("the recording is empty: the run had no tick")
         return Decision("invalid", None, fault.reason, fault.tick, fault.port, fault.joules)
     unstrict, active, excess = energies.unstrict, energies.active, energies.excess
     if excess is not None and not (active is not None and active[0] <= excess[0]):
@@ -416,7 +416,7 @@ def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tup
     if facts["certified"] is False and not (kept and kept.refutation):
         doubt = "the device has less damping than the coupling needs"
     pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
-    return doubt, pushed, unusual_end(events), facts["unchecked"]
+    return kept.silence if kept else "", doubt, pushed, unusual_end(events), facts["unchecked"]
 
 
 def _check_records(
@@ -519,7 +519,7 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
             "conditions": condition_sentences(info, worst, method),
             "damping_margin": damping_margin(conditions),
             "coupling": coupling,
-            "coupling_sentences": coupling.sentences(),
+            "coupling_sentences": coupling.sentences(info),
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
@@ -548,6 +548,8 @@ def _time_facts(
         has_tripped=any(event.get("event") == "trip" for event in recording.events),
         scene_steps=timing.scene_steps,
         scene_silence=run.parameters.period * timing.longest_silence,
+        silence=timing.silence,
+        silent_tick=timing.silent_tick,
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.of(times, run.worst, conditions)

@@ -342,7 +342,7 @@ class Audit:
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
     judged = "environment " if report.environment and not report.port else ""
-    tripped = " [bold yellow]until the guard tripped[/]" if "trip" in report.events else ""
+    tripped = ", [bold yellow]then the guard stopped the run[/]" if "trip" in report.events else ""
     out.print(f"{plain(str(report.path))}: {judged}[bold {colour}]{report.words}[/]{tripped}")
     out.print(f"  {plain(report.reason)}")
     if report.resimulation.startswith("not"):

@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
+from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
@@ -24,9 +25,10 @@ from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import FORCE_SHARE, TRAVEL, UNHELD, duration_at
 from hapticbridge.identify.profile import draw_identification, measured_profile
 from hapticbridge.plotting import check_ending
+from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.z_width import ZWidth, z_width
-from hapticbridge.theory_plots import draw_z_width, recommended, recommended_coupling
+from hapticbridge.theory_plots import draw_z_width
 from hapticbridge.units import format_si
 
 
@@ -52,12 +54,21 @@ def safe_width(result: Identification) -> ZWidth | None:
     )
 
 
-def print_result(result: Identification, z: ZWidth | None, device: str) -> None:
+def coupling_of_run(result: Identification, profile: Profile) -> RunCoupling:
+    """Returns the coupling that a run chooses by itself with the profile of what was measured."""
+    coupling = default_coupling(profile.fill(result.info), result.period)
+    return RunCoupling.of(default_method(), result.period, coupling)
+
+
+def print_result(
+    result: Identification, z: ZWidth | None, coupling: RunCoupling, device: str
+) -> None:
     """Prints what was measured, how surely, and the coupling to use.
 
     Args:
         result: What ``identify`` returned.
         z: What ``safe_width`` made of it.
+        coupling: What ``coupling_of_run`` returned.
         device: The device as the user named it.
     """
     for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
@@ -100,11 +111,11 @@ def print_result(result: Identification, z: ZWidth | None, device: str) -> None:
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
         f"{z.limit[0]:.4g} N/m at B_law = 0 ({z.corner_limited_by})"
     )
-    (sentence,) = recommended_coupling(z).sentences()
-    coupling = recommended(z)
-    out.print(f"use {sentence}")
-    command = next_command(coupling.stiffness, coupling.damping, 1.0 / z.period)
-    out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
+    out.print(f"use {coupling.sentences()[0]}")
+    requested = coupling.requested
+    if requested is not None:
+        command = next_command(requested.stiffness, requested.damping, 1.0 / z.period)
+        out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
 
 
 def why_none(result: Identification) -> str:
@@ -114,7 +125,9 @@ def why_none(result: Identification) -> str:
     return "damping may be zero: no coupling is safe for any hand"
 
 
-def facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[str, object]:
+def facts(
+    result: Identification, z: ZWidth | None, coupling: RunCoupling, path: Path | None
+) -> dict[str, object]:
     """Returns the facts that ``print_result`` prints, for ``--json``."""
     return {
         "device": result.info.name,
@@ -126,7 +139,7 @@ def facts(result: Identification, z: ZWidth | None, path: Path | None) -> dict[s
         "confidence": CONFIDENCE,
         "assumed": UNHELD,
         "largest_stiffness": None if z is None else float(z.limit[0]),
-        "coupling": None if z is None else asdict(recommended_coupling(z)),
+        "coupling": None if z is None else asdict(coupling),
         "profile": None if path is None else str(path),
     }
 
@@ -205,12 +218,13 @@ class Identify:
             duration=duration,
             workspace=getattr(device, "workspace", None),
         )
+        coupling = coupling_of_run(result, profile)
         path = self._place(profile, is_real=device.info.is_real)
         # first, so that a file that cannot be written costs nothing that was measured
         if self.as_json:
-            print_json(facts(result, z, path))
+            print_json(facts(result, z, coupling, path))
         else:
-            print_result(result, z, self.device)
+            print_result(result, z, coupling, self.device)
         if path is not None:
             _write(profile, path)
             notify(f"wrote {path}")

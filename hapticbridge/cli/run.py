@@ -83,7 +83,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
     rendered = RunCoupling.of(method, setup.timestep, coupling, is_always_implicit=held)
     scales = setup.workspace.scales
-    for sentence in rendered.felt_at(setup.scene.grip, *scales).sentences():
+    for sentence in rendered.felt_at(setup.scene.grip, *scales).sentences(setup.info):
         err.print(f"  {sentence}")
     coarse = coarse_spring(setup.scene.model, setup.scene.grip, method)
     if coarse:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,10 @@ out = Console(highlight=False, soft_wrap=True)
 
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 """Progress, warnings and errors, on stderr, so that a pipe gets results alone."""
+
+
+REPRINT = 2.0
+"""Time in s between two plain lines of progress."""
 
 
 def plain(text: str) -> str:
@@ -81,10 +86,6 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: object) -
         err.print(f"[yellow]warning:[/yellow] {escape(str(message))}")
 
 
-SILENCE = 2.0
-"""Time in s after which work is named where nothing can be animated. Shorter work needs no word."""
-
-
 @contextmanager
 def working(words: str) -> Iterator[None]:
     """Names work while it is done, on stderr: at once on a terminal, else once if it takes long.
@@ -96,7 +97,7 @@ def working(words: str) -> Iterator[None]:
         with err.status(f"{words} …"):
             yield
         return
-    timer = threading.Timer(SILENCE, err.print, (f"{words} …",))
+    timer = threading.Timer(REPRINT, err.print, (f"{words} …",))
     timer.daemon = True
     timer.start()
     try:
@@ -109,8 +110,7 @@ def working(words: str) -> Iterator[None]:
 def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., None]]:
     """Shows a bar on stderr; yields a function of the work done, the whole work and a name.
 
-    Without a terminal there is no bar, because rich would leave an empty line of it in a file. Long
-    work is named once.
+    Without a terminal there is no bar but a plain line every ``REPRINT`` seconds, as in a run.
 
     Args:
         words: Description of the work.
@@ -125,13 +125,16 @@ def progress(words: str, *, is_counted: bool = False) -> Iterator[Callable[..., 
 
     count = [TextColumn("{task.completed}/{task.total}")] if is_counted else []
     columns = TextColumn("{task.description}"), BarColumn(), *count, TimeRemainingColumn()
-    quiet = nullcontext() if err.is_terminal else working(words)
-    with quiet, Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(words, total=None)
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        task, printed = bar.add_task(words, total=None), time.monotonic()
 
         def show(done: int, total: int, name: str = "") -> None:
             description = f"{words}: {plain(name)}" if name else words
             bar.update(task, completed=done, total=total, description=description)
+            nonlocal printed
+            if not err.is_terminal and time.monotonic() - printed >= REPRINT:
+                printed = time.monotonic()
+                err.print(f"{description}  {100 * done / total:.0f} %")
 
         yield show
 

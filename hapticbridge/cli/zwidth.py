@@ -330,6 +330,7 @@ class Bound:
             table.add_row(way.name, amount, _where(way), *verdict)
         out.print(table)
         least = method.compensated_share * self.stiffness * period
+        out.print("a delay of the device is not in it: 'zwidth --delay' has the limit at a wall")
         if self.damping < least:
             out.print(
                 f"method {method.name} cannot show less than B = {least:.4g} N s/m at this "

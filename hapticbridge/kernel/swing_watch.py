@@ -38,6 +38,12 @@ comes back. This step is no hand's will, so the answer to it shows delay and sig
 the limit. A probe is no alarm. The next one waits 0.5 s, then twice as long each time up to 8 s;
 the findings above need no probe and wait for nothing.
 
+A handle on its mechanical stop cannot answer: a reversed motor presses it there and nothing swings.
+One that stands for 1 s, with equal samples, against 1.5 N (0.075 N m) is probed, too. If it then
+moves against the force, a hand pushed it and the motor is right, for the rest of the run. If it
+stands through the probe, r stays at the quarter until the handle is 2 mm away, and the flag
+``UNANSWERED`` stays.
+
 The margins, in 856 runs of honest hands of 0.05 to 2 kg and up to 3000 N/m that tap, hammer and
 shake at up to 8 Hz and 30 mm, with limits of 2, 5 and 10 N: p >= −0.07 where E_s >= E/4; on a
 device 2 ms late, which is clean, −0.36 where E_s >= E/4 and −0.28 where E_s >= E; c >= −0.45; x <=
@@ -62,7 +68,15 @@ import math
 import numpy as np
 
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import PROBED, RUNS_AWAY, STALE_SAMPLE, SWINGING, Part, State
+from hapticbridge.kernel.codes import (
+    PROBED,
+    RUNS_AWAY,
+    STALE_SAMPLE,
+    SWINGING,
+    UNANSWERED,
+    Part,
+    State,
+)
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import Vector, norm
 
@@ -126,6 +140,16 @@ PROBE, PROBE_SHARE, REST, LONGEST_REST = 0.15, 0.25, 0.5, 8.0
 """Duration in s of a probe, its share of the ratio, and the first and longest rest after it in s.
 At a quarter of the ratio a swing has a sixteenth of the stiffness and ends."""
 
+STAND, AWAY = 1.0, 2e-3
+"""Time in s for which all samples of a handle that stands are equal, and distance in m at which it
+has left. The tremor of a hand, at 8 to 12 Hz, leaves a step of most encoders within
+1 s. Friction may hide it, and the answer to the probe is larger. Angles are ``USUAL_ARM`` times
+as many rad."""
+
+PUSH = 1.5, 0.075
+"""Least force in N and torque in N m under which a handle that stands is suspicious. A probe takes
+three quarters of it away, more than twice the friction of a desktop device."""
+
 RING = 16
 """Blocks that are kept for late work."""
 
@@ -142,6 +166,7 @@ WATCH_DTYPE = np.dtype(
         ("gain", "<f8", 2),
         ("probe_blocks", "<i8"),
         ("longest_rest", "<i8"),
+        ("stand_blocks", "<i8"),
         ("flags", "<i8"),
         ("max_share", "<f8"),
         ("cap", "<f8"),
@@ -177,12 +202,16 @@ WATCH_DTYPE = np.dtype(
         ("still", "<i8", 2),
         ("steps", "<f8", 2),
         ("counts", "<i8", 8),
+        ("stray", "<f8", 6),
+        ("stood", "<i8", 2),
+        ("is_right", "<i8", 2),
+        ("is_held", "<i8", 2),
     ]
 )
 """Sub-record ``watch``, written by this module alone. ``block_ticks`` is 0 without a watch; pairs
 are translation and rotation.
 
-The first eleven are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
+The first twelve are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
 slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
 N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_share`` the one
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
@@ -190,7 +219,9 @@ allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_e
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
 ``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and Σ
 W². ``still`` counts the equal samples before this one, and ``steps`` the coarse steps of late;
-``counts`` are blocks in a row of late, reversed, exchanged and answered late."""
+``counts`` are blocks in a row of late, reversed, exchanged and answered late. ``stray`` is the way
+from where the handle stands, ``stood`` the blocks since; ``is_right`` is 1 once it moved as a motor
+that is right lets it, ``is_held`` while r waits for it to leave."""
 
 
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
@@ -211,8 +242,8 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     watch["late_energy"] = [limits.swing_energy * part for part in level]
     speed = limits.runaway_speed
     watch["gain"] = speed * level[0], USUAL_ARM * speed * level[1]
-    watch["probe_blocks"], watch["rest"], watch["longest_rest"] = (
-        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST)
+    watch["probe_blocks"], watch["rest"], watch["longest_rest"], watch["stand_blocks"] = (
+        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST, STAND)
     )
 
 
@@ -286,6 +317,8 @@ def _close_block(s: State) -> None:
         _add_block(s, kind)
         _add_late_answers(watch, kind)
         verdict |= _verdict(s, kind)
+        if _stands(s, kind):
+            verdict |= PROBED
     for i in range(6):
         watch.wrench[i] = watch.motion[i] = 0.0
     watch.blocks += 1
@@ -304,13 +337,43 @@ def _close_block(s: State) -> None:
         watch.rest_end = watch.probe_end + watch.rest
         watch.rest = min(2 * watch.rest, watch.longest_rest)
         watch.returns_to = s.guard.share
-    is_probing = watch.blocks < watch.probe_end
+    is_probing = watch.blocks < watch.probe_end or watch.is_held[0] + watch.is_held[1] > 0
     watch.max_share = PROBE_SHARE * watch.cap if is_probing else watch.cap
     watch.flags &= ~PROBED
     if is_probing or s.guard.share < watch.returns_to:
         watch.flags |= PROBED
     else:
         watch.returns_to = 0.0
+
+
+@compiled
+def _stands(s: State, kind: int) -> bool:
+    """Returns True if the handle stands against the force; judges its answer to a probe."""
+    watch, stray, first = s.watch, s.watch.stray, 3 * kind
+    if s.loop.external_flags & STALE_SAMPLE:
+        return False
+    way = along = square = 0.0
+    for i in range(first, first + 3):
+        stray[i] += watch.motion[i]
+        way += stray[i] * stray[i]
+        along += stray[i] * watch.wrench[i]
+        square += watch.wrench[i] * watch.wrench[i]
+    way = math.sqrt(way) / (1.0 if kind == 0 else USUAL_ARM)
+    if way > (AWAY if watch.is_held[kind] else 0.0):
+        is_probed = watch.blocks < watch.probe_end
+        if is_probed and watch.stood[kind] >= watch.stand_blocks and along < 0.0:
+            watch.is_right[kind] = 1
+        watch.is_held[kind] = watch.stood[kind] = 0
+        for i in range(first, first + 3):
+            stray[i] = 0.0
+    elif watch.stood[kind] > 0 or math.sqrt(square) >= PUSH[kind] * watch.ticks:
+        watch.stood[kind] += 1
+    if watch.stood[kind] < watch.stand_blocks or watch.is_right[kind] or watch.is_held[kind]:
+        return False
+    if watch.blocks == watch.probe_end - 1:
+        watch.is_held[kind] = 1
+        watch.flags |= UNANSWERED
+    return True
 
 
 @compiled

@@ -70,6 +70,8 @@ GUARD_DTYPE = np.dtype(
         ("fresh", "<i8"),
         ("time_since_sample", "<f8"),
         ("silence", "<f8"),
+        ("longest_silence", "<f8"),
+        ("silent_tick", "<i8"),
         ("start_tick", "<i8"),
         ("rise_ticks", "<i8"),
         ("share", "<f8"),
@@ -80,7 +82,8 @@ GUARD_DTYPE = np.dtype(
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
 ``time_since_sample`` and ``silence`` in s, the latter of the last silence of the device until the
-force has come back; ``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
+force has come back; ``longest_silence`` in s of the whole run ended at ``silent_tick``;
+``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
 of the lever between device and handle;
 ``rise_ticks`` its time from 0 to 1."""
 
@@ -178,6 +181,8 @@ def advance_share(s: State, position: Vector, buttons: int, elapsed: float) -> N
     if not is_stale and guard.time_since_sample > 0.0:
         guard.silence = guard.time_since_sample
     guard.time_since_sample = waited if is_stale else 0.0
+    if is_stale and waited > guard.longest_silence:
+        guard.longest_silence, guard.silent_tick = waited, s.loop.tick
     is_clutched = (buttons & (guard.clutch | CLUTCHED)) != 0
     is_clutched = is_clutched or (guard.dead_man != 0 and (buttons & guard.dead_man) == 0)
     is_clutched = is_clutched or norm(position) > guard.reach

@@ -45,9 +45,14 @@ REPRINT = 2.0
 """Time in s between two plain lines."""
 
 
+SILENCE = 0.2
+"""Least time in s without a new sample of the device that is shown. A hand notices that the force
+is gone; a slow device has a sample within it."""
+
 LOWERED = {
     int(TickFlag.RUNS_AWAY): "FORCE TAKEN AWAY: the device does not move as it is pushed",
     int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late",
+    int(TickFlag.UNANSWERED): "FORCE LOWERED: the device does not move; move it off its stop",
 }
 """Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
 
@@ -65,18 +70,29 @@ class RunState:
         self._flags = 0
         self._overruns = 0
         self._dropped = 0
+        self._fresh_ns = np.zeros(len(are_held))
+        self._silence = 0.0
 
     def add(self, rows: NDArray[np.void]) -> None:
         """Adds new records, ``TICK_DTYPE``: of n >= 1 ticks, in each tick one per hand."""
         count = len(self._are_held)
         self._last = rows[-count:].copy()
         self._flags |= int(np.bitwise_or.reduce(rows["flags"]))
+        self._add_silence(rows.reshape(-1, count))
         rows = rows[::count]  # counted by the first hand
         self._overruns += int(np.count_nonzero(rows["flags"] & TickFlag.OVERRUN))
         missing = np.diff(rows["tick"], prepend=self._last_tick) - 1
         is_gap = (rows["flags"] & TickFlag.DROPPED_BEFORE) != 0
         self._dropped += int(missing[is_gap].clip(min=0).sum())
         self._last_tick = int(rows["tick"][-1])
+
+    def _add_silence(self, rows: NDArray[np.void]) -> None:
+        """Adds the longest time without a new sample, of (n, hands) records."""
+        due, is_stale = rows["deadline_ns"], rows["flags"] & TickFlag.STALE_SAMPLE != 0
+        fresh = np.maximum.accumulate(np.where(is_stale, 0, due), axis=0)
+        fresh = np.maximum(fresh, self._fresh_ns)
+        self._silence = max(self._silence, 1e-9 * float((due - fresh).max()))
+        self._fresh_ns = fresh[-1]
 
     def __str__(self) -> str:
         if self._last is None:
@@ -98,6 +114,8 @@ class RunState:
             f"{self._overruns} overruns",
         ]
         parts += [words for flag, words in LOWERED.items() if self._flags & flag][:1]
+        if self._silence >= SILENCE:
+            parts.append(f"NO NEW SAMPLE for {self._silence:.1f} s")
         if self._dropped:
             parts.append(f"{self._dropped} records dropped")
         return "  ".join(parts)

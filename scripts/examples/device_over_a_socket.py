@@ -54,8 +54,10 @@ class Handle:
             self.link.send(NUMBER.pack(wrench[0]))
 
     def close(self) -> None:
-        """Ends the force."""
-        self.write(np.zeros(6))
+        """Ends the force, then the link; a second call does nothing."""
+        if self.link.fileno() >= 0:
+            self.write(np.zeros(6))
+            self.link.close()
 
 
 hardware = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -689,7 +689,8 @@ FAULTS = (
     Fault("10 x too stiff, free", stiff(10, None), "slips", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "slips"),
     Fault("edge of the workspace", _edge, "fades", within=150),
-    Fault("encoder steps of 50 µm", _quantised, "goes on"),
+    # the hand has no tremor: it stands within a step, is probed once, and the handle slips
+    Fault("encoder steps of 50 µm", _quantised, "slips"),
     Fault("encoder steps of 4 mm", corrupting(_coarse), "lowers", "coarse steps", within=300),
     *UNSEEN,
     Fault("error in the user's code", acting(_raise), "stops", "ZeroDivisionError"),
