@@ -52,7 +52,12 @@ def delay_ticks(info: DeviceInfo, period: float) -> int | None:
     """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
     if info.delay is None:
         return None
-    return max(0, math.ceil(info.delay / device_period(info, period) - _WHOLE))
+    return whole_ticks(info.delay, device_period(info, period))
+
+
+def whole_ticks(delay: float, period: float) -> int:
+    """Returns the whole ticks in which a delay in s ends; ticks of ``period`` in s."""
+    return max(0, math.ceil(delay / period - _WHOLE))
 
 
 def damping_for_delay(

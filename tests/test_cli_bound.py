@@ -54,7 +54,7 @@ def test_the_json_is_null_where_none_suffices(
     [
         "zwidth --damping 1e-30 --mass 1e30 --rate 1",
         "zwidth --damping 2 --friction 1e30 --resolution 1e-30",
-        "zwidth --damping 2 --delay 3 --filter-time 1e25",
+        "zwidth --damping 2 --delay 0.003 --filter-time 1e25",
         "bound --stiffness 1e24 --damping 1e30 --device-damping 1e-30",
         "bound --stiffness 1e-20 --damping 1e30 --device-damping 1e30",
     ],

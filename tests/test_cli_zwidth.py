@@ -16,7 +16,7 @@ FREE = "simulated:hand=none,resolution=1e-6"
 
 @pytest.mark.parametrize(
     "command",
-    [ZWIDTH, f"{ZWIDTH} --rate 2000 --delay 1", "bound --stiffness 2000 --device-damping 2"],
+    [ZWIDTH, f"{ZWIDTH} --rate 2000 --delay 0.5e-3", "bound --stiffness 2000 --device-damping 2"],
 )
 def test_the_next_command_runs_certified_and_is_rendered_as_it_asks(
     command: str, call: Called

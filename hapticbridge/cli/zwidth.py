@@ -10,7 +10,8 @@ from typing import Annotated
 import tyro
 from rich.table import Table
 
-from hapticbridge.certificate import delay_ticks
+from hapticbridge.arguments import Arguments
+from hapticbridge.certificate import delay_ticks, whole_ticks
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -22,7 +23,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.bounds import largest_effective_damping, law_damping
-from hapticbridge.theory.transfer import scalar
+from hapticbridge.theory.transfer import MAX_DELAY, scalar
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (
     Alternative,
@@ -32,6 +33,8 @@ from hapticbridge.theory_plots import (
     recommended,
     recommended_coupling,
 )
+
+_ARGUMENTS = Arguments(HapticBridgeError)
 
 DEFAULT_RATE = 1000.0
 """Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
@@ -70,8 +73,8 @@ class Zwidth:
     """Step of the device's position in m; by default exact."""
     rate: float = DEFAULT_RATE
     """Ticks per second."""
-    delay: int = 0
-    """Whole ticks from position to force, beyond the hold."""
+    delay: float = 0.0
+    """Time in s from position to force, beyond the hold; it counts as whole ticks."""
     filter_time: float = 0.0
     """Time constant in s of a first-order low-pass behind the coupling's damper."""
     plot: Path | None = None
@@ -137,7 +140,9 @@ class Zwidth:
         numbers = {
             name: getattr(self, name) for name in ("damping", "mass", "friction", "resolution")
         }
-        delay = self.delay
+        delay = whole_ticks(
+            _ARGUMENTS.number("--delay", self.delay, "s", least=0, most=MAX_DELAY * period), period
+        )
         if info is not None:
             numbers = {
                 name: getattr(info, name) if value is None else value

@@ -10,6 +10,7 @@ experimental.
 | engine | contacts and solver | coupling |
 |---|---|---|
 | ``mujoco`` | soft, two timesteps; Newton; ``implicitfast`` | held force |
+| ``mujoco_warp`` | the same, single precision | held force |
 | ``ode`` | direct solver, contact layer of 0.1 µm | held force |
 | ``ode_spring`` | the same | soft joints, solved with the contacts |
 | ``physx`` | TGS, 20 iterations, single precision | held force |

@@ -386,6 +386,7 @@ _PACKAGE = "hapticbridge.lab.engines"
 
 ENGINES = {
     "mujoco": "mujoco",
+    "mujoco_warp": "mujoco_warp",
     "ode": "ode",
     "ode_spring": "ode",
     "physx": "physx",

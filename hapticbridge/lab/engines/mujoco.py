@@ -87,7 +87,8 @@ class MujocoSimulation(HeldSimulation):
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         # views, read and written every step
-        self._applied = self._data.xfrc_applied[self._model.body("tool").id]
+        self._body = self._model.body("tool").id
+        self._applied = self._data.xfrc_applied[self._body]
         self._position, self._velocity = self._data.qpos, self._data.qvel
         self._position[:3], self._position[3:] = task.start.position, task.start.quaternion
         spin = task.start_velocity.angular
