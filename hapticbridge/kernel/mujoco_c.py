@@ -59,6 +59,9 @@ mj_mul_m: Any = external("mj_mulM", "void(intp, intp, intp, intp)")
 mj_mul_jac: Any = external("mj_mulJacVec", "void(intp, intp, intp, intp)")
 mj_solve_m: Any = external("mj_solveM", "void(intp, intp, intp, intp, int32)")
 mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, int32, intp)")
+mju_normalize4: Any = external("mju_normalize4", "double(intp)")
+mju_quat2mat: Any = external("mju_quat2Mat", "void(intp, intp)")
+mju_sub_quat: Any = external("mju_subQuat", "void(intp, intp, intp)")
 mj_contact_force: Any = external("mj_contactForce", "void(intp, intp, int32, intp)")
 
 
@@ -243,9 +246,16 @@ _DATA_ARRAYS = (
     "ctrl",
     "mocap_pos",
     "mocap_quat",
+    "xpos",
+    "xquat",
+    "xmat",
+    "xipos",
+    "ximat",
     "site_xpos",
     "site_xquat",
-    "xipos",
+    "site_xmat",
+    "subtree_com",
+    "cdof",
     "ten_length",
     "qfrc_actuator",
     "qfrc_applied",
@@ -253,6 +263,7 @@ _DATA_ARRAYS = (
     "qfrc_gravcomp",
     "xfrc_applied",
     "actuator_force",
+    "actuator_length",
     "moment_rownnz",
     "moment_rowadr",
     "moment_colind",
@@ -326,9 +337,13 @@ _CONTACT = (
 )
 _IDS = (
     "handle_mocap_id",
+    "handle_body_id",
     "handle_site_id",
     "grip_site_id",
     "grip_body_id",
+    "grip_root_id",
+    "grip_dofs",
+    "grip_dof_count",
     "weld_id",
     "coupling_actuator_id",
     "coupling_output_adr",
@@ -345,6 +360,7 @@ _FACTS = (
     "has_gravity_compensation",
     "has_tendons_or_flexes",
     "is_discrete",
+    "is_handle_alone",
 )
 
 MJ_DTYPE = np.dtype(
