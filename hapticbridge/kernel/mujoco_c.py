@@ -111,9 +111,16 @@ def ints(address: int, count: int) -> NDArray[np.int32]:
 
 
 @compiled
+def wide_ints(address: int, count: int) -> NDArray[np.int64]:
+    """Returns ``count`` 64-bit integers at an address, as a view."""
+    view: NDArray[np.int64] = _view(_as_pointer(address), count, np.int64)
+    return view
+
+
+@compiled
 def pointer_at(address: int) -> int:
     """Returns the pointer stored at an address (arrays in MuJoCo's arena move between steps)."""
-    return int(_view(_as_pointer(address), 1, np.int64)[0])
+    return int(wide_ints(address, 1)[0])
 
 
 _DIVERGED = tuple(
@@ -215,14 +222,19 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     """Returns the addresses of model and data for the C functions.
 
     Raises:
-        SceneError: The described layout of ``mjData`` is not that of the library, so the compiled
-            tick would read wrong memory.
+        SceneError: The described layout of ``mjData`` or ``mjModel`` is not that of the library, so
+            the compiled tick would read wrong memory.
     """
+    option = struct_of("mjModel").from_address(model._address).opt
     view = struct_of("mjData").from_address(data._address)
     agrees = (
         view.ncon == data.ncon
         and view.nefc == data.nefc
         and view.nisland == data.nisland
+        and view.nbody_awake == data.nbody_awake
+        and view.dof_awake_ind == data.dof_awake_ind.ctypes.data
+        and (option.disableflags, option.enableflags)
+        == (model.opt.disableflags, model.opt.enableflags)
         and view.time == data.time
         and view.qvel == data.qvel.ctypes.data
         and view.site_xpos == data.site_xpos.ctypes.data
@@ -231,7 +243,7 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     )
     if not agrees:
         raise SceneError(
-            f"MuJoCo {mujoco.__version__} lays out mjData differently from its own description; "
+            f"MuJoCo {mujoco.__version__} lays out its data differently from its own description; "
             "install a version from constraints.txt"
         )
     return int(model._address), int(data._address)
@@ -259,6 +271,7 @@ _DATA_ARRAYS = (
     "ten_length",
     "qfrc_actuator",
     "qfrc_applied",
+    "qfrc_bias",
     "qfrc_constraint",
     "qfrc_gravcomp",
     "xfrc_applied",
@@ -274,6 +287,12 @@ _DATA_ARRAYS = (
 _DATA_FIELDS = (
     "time",
     "ncon",
+    "nbody_awake",
+    "nparent_awake",
+    "nv_awake",
+    "body_awake_ind",
+    "parent_awake_ind",
+    "dof_awake_ind",
     "nisland",
     "nefmA",
     "efm_aid",
@@ -367,7 +386,7 @@ MJ_DTYPE = np.dtype(
     [
         (name, "<i8")
         for name in (
-            *("model", "data", "warnings", "gainprm", "biasprm"),
+            *("model", "data", "warnings", "gainprm", "biasprm", "enableflags"),
             *_DATA_ARRAYS,
             *_DATA_FIELDS,
             *_OWNED,
@@ -402,6 +421,8 @@ def model_addresses(
     values |= {name: getattr(data, name).ctypes.data for name in _DATA_ARRAYS}
     values |= {name: field_address(data, name) for name in _DATA_FIELDS}
     values["warnings"] = field_address(data, "warning")
+    options = struct_of("mjModel").opt.offset + struct_of("mjOption").enableflags.offset
+    values["enableflags"] = model_address + options
     values["gainprm"] = model.actuator_gainprm.ctypes.data
     values["biasprm"] = model.actuator_biasprm.ctypes.data
     values |= {name: getattr(model, name) for name in _SIZES}
