@@ -35,7 +35,7 @@ from hapticbridge.kernel.handle import (
     tool_motion,
 )
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
-from hapticbridge.kernel.ledger import meter_ports_again
+from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.kernel.rigid_contact import aim_again
 from hapticbridge.pose import Vector, norm, scaled
@@ -121,14 +121,6 @@ def _copy_state(s: State, is_kept: bool) -> None:
 def keep_state(s: State) -> None:
     """Keeps MuJoCo's state before a step, for a repetition of the step."""
     _copy_state(s, True)
-
-
-@compiled
-def _has_loaded_body(s: State) -> bool:
-    found = False
-    for value in floats(s.mj.xfrc_applied, 6 * s.mj.nbody):
-        found = found or value != 0.0
-    return found
 
 
 @compiled
@@ -221,7 +213,7 @@ def _start_again(s: State, count: int) -> None:
     """Repeats the step that just ended, after ``count`` repetitions, within the tank."""
     if count == 0:
         _copy_state(s, False)
-        if s.level.reads_poses or _has_loaded_body(s):  # which act at the start's positions
+        if s.level.reads_poses or has_loaded_body(s):  # which act at the start's positions
             mj_kinematics(s.mj.model, s.mj.data)
     _repeat_step(s)
     spend_within_tank(s)

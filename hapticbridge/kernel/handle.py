@@ -275,8 +275,8 @@ def handle_of_step(s: State, is_last: bool) -> tuple[Vector, Quaternion]:
 #
 # The handle is a body of the world without joint, mass or geom. Its pose decides its frames, and
 # length and moment of the coupling's actuators, which measure the grip's pose in the handle's axes.
-# Kinematics and transmission of a whole scene take a fifth of MuJoCo's step, with 1 as with 100 free
-# bodies, and compute the same numbers to the bit.
+# Kinematics and transmission of a whole scene take a fifth of MuJoCo's step, with one free body as
+# with a hundred, and compute the same numbers to the bit.
 
 
 def bind_handle(mj: Part, model: mujoco.MjModel) -> dict[str, NDArray[np.generic]]:

@@ -348,12 +348,11 @@ def take_handle_in(s: State) -> None:
 @compiled
 def is_sound(s: State) -> bool:
     """Returns True if MuJoCo's check at the start of a step would find nothing to reset."""
-    mj = s.mj
+    mj, found = s.mj, 0
     for values in (floats(mj.qpos, mj.nq), floats(mj.qvel, mj.nv)):
-        for value in values:
-            if not abs(value) < LARGEST_CONTROL:  # also False for a value that is not a number
-                return False
-    return True
+        for value in values:  # without a branch, so that several are compared at once
+            found |= not abs(value) < LARGEST_CONTROL  # also for a value that is not a number
+    return found == 0
 
 
 @compiled
