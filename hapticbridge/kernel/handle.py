@@ -279,29 +279,28 @@ def handle_of_step(s: State, is_last: bool) -> tuple[Vector, Quaternion]:
 # with a hundred, and compute the same numbers to the bit.
 
 
-def bind_handle(mj: Part, model: mujoco.MjModel) -> dict[str, NDArray[np.generic]]:
-    """Fills in the grip's degrees of freedom; returns the arrays that must outlive the state.
+def handle_facts(mj: Part, model: mujoco.MjModel) -> tuple[dict[str, int], NDArray[np.int32]]:
+    """Returns numbers of ``MJ_DTYPE`` about grip and handle, and the grip's degrees of freedom.
 
-    Needs the ids of grip and handle. ``is_handle_alone`` becomes 0 if other actuators follow those
-    of the coupling, whose place in MuJoCo's arrays depends on the coupling's moments.
+    Needs the ids of both. ``is_handle_alone`` is 0 if other actuators follow those of the coupling,
+    whose place in MuJoCo's arrays depends on the coupling's moments.
     """
     body, dofs = int(mj["grip_body_id"]), list[int]()
-    mj["grip_root_id"] = model.body_rootid[body]
+    root = int(model.body_rootid[body])
     while body > 0 and model.body_dofnum[body] == 0:
         body = int(model.body_parentid[body])
     dof = int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body > 0 else -1
     while dof >= 0:
         dofs.insert(0, dof)
         dof = int(model.dof_parentid[dof])
-    mj["grip_dof_count"] = len(dofs)
     handle, site = int(mj["handle_body_id"]), int(mj["handle_site_id"])
-    is_last = int(mj["coupling_output_adr"]) + 6 == model.nu
-    mj["is_handle_alone"] = (
-        is_last
+    is_alone = (
+        int(mj["coupling_output_adr"]) + 6 == model.nu
         and model.body_sameframe[handle] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
         and model.site_sameframe[site] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
     )
-    return {"grip_dofs": np.array(dofs or [0], dtype=np.int32)}
+    facts = {"grip_root_id": root, "grip_dof_count": len(dofs), "is_handle_alone": bool(is_alone)}
+    return facts, np.array(dofs or [0], dtype=np.int32)
 
 
 @compiled

@@ -53,9 +53,9 @@ from hapticbridge.kernel.compared_methods import balance_contacts, massless_tool
 from hapticbridge.kernel.force_level import LEVEL_DTYPE, bind_level
 from hapticbridge.kernel.handle import (
     POSE_DTYPE,
-    bind_handle,
     bind_poses,
     follow_handle,
+    handle_facts,
     move_handle_home,
     set_tool,
 )
@@ -342,7 +342,10 @@ class BoundKernel:
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
-        self._own(bind_handle(mj, model))
+        facts, dofs = handle_facts(mj, model)
+        for name, value in facts.items():
+            mj[name] = value
+        self._own({"grip_dofs": dofs})
         mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))
