@@ -243,7 +243,7 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     )
     if not agrees:
         raise SceneError(
-            f"MuJoCo {mujoco.__version__} lays out its data differently from its own description; "
+            f"MuJoCo {mujoco.__version__} lays out its structs differently from its description; "
             "install a version from constraints.txt"
         )
     return int(model._address), int(data._address)
