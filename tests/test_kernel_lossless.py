@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device.trajectory import pose_at, read_motion
+from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.lossless import evaluate_tool_passive, write_tool_bias
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
 from hapticbridge.lab.closed_loop import ClosedLoop
@@ -591,3 +593,61 @@ def test_a_tool_on_a_cloth_is_held_by_it() -> None:
     is_free = (rows["flags"] & int(TickFlag.MIDPOINT)) != 0
     assert touches.any() and is_free.any()
     assert not (touches & is_free).any()
+
+
+# --- bias and passive forces of the tool's tree alone --------------------------------------------
+
+TREES = """
+<mujoco>
+  <option viscosity="0.1" density="3"/>
+  <worldbody>
+    <body pos="1 0 0">
+      <freejoint/><geom size=".1" mass="1"/>
+      <body pos=".3 0 0" gravcomp=".5">
+        <joint axis="0 1 0" stiffness="3" damping=".2"/><geom size=".1" mass="1"/>
+      </body>
+    </body>
+    <body gravcomp="1">
+      <freejoint/><geom type="box" size=".1 .2 .3" mass="1"/>
+      <body pos=".3 0 0">
+        <joint axis="0 1 0" stiffness="3" damping=".2"/><joint type="slide" axis="1 1 0"/>
+        <geom size=".1" pos=".1 0 0" mass="1"/><site name="grip" pos=".1 .2 0"/>
+      </body>
+      <body pos="0 .3 0" gravcomp=".4">
+        <joint type="ball" stiffness="1" damping=".1"/>
+        <geom type="capsule" size=".1 .2" pos=".1 0 0" mass="1"/>
+      </body>
+    </body>
+    <body pos="-1 0 0"><joint stiffness="1"/><geom size=".1" pos=".1 0 0" mass="1"/></body>
+  </worldbody>
+</mujoco>"""
+"""The tool's tree between two others, with every passive force but those of tendons."""
+
+
+def test_bias_and_passive_forces_of_the_tools_tree_are_those_of_the_scene_to_the_bit() -> None:
+    """Against MuJoCo's evaluation of all trees; the other trees' numbers stay as they were."""
+    scene, rng = load(TREES), np.random.default_rng(3)
+    kernel = bound(scene, "lossless", Coupling(100.0, 1.0, 1.0, 0.01), 1e-3)
+    s, model, data = kernel.state[0], scene.model, scene.data
+    tree = model.dof_treeid == model.body_treeid[s["mj"]["grip_body_id"]]
+    write, passive = direct(write_tool_bias, s, 0, 0), direct(evaluate_tool_passive, s)
+    speeds, bias, whole = (np.zeros(model.nv) for _ in range(3))
+    for _ in range(100):
+        data.qpos[:] = model.qpos0 + 0.5 * rng.normal(size=model.nq)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        data.qvel[:], speeds[:] = rng.normal(size=(2, model.nv))
+        mujoco.mj_forward(model, data)
+        before = (data.qvel.copy(), data.qfrc_bias.copy(), data.qfrc_passive.copy())
+        write(s, speeds.ctypes.data, bias.ctypes.data)
+        assert np.array_equal(before[0], data.qvel)
+        assert np.array_equal(before[1], data.qfrc_bias)
+        data.qvel[:] = speeds
+        passive(s)
+        found = data.qfrc_passive.copy()
+        assert np.array_equal(found[~tree], before[2][~tree])
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_rne(model, data, 0, whole)
+        mujoco.mj_passive(model, data)
+        assert np.array_equal(bias[tree], whole[tree])
+        assert np.array_equal(found[tree], data.qfrc_passive[tree])
+    assert not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP

@@ -360,19 +360,23 @@ def test_described_layout_is_that_of_the_library() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
-    [("mjtNum", "lays out mjData differently"), ("mjtNew", "uses a type 'mjtNew'")],
+    ("struct", "kind", "message"),
+    [
+        ("mjData", "mjtNum", "lays out its structs differently"),
+        ("mjOption", "mjtNum", "lays out its structs differently"),
+        ("mjData", "mjtNew", "uses a type 'mjtNew'"),
+    ],
 )
-def test_another_layout_of_mujocos_data_is_refused(
-    monkeypatch: pytest.MonkeyPatch, kind: str, message: str
+def test_another_layout_of_mujocos_structs_is_refused(
+    monkeypatch: pytest.MonkeyPatch, struct: str, kind: str, message: str
 ) -> None:
     """As if a new MuJoCo had a field that its description does not have, or a type we do not."""
-    described = structs.STRUCTS["mjData"]
+    described = structs.STRUCTS[struct]
     extra = ast_nodes.StructFieldDecl(name="new", type=ast_nodes.ValueType(name=kind), doc="")
     changed = replace(described, fields=(extra, *described.fields))
     scene = load(FREE_BALL)
     with monkeypatch.context() as patch:
-        patch.setitem(structs.STRUCTS, "mjData", changed)
+        patch.setitem(structs.STRUCTS, struct, changed)
         native.struct_of.cache_clear()
         try:
             with pytest.raises(SceneError, match=message):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from itertools import count
 from pathlib import Path
 
@@ -103,6 +103,27 @@ def test_rate_is_what_half_a_period_leaves_at_the_99th_percentile() -> None:
     point = chart.points[0]
     assert point.time.median == pytest.approx(1e-6)
     assert point.rate == pytest.approx(0.5 / 1e-6)
+
+
+def test_fixed_cost_beyond_mujocos_step_is_told_from_what_grows() -> None:
+    families = tuple(family for family in work.FAMILIES if family.name == "bodies")
+    ticks = count()
+    chart = work.measure_work(families, most=2, rounds=1, clock=lambda: next(ticks))
+    times = {
+        (work.ALONE.name, 1): 2e-6,
+        (work.ALONE.name, 2): 10e-6,
+        (work.USUAL.name, 1): 3e-6,
+        (work.USUAL.name, 2): 12e-6,
+    }
+    points = tuple(
+        replace(point, time=replace(point.time, median=times[point.variant, point.size]))
+        for point in chart.points
+        if point.variant in {work.ALONE.name, work.USUAL.name}
+    )
+    told = work.paragraph(work.WorkChart(points, "a machine"))
+    extra = "1 µs for 1 (1.50 times the step) and 2 µs for 2 (1.20 times the step)"
+    assert told.count("; beyond MuJoCo's step alone ") == 1
+    assert f"; beyond MuJoCo's step alone {extra}" in told
 
 
 @pytest.mark.parametrize(

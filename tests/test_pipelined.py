@@ -19,7 +19,9 @@ from kernel_runs import fast as fast_run
 from hapticbridge.bridge import Bridge
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
+from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import Scheme
+from hapticbridge.kernel.handle import take_handle_frames
 from hapticbridge.kernel.tick import can_split, is_sound
 
 TICKS = 400
@@ -88,6 +90,41 @@ def test_only_the_first_tick_is_a_whole_step_and_the_wrench_goes_out_first(
     ticks = ["mj_step1", "mj_step2", "write", "mj_fwdPosition"]
     ticks += ["mj_step2", "write", "mj_fwdPosition"] * (TICKS - 1)
     assert calls == [*ticks, "write", "write"]
+
+
+OF_THE_HANDLE = ("xpos", "xquat", "xmat", "xipos", "ximat", "site_xpos", "site_xquat", "site_xmat")
+"""Frames that MuJoCo's kinematics writes."""
+
+
+@pytest.mark.parametrize("name", ["point_mass", "hex_key", "drawer", "pliers"])
+def test_what_depends_on_the_handle_is_what_mujoco_computes_to_the_bit(name: str) -> None:
+    """Against MuJoCo's kinematics and transmission of the whole scene, at random poses."""
+    rng = np.random.default_rng(7)
+    with fast(name, ScriptedDevice(still)) as bridge:
+        state, model, data = bridge.session.kernel.state[0], bridge.scene.model, bridge.scene.data
+        assert state["mj"]["is_handle_alone"]
+        handle, take = int(state["mj"]["handle_mocap_id"]), direct(take_handle_frames, state)
+        for k in range(300):
+            data.qpos[:] = model.qpos0 + 0.3 * rng.normal(size=model.nq) * (k > 0)
+            mujoco.mj_normalizeQuat(model, data.qpos)
+            mujoco.mj_fwdPosition(model, data)
+            data.mocap_pos[handle] = rng.normal(size=3)
+            turn = rng.normal(size=4) if k % 3 else np.eye(4)[0]
+            data.mocap_quat[handle] = turn / (np.linalg.norm(turn) if k % 2 else 1.0)
+            take(state)
+            found = _of_the_handle(data)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_transmission(model, data)
+            assert found == _of_the_handle(data)
+
+
+def _of_the_handle(data: mujoco.MjData) -> list[list[float]]:
+    """Returns all frames, and lengths and moments of the actuators."""
+    end = data.moment_rowadr[-1] + data.moment_rownnz[-1]
+    parts = [getattr(data, name) for name in OF_THE_HANDLE]
+    parts += [data.actuator_length, data.moment_rownnz, data.moment_rowadr]
+    parts += [data.moment_colind[:end], data.actuator_moment[:end]]
+    return [part.ravel().tolist() for part in parts]
 
 
 @pytest.mark.parametrize("method", ["weld", "explicit:rk4"])

@@ -35,7 +35,7 @@ from hapticbridge.kernel.handle import (
     tool_motion,
 )
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
-from hapticbridge.kernel.ledger import meter_ports_again
+from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.kernel.rigid_contact import aim_again
 from hapticbridge.pose import Vector, norm, scaled
@@ -55,6 +55,8 @@ LEVEL_DTYPE = np.dtype(
         ("compliance", "<f8", 2),
         ("tried", "<f8", 2),
         ("length", "<f8", 2),
+        ("wanted", "<f8", 2),
+        ("found", "<f8", 2),
         ("is_solved", "<i8"),
         ("reads_poses", "<i8"),
         ("repetitions", "<i8"),
@@ -64,7 +66,8 @@ LEVEL_DTYPE = np.dtype(
 )
 """Sub-record ``level``, written by this module alone. Pairs are force and torque: ``level`` F on
 the tool in N and N m, ``share`` c of the present gains, ``previous`` c of the previous tick,
-``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖.
+``compliance`` σ; ``tried`` c of the previous repetition in the step and ``length`` its ‖u‖;
+``wanted`` c of the next repetition and ``found`` the present ‖u‖.
 ``is_solved`` is 1 if steps are repeated, and ``reads_poses`` if sensors, plugins or a callback read
 the bodies' poses then; ``repetitions`` counts repetitions since the start; ``state_before`` is the
 address of MuJoCo's state before the step."""
@@ -121,14 +124,6 @@ def keep_state(s: State) -> None:
 
 
 @compiled
-def _has_loaded_body(s: State) -> bool:
-    found = False
-    for value in floats(s.mj.xfrc_applied, 6 * s.mj.nbody):
-        found = found or value != 0.0
-    return found
-
-
-@compiled
 def _repeat_step(s: State) -> None:
     """Repeats MuJoCo's step from the state before it; its positions must be those of the start."""
     _copy_state(s, False)
@@ -171,8 +166,8 @@ def _share_at_level(level: float, size: float, share: float, compliance: float) 
 
 
 @compiled
-def _shares_to_try(s: State, count: int) -> tuple[bool, tuple[float, float]]:
-    """Returns True if the step's wrench is at its level or below; and the shares to try otherwise.
+def _is_at_level(s: State, count: int) -> bool:
+    """Returns True if the wrench is at its level or below; else notes the shares to try.
 
     ``count`` is the number of repetitions of the step so far.
     """
@@ -180,10 +175,9 @@ def _shares_to_try(s: State, count: int) -> tuple[bool, tuple[float, float]]:
     force, torque = applied_wrench(s, 1.0)
     sizes = (norm(force), norm(torque))
     is_done = True
-    wanted = (level.share[0], level.share[1])
     for ch in range(2):
         c, size = level.share[ch], sizes[ch]
-        u = size / c
+        u = level.found[ch] = size / c
         if count > 0 and c != level.tried[ch]:
             u_last = level.length[ch]
             change = level.tried[ch] * u_last - size
@@ -194,18 +188,23 @@ def _shares_to_try(s: State, count: int) -> tuple[bool, tuple[float, float]]:
             new = 0.5 * (c + new)
         if abs(new - c) * u > TOLERANCE * level.level[ch]:
             is_done = False
-        wanted = (new, wanted[1]) if ch == 0 else (wanted[0], new)
-    return is_done, wanted
+        level.wanted[ch] = new
+    return is_done
 
 
 @compiled
-def _try_shares(s: State, wanted: tuple[float, float]) -> None:
+def _can_try(level: Part) -> bool:
+    """Returns True if the shares to try are numbers."""
+    return math.isfinite(level.wanted[0] + level.wanted[1])
+
+
+@compiled
+def _try_shares(s: State) -> None:
     """Sets the shares of the step's repetition."""
     level = s.level
-    force, torque = applied_wrench(s, 1.0)
-    level.length[0], level.length[1] = norm(force) / level.share[0], norm(torque) / level.share[1]
     for ch in range(2):
-        level.tried[ch], level.share[ch] = level.share[ch], wanted[ch]
+        level.length[ch] = level.found[ch]
+        level.tried[ch], level.share[ch] = level.share[ch], level.wanted[ch]
     set_gains(s, 1.0)
 
 
@@ -214,7 +213,7 @@ def _start_again(s: State, count: int) -> None:
     """Repeats the step that just ended, after ``count`` repetitions, within the tank."""
     if count == 0:
         _copy_state(s, False)
-        if s.level.reads_poses or _has_loaded_body(s):  # which act at the start's positions
+        if s.level.reads_poses or has_loaded_body(s):  # which act at the start's positions
             mj_kinematics(s.mj.model, s.mj.data)
     _repeat_step(s)
     spend_within_tank(s)
@@ -229,10 +228,9 @@ def solve_level(s: State) -> bool:
     """
     count = 0
     for _ in range(REPETITIONS):
-        is_done, wanted = _shares_to_try(s, count)
-        if is_done or not math.isfinite(wanted[0] + wanted[1]):
+        if _is_at_level(s, count) or not _can_try(s.level):
             break
-        _try_shares(s, wanted)
+        _try_shares(s)
         _start_again(s, count)
         count += 1
     s.level.repetitions += count
@@ -269,13 +267,15 @@ def limited_wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, 
         Force, torque, and the tool's motion and rotation vector since the previous evaluation.
     """
     level = s.level
+    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
+    if is_reduced:  # the wrench of the step itself decides, without poses
+        solve_level(s)
     position, orientation, moved, turned = tool_after_step(s)
     handle = handle_of_step(s, is_last)
     force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
     if is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1]:
         if level.is_solved:
-            if solve_level(s):
+            if not is_reduced and solve_level(s):
                 position, orientation, moved, turned = tool_after_step(s)
                 force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
             _foresee_shares(s)
@@ -310,15 +310,14 @@ def _solve_levels(states: NDArray[np.void]) -> bool:
     for _ in range(REPETITIONS * states.size):
         is_done = True
         for i in range(states.size):
-            is_settled, wanted = _shares_to_try(states[i], count)
-            if not math.isfinite(wanted[0] + wanted[1]):
+            is_settled = _is_at_level(states[i], count)
+            if not _can_try(states[i].level):
                 return count > 0
             is_done = is_done and is_settled
         if is_done:
             break
         for i in range(states.size):
-            _, wanted = _shares_to_try(states[i], count)
-            _try_shares(states[i], wanted)
+            _try_shares(states[i])
         _start_again(states[0], count)
         count += 1
     states[0].level.repetitions += count

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, direct
 from hapticbridge.kernel.codes import Part, State
-from hapticbridge.kernel.mujoco_c import floats, mj_kinematics
+from hapticbridge.kernel.mujoco_c import (
+    floats,
+    ints,
+    mj_kinematics,
+    mj_transmission,
+    mju_normalize4,
+    mju_quat2mat,
+    mju_sub_quat,
+)
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.pose import (
     Quaternion,
@@ -15,6 +24,7 @@ from hapticbridge.pose import (
     add,
     canonical,
     conjugate,
+    cross,
     norm,
     product,
     quaternion_exp,
@@ -259,3 +269,103 @@ def handle_of_step(s: State, is_last: bool) -> tuple[Vector, Quaternion]:
     m = mj.handle_mocap_id
     position = vector_of(floats(mj.mocap_pos + 24 * m, 3))
     return position, canonical(quaternion_of(floats(mj.mocap_quat + 32 * m, 4)))
+
+
+# What MuJoCo's position stage computes of the handle, for a handle that moved after that stage
+#
+# The handle is a body of the world without joint, mass or geom. Its pose decides its frames, and
+# length and moment of the coupling's actuators, which measure the grip's pose in the handle's axes.
+# Kinematics and transmission of a whole scene take a fifth of MuJoCo's step, with one free body as
+# with a hundred, and compute the same numbers to the bit.
+
+
+def handle_facts(mj: Part, model: mujoco.MjModel) -> tuple[dict[str, int], NDArray[np.int32]]:
+    """Returns numbers of ``MJ_DTYPE`` about grip and handle, and the grip's degrees of freedom.
+
+    Needs the ids of both. ``is_handle_alone`` is 0 if other actuators follow those of the coupling,
+    whose place in MuJoCo's arrays depends on the coupling's moments.
+    """
+    body, dofs = int(mj["grip_body_id"]), list[int]()
+    root = int(model.body_rootid[body])
+    while body > 0 and model.body_dofnum[body] == 0:
+        body = int(model.body_parentid[body])
+    dof = int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body > 0 else -1
+    while dof >= 0:
+        dofs.insert(0, dof)
+        dof = int(model.dof_parentid[dof])
+    handle, site = int(mj["handle_body_id"]), int(mj["handle_site_id"])
+    is_alone = (
+        int(mj["coupling_output_adr"]) + 6 == model.nu
+        and model.body_sameframe[handle] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
+        and model.site_sameframe[site] == mujoco.mjtSameFrame.mjSAMEFRAME_BODY
+    )
+    facts = {"grip_root_id": root, "grip_dof_count": len(dofs), "is_handle_alone": bool(is_alone)}
+    return facts, np.array(dofs or [0], dtype=np.int32)
+
+
+@compiled
+def take_handle_frames(s: State) -> None:
+    """Computes what depends on the handle's pose in MuJoCo's position stage, as that stage does."""
+    mj = s.mj
+    if mj.held_qpos != 0:
+        return  # such a coupling has no handle, and its gains alone depend on the sample
+    if not mj.is_handle_alone:
+        mj_kinematics(mj.model, mj.data)
+        mj_transmission(mj.model, mj.data)
+        return
+    _move_handle_body(mj)
+    _turn_actuators(mj)
+
+
+@compiled
+def _move_handle_body(mj: Part) -> None:
+    """Computes the frames of the handle's body and site, which coincide."""
+    m, body, site = mj.handle_mocap_id, mj.handle_body_id, mj.handle_site_id
+    position = vector_of(floats(mj.mocap_pos + 24 * m, 3))
+    for address in (mj.xpos + 24 * body, mj.xipos + 24 * body, mj.site_xpos + 24 * site):
+        store_vector(floats(address, 3), position)
+    quaternion, frame = floats(mj.xquat + 32 * body, 4), floats(mj.xmat + 72 * body, 9)
+    store_quaternion(quaternion, quaternion_of(floats(mj.mocap_quat + 32 * m, 4)))
+    mju_normalize4(mj.xquat + 32 * body)
+    mju_quat2mat(mj.xmat + 72 * body, mj.xquat + 32 * body)
+    store_quaternion(floats(mj.site_xquat + 32 * site, 4), quaternion_of(quaternion))
+    inertial, own = floats(mj.ximat + 72 * body, 9), floats(mj.site_xmat + 72 * site, 9)
+    for i in range(9):
+        inertial[i] = own[i] = frame[i]
+
+
+@compiled
+def _turn_actuators(mj: Part) -> None:
+    """Computes length and moment of the coupling's actuators: the grip in the handle's axes.
+
+    MuJoCo keeps a moment's entries that are not zero, in the order of the degrees of freedom.
+    """
+    first, count = mj.coupling_output_adr, mj.grip_dof_count
+    lengths = floats(mj.actuator_length + 8 * first, 6)
+    frame = floats(mj.site_xmat + 72 * mj.handle_site_id, 9)
+    grip = vector_of(floats(mj.site_xpos + 24 * mj.grip_site_id, 3))
+    shift = subtract(grip, vector_of(floats(mj.site_xpos + 24 * mj.handle_site_id, 3)))
+    for i in range(3):
+        lengths[i] = frame[i] * shift[0] + frame[3 + i] * shift[1] + frame[6 + i] * shift[2]
+    mju_sub_quat(
+        mj.actuator_length + 8 * first + 24,
+        mj.site_xquat + 32 * mj.grip_site_id,
+        mj.site_xquat + 32 * mj.handle_site_id,
+    )
+    arm = subtract(grip, vector_of(floats(mj.subtree_com + 24 * mj.grip_root_id, 3)))
+    sizes, starts = ints(mj.moment_rownnz, first + 6), ints(mj.moment_rowadr, first + 6)
+    dofs, end = ints(mj.grip_dofs, count), starts[first]
+    columns = ints(mj.moment_colind, end + 6 * count)
+    moments = floats(mj.actuator_moment, end + 6 * count)
+    for row in range(6):
+        axis, start = row % 3, end
+        for dof in dofs:
+            motion = floats(mj.cdof + 48 * dof, 6)
+            v = vector_of(motion)
+            if row < 3:
+                v = add(vector_of(motion[3:6]), cross(v, arm))
+            moment = v[0] * frame[axis] + v[1] * frame[3 + axis] + v[2] * frame[6 + axis]
+            if moment != 0.0:
+                columns[end], moments[end] = dof, moment
+                end += 1
+        starts[first + row], sizes[first + row] = start, end - start

@@ -342,6 +342,15 @@ def _actuator_work(s: State) -> float:
 
 
 @compiled
+def has_loaded_body(s: State) -> bool:
+    """Returns True if a wrench is applied to a body."""
+    found = 0
+    for value in floats(s.mj.xfrc_applied, 6 * s.mj.nbody):
+        found |= value != 0.0  # without a branch, so that several are compared at once
+    return found != 0
+
+
+@compiled
 def add_body_wrenches(s: State, result: int, clears: bool = False) -> bool:
     """Adds ``xfrc_applied`` as generalised forces, at the present positions, to an array.
 
@@ -353,6 +362,8 @@ def add_body_wrenches(s: State, result: int, clears: bool = False) -> bool:
     Returns:
         True if a body is loaded; otherwise nothing was written.
     """
+    if not has_loaded_body(s):
+        return False
     mj = s.mj
     wrenches = floats(mj.xfrc_applied, 6 * mj.nbody)
     found = False

@@ -59,10 +59,14 @@ from hapticbridge.kernel.mujoco_c import (
     floats,
     ints,
     mj_apply_ft,
+    mj_com_vel,
     mj_factor_m,
     mj_mul_m,
+    mj_passive,
+    mj_rne,
     mj_solve_m,
     pointer_at,
+    wide_ints,
 )
 from hapticbridge.kernel.springs import (
     add_rest,
@@ -102,19 +106,23 @@ _OWN_VECTORS = (
     "generalised",
     "work_buffer",
 )
-_ADDRESSES = (
-    "qfrc_written",
-    "qfrc_passive",
+_OWN_LISTS = (
     "geom_in_tree",
     "joint_in_tree",
     "dof_in_tree",
+    "dofs_of_tree",
+    "awake_lists",
+    "awake_counts",
     "wrench_buffer",
 )
+_ADDRESSES = (*_OWN_LISTS, "qfrc_written", "qfrc_passive")
 
 LOSSLESS_DTYPE = np.dtype(
     [
         *((name, "<i8") for name in _OWN_VECTORS + _ADDRESSES),
         ("has_passive", "<i8"),
+        ("dof_count", "<i8"),
+        ("has_other_trees", "<i8"),
         ("is_never_free", "<i8"),
         ("is_midpoint", "<i8"),
         ("was_midpoint", "<i8"),
@@ -134,6 +142,70 @@ Addresses of vectors over the degrees of freedom come first. ``is_midpoint`` and
 are the form of the next and of the last step; ``holdoff`` counts the ticks until the tool may be
 lossless again; ``energy_debt`` in J is created energy that is still to be taken back; ``twist``
 in rad is φ in the tool's frame; ``applied_half`` is the wrench that the actuators applied."""
+
+SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+"""Bit of MuJoCo's flags that lets bodies sleep."""
+
+# Bias and passive forces of the tool's tree alone
+#
+# MuJoCo evaluates them for a whole scene: in one with 100 free bodies that takes a third of its
+# step, three times per tick. If bodies may sleep, its functions visit the bodies that are awake,
+# and compute the same numbers for these to the bit. The bridge allows no sleep during a step, so
+# the lists of what is awake are free: for the duration of a call they hold the tool's tree.
+
+
+@compiled
+def _exchange_awake(s: State) -> None:
+    """Exchanges MuJoCo's lists of what is awake for those of the tool's tree, or back."""
+    mj, lossless = s.mj, s.lossless
+    lists, counts = wide_ints(lossless.awake_lists, 3), ints(lossless.awake_counts, 3)
+    own_lists = (mj.body_awake_ind, mj.parent_awake_ind, mj.dof_awake_ind)
+    own_counts = (mj.nbody_awake, mj.nparent_awake, mj.nv_awake)
+    for i in range(3):
+        at = wide_ints(own_lists[i], 1)
+        lists[i], at[0] = at[0], lists[i]
+        count = ints(own_counts[i], 1)
+        counts[i], count[0] = count[0], counts[i]
+    ints(mj.enableflags, 1)[0] ^= SLEEP
+
+
+@compiled
+def write_tool_bias(s: State, velocity: int, result: int) -> None:
+    """Does what ``ledger.write_bias`` does, for the degrees of freedom of the tool's tree."""
+    mj, lossless = s.mj, s.lossless
+    if not lossless.has_other_trees:
+        write_bias(s, velocity, result)
+        return
+    nv = mj.nv
+    dofs = ints(lossless.dofs_of_tree, lossless.dof_count)
+    qvel, other, saved = floats(mj.qvel, nv), floats(velocity, nv), floats(mj.scratch, nv)
+    bias, kept, found = (
+        floats(mj.qfrc_bias, nv),
+        floats(mj.scratch + 8 * nv, nv),
+        floats(result, nv),
+    )
+    for dof in dofs:
+        saved[dof], qvel[dof] = qvel[dof], other[dof]
+        kept[dof] = bias[dof]
+    _exchange_awake(s)
+    mj_com_vel(mj.model, mj.data)
+    # MuJoCo heeds the lists only if it writes to its own array
+    mj_rne(mj.model, mj.data, np.int32(0), mj.qfrc_bias)
+    _exchange_awake(s)
+    for dof in dofs:
+        qvel[dof], found[dof], bias[dof] = saved[dof], bias[dof], kept[dof]
+
+
+@compiled
+def evaluate_tool_passive(s: State) -> None:
+    """Does what ``springs.evaluate_passive`` does, for the tool's tree."""
+    if s.mj.has_tendons_or_flexes or not s.lossless.has_other_trees:
+        evaluate_passive(s)
+        return
+    _exchange_awake(s)
+    mj_passive(s.mj.model, s.mj.data)
+    _exchange_awake(s)
+
 
 # The velocity v at which a lossless step's energy is balanced, and the force carried over
 
@@ -176,7 +248,7 @@ def write_external(s: State, result: int) -> None:
 def write_half_step(s: State) -> None:
     """Writes (T/2) M⁻¹ [2 Jᵀr − c(q, u) + p] for the tool's tree.
 
-    Needs the results of ``carry``, ``write_bias`` and ``write_external``.
+    Needs the results of ``carry``, ``write_tool_bias`` and ``write_external``.
     """
     mj, lossless = s.mj, s.lossless
     carried, bias = floats(lossless.generalised, mj.nv), floats(lossless.bias_at_u, mj.nv)
@@ -197,7 +269,7 @@ def write_half_step(s: State) -> None:
 def keep_carried(s: State) -> None:
     """Writes the force that the next step applies: Jᵀr + c(q, u) − c(q, v), on the tool's tree."""
     mj, lossless = s.mj, s.lossless
-    write_bias(s, lossless.velocity, lossless.bias_at_v)
+    write_tool_bias(s, lossless.velocity, lossless.bias_at_v)
     own, carried = (floats(lossless.carried_force, mj.nv), floats(lossless.generalised, mj.nv))
     at_u, at_v = floats(lossless.bias_at_u, mj.nv), floats(lossless.bias_at_v, mj.nv)
     in_tree = ints(lossless.dof_in_tree, mj.nv)
@@ -210,10 +282,10 @@ def keep_carried(s: State) -> None:
 def balance_midpoint(s: State) -> None:
     """Computes v_k from u_k and the kinetic energy at v_k; needs the result of ``carry``."""
     mj, lossless = s.mj, s.lossless
-    write_bias(s, mj.qvel, lossless.bias_at_u)
+    write_tool_bias(s, mj.qvel, lossless.bias_at_u)
     write_external(s, lossless.external)
     if lossless.has_passive:
-        evaluate_passive(s)
+        evaluate_tool_passive(s)
         note_rest(s)
     write_half_step(s)
     v, u, half = (
@@ -243,7 +315,7 @@ def balance(s: State) -> None:
     kinetic = own + others
     set_kinetic_energy(s.energy, kinetic - _take_back(s, kinetic, own))
     if take_back(s, lossless.velocity, s.loop.law_work):
-        write_bias(s, mj.qvel, lossless.bias_at_u)
+        write_tool_bias(s, mj.qvel, lossless.bias_at_u)
 
 
 @compiled
@@ -286,7 +358,7 @@ def _take_back(s: State, kinetic: float, own: float) -> float:
         if in_tree[i]:
             u[i] -= (1.0 - slower) * v[i]  # the next step starts from u
             v[i] *= slower
-    write_bias(s, mj.qvel, lossless.bias_at_u)
+    write_tool_bias(s, mj.qvel, lossless.bias_at_u)
     lossless.energy_debt -= taken
     return float(taken)
 
@@ -608,10 +680,11 @@ def bind_lossless(
         "dof_in_tree": np.ascontiguousarray(tree.dofs, dtype=np.int32),
         "wrench_buffer": np.zeros(6),
     }
+    owned |= _bind_tree(lossless, tree)
     owned |= {name: np.zeros(nv) for name in _OWN_VECTORS}
     owned["last_written"][: model.nv] = data.qfrc_applied
-    for name, array in owned.items():
-        lossless[name] = array.ctypes.data
+    for name in _OWN_VECTORS + _OWN_LISTS:
+        lossless[name] = owned[name].ctypes.data
     lossless["qfrc_written"] = data.qfrc_applied.ctypes.data
     lossless["qfrc_passive"] = data.qfrc_passive.ctypes.data
     lossless["is_never_free"] = tree.is_never_free
@@ -620,6 +693,22 @@ def bind_lossless(
         chosen = {"jnt": tree.joints, "dof": tree.dofs, "tendon": tree.tendons}
         owned |= bind_springs(s["springs"], model, data, chosen)
     return owned | {"user_forces": owned["last_written"].copy()}
+
+
+def _bind_tree(lossless: Part, tree: ToolTree) -> dict[str, NDArray[np.generic]]:
+    """Fills in how many of the scene are in the tool's tree; returns their lists for MuJoCo."""
+    bodies, dofs = (np.flatnonzero(each).astype(np.int32) for each in (tree.bodies, tree.dofs))
+    lossless["dof_count"] = dofs.size
+    lossless["has_other_trees"] = 0 < dofs.size < tree.dofs.size
+    with_world = np.append(np.int32(0), bodies)
+    lists = [with_world.ctypes.data, bodies.ctypes.data, dofs.ctypes.data]
+    return {
+        "awake_bodies": with_world,
+        "awake_parents": bodies,
+        "dofs_of_tree": dofs,
+        "awake_lists": np.array(lists, dtype=np.int64),
+        "awake_counts": np.array([with_world.size, bodies.size, dofs.size], dtype=np.int32),
+    }
 
 
 @compiled
@@ -698,14 +787,14 @@ def _enter(s: State, force: Vector, torque: Vector) -> None:
         v[i] = u[i]
     write_external(s, lossless.external)
     if lossless.has_passive:
-        evaluate_passive(s)
+        evaluate_tool_passive(s)
         begin_springs(s)
     for _ in range(2):
-        write_bias(s, mj.qvel, lossless.bias_at_u)
+        write_tool_bias(s, mj.qvel, lossless.bias_at_u)
         write_half_step(s)
         for i in range(mj.nv):
             u[i] = v[i] - half[i]
-    write_bias(s, mj.qvel, lossless.bias_at_u)
+    write_tool_bias(s, mj.qvel, lossless.bias_at_u)
     keep_carried(s)
     set_gains(s, 0.5)
     lossless.is_midpoint = 1

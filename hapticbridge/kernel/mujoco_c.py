@@ -59,6 +59,9 @@ mj_mul_m: Any = external("mj_mulM", "void(intp, intp, intp, intp)")
 mj_mul_jac: Any = external("mj_mulJacVec", "void(intp, intp, intp, intp)")
 mj_solve_m: Any = external("mj_solveM", "void(intp, intp, intp, intp, int32)")
 mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, int32, intp)")
+mju_normalize4: Any = external("mju_normalize4", "double(intp)")
+mju_quat2mat: Any = external("mju_quat2Mat", "void(intp, intp)")
+mju_sub_quat: Any = external("mju_subQuat", "void(intp, intp, intp)")
 mj_contact_force: Any = external("mj_contactForce", "void(intp, intp, int32, intp)")
 
 
@@ -108,9 +111,16 @@ def ints(address: int, count: int) -> NDArray[np.int32]:
 
 
 @compiled
+def wide_ints(address: int, count: int) -> NDArray[np.int64]:
+    """Returns ``count`` 64-bit integers at an address, as a view."""
+    view: NDArray[np.int64] = _view(_as_pointer(address), count, np.int64)
+    return view
+
+
+@compiled
 def pointer_at(address: int) -> int:
     """Returns the pointer stored at an address (arrays in MuJoCo's arena move between steps)."""
-    return int(_view(_as_pointer(address), 1, np.int64)[0])
+    return int(wide_ints(address, 1)[0])
 
 
 _DIVERGED = tuple(
@@ -212,14 +222,19 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     """Returns the addresses of model and data for the C functions.
 
     Raises:
-        SceneError: The described layout of ``mjData`` is not that of the library, so the compiled
-            tick would read wrong memory.
+        SceneError: The described layout of ``mjData`` or ``mjModel`` is not that of the library, so
+            the compiled tick would read wrong memory.
     """
+    option = struct_of("mjModel").from_address(model._address).opt
     view = struct_of("mjData").from_address(data._address)
     agrees = (
         view.ncon == data.ncon
         and view.nefc == data.nefc
         and view.nisland == data.nisland
+        and view.nbody_awake == data.nbody_awake
+        and view.dof_awake_ind == data.dof_awake_ind.ctypes.data
+        and (option.disableflags, option.enableflags)
+        == (model.opt.disableflags, model.opt.enableflags)
         and view.time == data.time
         and view.qvel == data.qvel.ctypes.data
         and view.site_xpos == data.site_xpos.ctypes.data
@@ -228,7 +243,7 @@ def addresses(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[int, int]:
     )
     if not agrees:
         raise SceneError(
-            f"MuJoCo {mujoco.__version__} lays out mjData differently from its own description; "
+            f"MuJoCo {mujoco.__version__} lays out its structs differently from its description; "
             "install a version from constraints.txt"
         )
     return int(model._address), int(data._address)
@@ -243,16 +258,25 @@ _DATA_ARRAYS = (
     "ctrl",
     "mocap_pos",
     "mocap_quat",
+    "xpos",
+    "xquat",
+    "xmat",
+    "xipos",
+    "ximat",
     "site_xpos",
     "site_xquat",
-    "xipos",
+    "site_xmat",
+    "subtree_com",
+    "cdof",
     "ten_length",
     "qfrc_actuator",
     "qfrc_applied",
+    "qfrc_bias",
     "qfrc_constraint",
     "qfrc_gravcomp",
     "xfrc_applied",
     "actuator_force",
+    "actuator_length",
     "moment_rownnz",
     "moment_rowadr",
     "moment_colind",
@@ -263,6 +287,12 @@ _DATA_ARRAYS = (
 _DATA_FIELDS = (
     "time",
     "ncon",
+    "nbody_awake",
+    "nparent_awake",
+    "nv_awake",
+    "body_awake_ind",
+    "parent_awake_ind",
+    "dof_awake_ind",
     "nisland",
     "nefmA",
     "efm_aid",
@@ -326,9 +356,13 @@ _CONTACT = (
 )
 _IDS = (
     "handle_mocap_id",
+    "handle_body_id",
     "handle_site_id",
     "grip_site_id",
     "grip_body_id",
+    "grip_root_id",
+    "grip_dofs",
+    "grip_dof_count",
     "weld_id",
     "coupling_actuator_id",
     "coupling_output_adr",
@@ -345,13 +379,14 @@ _FACTS = (
     "has_gravity_compensation",
     "has_tendons_or_flexes",
     "is_discrete",
+    "is_handle_alone",
 )
 
 MJ_DTYPE = np.dtype(
     [
         (name, "<i8")
         for name in (
-            *("model", "data", "warnings", "gainprm", "biasprm"),
+            *("model", "data", "warnings", "gainprm", "biasprm", "enableflags"),
             *_DATA_ARRAYS,
             *_DATA_FIELDS,
             *_OWNED,
@@ -386,6 +421,8 @@ def model_addresses(
     values |= {name: getattr(data, name).ctypes.data for name in _DATA_ARRAYS}
     values |= {name: field_address(data, name) for name in _DATA_FIELDS}
     values["warnings"] = field_address(data, "warning")
+    options = struct_of("mjModel").opt.offset + struct_of("mjOption").enableflags.offset
+    values["enableflags"] = model_address + options
     values["gainprm"] = model.actuator_gainprm.ctypes.data
     values["biasprm"] = model.actuator_biasprm.ctypes.data
     values |= {name: getattr(model, name) for name in _SIZES}

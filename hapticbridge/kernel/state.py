@@ -55,6 +55,7 @@ from hapticbridge.kernel.handle import (
     POSE_DTYPE,
     bind_poses,
     follow_handle,
+    handle_facts,
     move_handle_home,
     set_tool,
 )
@@ -335,11 +336,16 @@ class BoundKernel:
             handle = name_of_hand(HANDLE, self._hand)
             mj["handle_site_id"] = added_id(model, mujoco.mjtObj.mjOBJ_SITE, handle)
             mj["handle_mocap_id"] = model.body_mocapid[handles[self._hand]]
+            mj["handle_body_id"] = handles[self._hand]
             grip = mj["grip_site_id"] = model.site(self._grip).id
         mj["weld_id"] = added_id(model, mujoco.mjtObj.mjOBJ_EQUALITY, WELD_NAME)
         mj["coupling_actuator_id"] = first
         mj["coupling_ctrl_adr"] = model.actuator_ctrladr[first]
         mj["coupling_output_adr"] = model.actuator_outadr[first]
+        facts, dofs = handle_facts(mj, model)
+        for name, value in facts.items():
+            mj[name] = value
+        self._own({"grip_dofs": dofs})
         mj["has_actuators"] = model.nactuator > own or bool(np.any(model.jnt_actgravcomp))
         if parameters.scheme == Scheme.MASSLESS:
             self._own(massless_tool(model, grip))

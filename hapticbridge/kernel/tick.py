@@ -50,6 +50,7 @@ from hapticbridge.kernel.handle import (
     move_device,
     move_handle,
     place_handle,
+    take_handle_frames,
 )
 from hapticbridge.kernel.law import (
     charge_lateness,
@@ -83,13 +84,11 @@ from hapticbridge.kernel.mujoco_c import (
     mj_contact_force,
     mj_fwd_position,
     mj_fwd_velocity,
-    mj_kinematics,
     mj_sensor_pos,
     mj_sensor_vel,
     mj_step,
     mj_step1,
     mj_step2,
-    mj_transmission,
     pointer_at,
     release_fence,
 )
@@ -337,10 +336,9 @@ def take_handle_in(s: State) -> None:
     They cannot fail after a position stage that has just succeeded through Python.
     """
     mj = s.mj
-    mj_kinematics(mj.model, mj.data)
+    take_handle_frames(s)
     if mj.nsensor > 0:
         mj_sensor_pos(mj.model, mj.data)
-    mj_transmission(mj.model, mj.data)
     mj_fwd_velocity(mj.model, mj.data)
     if mj.nsensor > 0:
         mj_sensor_vel(mj.model, mj.data)
@@ -350,12 +348,11 @@ def take_handle_in(s: State) -> None:
 @compiled
 def is_sound(s: State) -> bool:
     """Returns True if MuJoCo's check at the start of a step would find nothing to reset."""
-    mj = s.mj
+    mj, found = s.mj, 0
     for values in (floats(mj.qpos, mj.nq), floats(mj.qvel, mj.nv)):
-        for value in values:
-            if not abs(value) < LARGEST_CONTROL:  # also False for a value that is not a number
-                return False
-    return True
+        for value in values:  # without a branch, so that several are compared at once
+            found |= not abs(value) < LARGEST_CONTROL  # also for a value that is not a number
+    return found == 0
 
 
 @compiled

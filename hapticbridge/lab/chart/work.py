@@ -85,10 +85,13 @@ METHOD_VARIANTS = (
 )
 """Methods whose cost is compared as bodies and contacts grow."""
 
+ALONE = Variant("MuJoCo's step alone", is_bare=True)
+"""Measure of what a tick costs more."""
+
 VARIANTS = (
     *METHOD_VARIANTS,
     Variant("bridge, islands off", has_islands=False),
-    Variant("MuJoCo's step alone", is_bare=True),
+    ALONE,
     Variant("MuJoCo's step alone, with sleep", is_bare=True, sleeps=True),
 )
 
@@ -269,7 +272,7 @@ FAMILIES = (
         "free balls that touch nothing",
         (1, 2, 5, 10, 20, 50, 100, 200),
         floating,
-        METHOD_VARIANTS,
+        (*METHOD_VARIANTS, ALONE),
     ),
     Family(
         "contacts",
@@ -442,6 +445,21 @@ class WorkChart:
             np.array([each.size for each in points], dtype=np.float64),
             np.array([each.time.median for each in points]),
         )
+
+    def beyond(self, family: Family, variant: Variant, size: int) -> tuple[float, float] | None:
+        """Returns a tick's time beyond MuJoCo's step alone in s, and over it, without unit.
+
+        None where a variant is that step itself, or the step was not measured.
+        """
+        times = {
+            each.is_bare: point.time.median
+            for each in (variant, ALONE)
+            for point in self.of(family, each)
+            if point.size == size
+        }
+        if set(times) != {False, True}:
+            return None
+        return times[False] - times[True], times[False] / times[True]
 
 
 def growth_of(sizes: NDArray[np.float64], times: NDArray[np.float64]) -> Growth | None:
@@ -673,10 +691,25 @@ def paragraph(chart: WorkChart) -> str:
             facts.append(
                 f"{family.unit.capitalize()}, {variant.name}: {1e6 * first.time.median:.3g} µs a "
                 f"tick for {first.size}, {1e6 * last.time.median:.3g} µs for {last.size}{slope}; "
-                f"up to {most} hold 1 kHz"
+                f"up to {most} hold 1 kHz{_beyond(chart, family, variant)}"
             )
     facts += [f"Whole loop, {each.name}: {1e6 * each.median:.3g} µs a tick" for each in chart.loops]
     return ". ".join([*facts, HOLDS]) + "."
+
+
+def _beyond(chart: WorkChart, family: Family, variant: Variant) -> str:
+    """States what a tick costs beyond MuJoCo's step for the least and the most; empty without it.
+
+    For the least it is the fixed cost of a tick, the rest grows with the scene.
+    """
+    points = chart.of(family, variant)
+    found = {p.size: chart.beyond(family, variant, p.size) for p in (points[0], points[-1])}
+    parts = [
+        f"{1e6 * extra[0]:.3g} µs for {size} ({extra[1]:.2f} times the step)"
+        for size, extra in found.items()
+        if extra is not None
+    ]
+    return f"; beyond {ALONE.name} " + " and ".join(parts) if parts else ""
 
 
 def _power(growth: Growth) -> str:
