@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.cli import main, terminal
+from hapticbridge.cli.identify import coupling_of_run
+from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import open_device
 from hapticbridge.device.profile import read_profile
+from hapticbridge.identify import Estimate, identify
+from hapticbridge.identify.profile import delay_of, measured_profile
 
 FREE = "simulated:hand=none,damping=1.5,friction=0.1,resolution=2e-5"
 
@@ -43,9 +48,32 @@ def test_it_recommends_the_coupling_that_a_run_takes_with_its_profile(
     words = ["identify", device, "--axes", "x", "--duration", "5", "--save", str(path), "--json"]
     assert main(words) == 0
     told = json.loads(capsys.readouterr().out)["coupling"]["requested"]["stiffness"]
-    sheet = read_profile(path).fill(open_device(device).info)
-    assert sheet.delay == pytest.approx(1e-3 * delay, abs=2e-4)
+    info = replace(open_device(device).info, damping=None, mass=None, friction=None, delay=None)
+    sheet = read_profile(path).fill(info)
+    assert sheet.delay == pytest.approx(1e-3 * delay, abs=1e-12)
     assert told == default_coupling(sheet, 1e-3).stiffness
+
+
+def test_what_was_measured_before_gives_way_to_a_new_measurement() -> None:
+    device = open_device(f"{FREE},delay=5")
+    result = identify(device, SimulatedClock(), period=1e-3, axes=("x",), duration=5.0)
+    profile = measured_profile(result, device="d", serial="", date="2026-01-01", duration=5.0)
+    before = replace(result, info=replace(result.info, delay=1e-3))
+    now = replace(result, info=replace(result.info, delay=None))
+    assert coupling_of_run(before, profile) == coupling_of_run(now, profile)
+    requested = coupling_of_run(now, profile).requested
+    assert requested is not None
+    assert requested.stiffness < 0.85 * 1.5 / 5e-3  # K d T alone may need no more than is there
+
+
+@pytest.mark.parametrize(
+    ("value", "half_width", "told"),
+    [(1.001, 0.1, 1.0), (0.03, 0.05, 0.0), (-0.02, 0.01, 0.0), (1.2, 0.1, 1.2), (2.97, 0.04, 3.0)],
+)
+def test_a_delay_is_whole_ticks_where_the_interval_has_them(
+    value: float, half_width: float, told: float
+) -> None:
+    assert delay_of(Estimate(1e-3 * value, 1e-3 * half_width), 1e-3) == pytest.approx(1e-3 * told)
 
 
 def test_progress_is_printed_in_plain_lines_without_a_terminal(

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.table import Table
 
-from hapticbridge.certificate import default_coupling
+from hapticbridge.certificate import default_coupling, whole_ticks
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
@@ -23,13 +22,16 @@ from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE
 from hapticbridge.identify.identify import FORCE_SHARE, TRAVEL, UNHELD, duration_at
-from hapticbridge.identify.profile import draw_identification, measured_profile
+from hapticbridge.identify.profile import delay_of, draw_identification, measured_profile
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import draw_z_width
 from hapticbridge.units import format_si
+
+REPLACED = {"mass", "damping", "friction", "rotational_inertia", "rotational_damping", "delay"}
+"""Numbers of a data sheet in whose place a measurement goes."""
 
 
 def safe_width(result: Identification) -> ZWidth | None:
@@ -42,22 +44,30 @@ def safe_width(result: Identification) -> ZWidth | None:
         return None
     if damping.least <= 0.0:
         return None
-    period = result.runs[next(iter(result.runs))].period
-    late = delay.least / period  # the interval must leave zero for a delay to be one
+    period = nominal_period(result)
     return z_width(
         damping.least,
         period,
         mass=mass.least,
         friction=max(friction.least, 0.0),
         resolution=result.resolution or 0.0,
-        delay=math.ceil(delay.most / period) if late > 0.05 else 0,
+        delay=whole_ticks(delay_of(delay, period), period),
     )
 
 
+def nominal_period(result: Identification) -> float:
+    """Returns T in s of the loop that measured, which its deadlines kept on average."""
+    return next(iter(result.runs.values())).period
+
+
 def coupling_of_run(result: Identification, profile: Profile) -> RunCoupling:
-    """Returns the coupling that a run chooses by itself with the profile of what was measured."""
-    coupling = default_coupling(profile.fill(result.info), result.period)
-    return RunCoupling.of(default_method(), result.period, coupling)
+    """Returns the coupling that a run chooses by itself with the profile of what was measured.
+
+    What was measured before, or stated, gives way to it.
+    """
+    measured: dict[str, Any] = dict.fromkeys({*profile.quantities} & REPLACED)
+    period, info = nominal_period(result), profile.fill(replace(result.info, **measured))
+    return RunCoupling.of(default_method(), period, default_coupling(info, period))
 
 
 def print_result(
@@ -114,7 +124,7 @@ def print_result(
     out.print(f"use {coupling.sentences()[0]}")
     requested = coupling.requested
     if requested is not None:
-        command = next_command(requested.stiffness, requested.damping, 1.0 / z.period)
+        command = next_command(requested.stiffness, requested.damping, 1.0 / nominal_period(result))
         out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -125,7 +126,10 @@ def measured_profile(
         for turns in (False, True)
         if (found := result.of_all("delay", turns=turns, most=True)) is not None
     ]
-    quantities["delay"] = _quantity(max(late, key=lambda delay: delay.most), source)
+    latest = max(late, key=lambda delay: delay.most)
+    quantities["delay"] = replace(
+        _quantity(latest, source), value=delay_of(latest, next(iter(result.runs.values())).period)
+    )
     for name in ("force_limit", "torque_limit", "speed_limit"):
         quantities[name] = Quantity(float(getattr(info, name)), "from the driver, not measured")
     if info.reach is not None:
@@ -141,6 +145,20 @@ def measured_profile(
         quantities=quantities,
         models=(info.name,),
     )
+
+
+def delay_of(found: Estimate, period: float) -> float:
+    """Returns a measured delay in s: as whole ticks if the interval has a whole number of them.
+
+    A device that answers a request within the tick is a tick late. Its estimate is a little more or
+    less than that, and a little more would count as another whole tick.
+
+    Args:
+        found: The estimate in s.
+        period: T in s of the loop that measured it.
+    """
+    whole = max(round(found.value / period), 0) * period
+    return whole if found.least <= whole <= found.most else max(found.value, 0.0)
 
 
 def _quantity(found: Estimate, source: str) -> Quantity:
