@@ -293,7 +293,7 @@ _REASONS = {
 }
 _REMEDIES = {
     BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
-    "is not 1",
+    "is not 1; check the driver's read()",
     JUMPED: "check the unit (m) and the times (s) of what it reports, and that no sample is late",
     STRETCHED: "check the motion's unit (m) and speed, and the tool's mass (--no-tool-weight "
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",

@@ -114,9 +114,9 @@ def watch_sentence(flags: int) -> str:
         )
     if flags & int(TickFlag.SWINGING):
         return (
-            "the force was lowered because the device answered late, or in coarse steps, and "
-            "swung: lower --stiffness, and measure the device's delay and resolution "
-            "('hapticbridge identify')"
+            "the force was lowered because the device swung: it answered late, or in coarse steps, "
+            "or an axis is reversed; check the signs of its axes, lower --stiffness, and measure "
+            "its delay and resolution ('hapticbridge identify')"
         )
     if flags & int(TickFlag.UNANSWERED):
         force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
@@ -208,8 +208,8 @@ class Timekeeping:
 
     def certified(self, verdict: bool | None) -> bool | None:
         """Returns a verdict on the device, False if the run was not as it assumes."""
-        is_refuted = bool(self.watch) or self.has_tripped
-        return False if self.is_kept is False or (verdict and is_refuted) else verdict
+        is_refuted = self.is_kept is False or self.watch or (verdict and self.has_tripped)
+        return False if is_refuted else verdict
 
     def device_words(self, verdict: bool | None) -> str:
         """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
@@ -311,6 +311,8 @@ class Timekeeping:
                 "late samples and forces may have given the hand "
                 f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
+        if self.silence and self.share >= MANY_KEPT:
+            return f"{NOT_KEPT}: {self.silence}; check its link and its power ({found})"
         return f"{NOT_KEPT}: {found}; try {self.remedy}"
 
 

@@ -206,7 +206,7 @@ def test_run_state_goes_on_to_say_why_the_force_is_lower() -> None:
     rows["flags"][1] |= TickFlag.SWINGING
     state.add(rows[1:2])
     state.add(rows[2:])
-    assert str(state).endswith("FORCE LOWERED: the device answers late")
+    assert str(state).endswith("FORCE LOWERED: the device answers late, or an axis is reversed")
 
 
 def test_run_state_names_the_forces_of_every_hand_and_counts_a_tick_once() -> None:

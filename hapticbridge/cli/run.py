@@ -616,7 +616,8 @@ class Run:
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
-            notify(f"view: {window.url}")
+            steer = "drag the arrows at the tool, and " if isinstance(device, MouseDevice) else ""
+            notify(f"view: {window.url} (open it in a browser; {steer}Ctrl-C ends the run)")
         if not self.as_json:
             announce_measured(bridge)
         try:

@@ -138,7 +138,7 @@ def move_axis(
             is_new = has_come and not skipped
             code = compute(state, sample, past, tones[k], since_new, wrench)
             if code != OK:
-                raise IdentificationError(_fault_message(code, s))
+                raise IdentificationError(_fault_message(code, axis, s))
             device.write(wrench)
             position[k] = place[index] if is_new else np.nan
             force[k] = wrench[index]
@@ -152,14 +152,14 @@ def move_axis(
     return AxisRun(axis, period, position, force, 1e-9 * np.diff(wakes), stale / ticks)
 
 
-def _fault_message(code: int, s: np.void) -> str:
+def _fault_message(code: int, axis: str, s: np.void) -> str:
     turns = code in (TURNED_FAR, TURNED_FAST)
     part, unit, factor = (slice(3, 6), "rad", 1.0) if turns else (slice(0, 3), "mm", 1e3)
     if code in (FAR, TURNED_FAR):
         distance = factor * float(np.linalg.norm(s["place"][part]))
         return (
-            f"the device moved {distance:.3g} {unit} from where it started, the limit is "
-            f"{factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
+            f"pushed along {axis}, the device moved {distance:.3g} {unit} from its start, the limit "
+            f"is {factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
             "check the sign of its axes (a reversed one runs away), or allow more travel (--travel)"
         )
     if code in (FAST, TURNED_FAST):

@@ -51,7 +51,7 @@ is gone; a slow device has a sample within it."""
 
 LOWERED = {
     int(TickFlag.RUNS_AWAY): "FORCE TAKEN AWAY: the device does not move as it is pushed",
-    int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late",
+    int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late, or an axis is reversed",
     int(TickFlag.UNANSWERED): "FORCE LOWERED: the device does not move; move it off its stop",
 }
 """Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
@@ -71,7 +71,7 @@ class RunState:
         self._overruns = 0
         self._dropped = 0
         self._fresh_ns = np.zeros(len(are_held))
-        self._silence = 0.0
+        self._silence = self._longest_silence = 0.0
 
     def add(self, rows: NDArray[np.void]) -> None:
         """Adds new records, ``TICK_DTYPE``: of n >= 1 ticks, in each tick one per hand."""
@@ -91,7 +91,9 @@ class RunState:
         due, is_stale = rows["deadline_ns"], rows["flags"] & TickFlag.STALE_SAMPLE != 0
         fresh = np.maximum.accumulate(np.where(is_stale, 0, due), axis=0)
         fresh = np.maximum(fresh, self._fresh_ns)
-        self._silence = max(self._silence, 1e-9 * float((due - fresh).max()))
+        since = 1e-9 * (due - fresh)
+        self._silence = float(since[-1].max())
+        self._longest_silence = max(self._longest_silence, float(since.max()))
         self._fresh_ns = fresh[-1]
 
     def __str__(self) -> str:
@@ -116,6 +118,8 @@ class RunState:
         parts += [words for flag, words in LOWERED.items() if self._flags & flag][:1]
         if self._silence >= SILENCE:
             parts.append(f"NO NEW SAMPLE for {self._silence:.1f} s")
+        elif self._longest_silence >= SILENCE:
+            parts.append(f"once no new sample for {self._longest_silence:.1f} s")
         if self._dropped:
             parts.append(f"{self._dropped} records dropped")
         return "  ".join(parts)
