@@ -275,8 +275,8 @@ def test_a_silence_of_the_device_is_named_in_summary_audit_and_live_line(tmp_pat
     words = "the device gave no new sample for 500 ms (at 0.3 s)"
     assert words in str(summary)
     assert words in audit(path).reason
-    state, ticks = RunState(), hb.read_recording(path).ticks
-    state.add(ticks[:700])
+    state, rows = RunState(), hb.read_recording(path).ticks
+    state.add(rows[:700])
     assert "NO NEW SAMPLE for 0.4 s" in str(state)
-    state.add(ticks[700:])
+    state.add(rows[700:])
     assert "once no new sample for 0.5 s" in str(state)

@@ -158,9 +158,10 @@ def _fault_message(code: int, axis: str, s: np.void) -> str:
     if code in (FAR, TURNED_FAR):
         distance = factor * float(np.linalg.norm(s["place"][part]))
         return (
-            f"pushed along {axis}, the device moved {distance:.3g} {unit} from its start, the limit "
-            f"is {factor * s['farthest'][int(turns)]:.3g} {unit}; let go of it, support its weight, "
-            "check the sign of its axes (a reversed one runs away), or allow more travel (--travel)"
+            f"pushed along {axis}, the device moved {distance:.3g} {unit} from its "
+            f"start, the limit is {factor * s['farthest'][int(turns)]:.3g} {unit}; let go, support "
+            "its weight, check the signs of its axes (a reversed one runs away), or allow more "
+            "travel (--travel)"
         )
     if code in (FAST, TURNED_FAST):
         step = factor * float(np.linalg.norm(s["place"][part] - s["before"][part]))
