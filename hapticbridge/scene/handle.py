@@ -298,7 +298,7 @@ def set_options(spec: mujoco.MjSpec, *, as_is: bool = False) -> tuple[str, ...]:
             "them be changed (without --as-is)"
         )
     if (integrator := int(option.integrator)) != mujoco.mjtIntegrator.mjINT_DISCRETE:
-        changes.append(f"integrator: {_INTEGRATORS[integrator]} → discrete")
+        changes.append(f"integrator: {_INTEGRATORS[integrator]} → the method's")
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.noslip_iterations = 0
