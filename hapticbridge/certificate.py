@@ -402,7 +402,7 @@ def _remedy(method: Method | None, used: float) -> str:
     """
     if method is None or method.compensated_share == 0.0:
         return "lower stiffness or damping, or raise the rate"
-    return "lower the damping" if used > 0 else "lower the stiffness, or raise the rate"
+    return "lower the coupling's damping" if used > 0 else "lower the stiffness, or raise the rate"
 
 
 def run_conditions(

@@ -216,8 +216,20 @@ class Timekeeping:
         if verdict:
             return f"device certified{self.clause}: b >= {self._bound}"
         if verdict is None:
-            return "device not judged: nothing proves that it bears the coupling"
+            return f"device not judged: {self._unproved}"
         return f"device not certified: {self.refutation or f'b < {self._bound}'}"
+
+    @property
+    def _unproved(self) -> str:
+        """What is missing for a verdict on the device, in a clause."""
+        felt = [each for each in self.in_time if each.is_felt]
+        if any(each.available is None for each in felt):
+            return "its damping is unknown ('hapticbridge identify' measures it)"
+        if any(each.delay is None for each in felt):
+            return "its delay is unknown ('hapticbridge identify' measures it)"
+        if any(each.delay for each in felt):
+            return "behind its delay the bound holds at walls, and none holds for every scene"
+        return "nothing proves that it bears the coupling"
 
     @property
     def refutation(self) -> str:

@@ -412,6 +412,15 @@ def refused(device: SimulatedDevice | Wrapped, words: str) -> str:
     return str(error.value)
 
 
+def test_a_device_that_falls_silent_is_not_pushed_on() -> None:
+    def silent(_: NDArray[np.void], tick: int) -> int:
+        return int(TickFlag.STALE_SAMPLE) if tick > 500 else 0
+
+    device = Wrapped(free(), silent)
+    refused(device, "no new sample for 51 ms while it pushed along x; check its link")
+    assert not device.last.any()
+
+
 @pytest.mark.parametrize("stiffness", [10.0, 135.0, 800.0])
 def test_a_hand_that_holds_still_is_felt_as_a_spring(stiffness: float) -> None:
     held = SimulatedDevice(resolution=1e-5, hand=Hand(stiffness=stiffness), path=STILL)

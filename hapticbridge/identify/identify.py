@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock, RealClock
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN, checked
+from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, IdentificationError
 from hapticbridge.identify.excitation import (
     FAR,
@@ -45,6 +46,9 @@ from hapticbridge.units import format_si
 RUNAWAY = 3.0
 """Multiple of the allowed travel at which a run is aborted, without unit. Such a device does not
 follow the commanded force, so zero force is the safer command."""
+
+SAMPLES = 5
+"""Samples of a device with a rate of its own that may be missing before it counts as silent."""
 
 _PROGRESS_RATE = 10
 """Rate of progress reports in Hz."""
@@ -111,8 +115,8 @@ def move_axis(
         progress: Called ten times a second with the completed share.
 
     Raises:
-        IdentificationError: The device moved farther or faster than allowed, or its pose is not
-            finite.
+        IdentificationError: The device moved farther or faster than allowed, gave no new sample
+            for ``SILENCE``, or its pose is not finite.
         DeviceError: The device failed.
     """
     ticks, index = round(duration / period), AXES.index(axis)
@@ -129,7 +133,8 @@ def move_axis(
     compute = direct(next_wrench, state, sample, past, 0.0, 1, wrench)
     position, force, wakes = np.empty(ticks), np.empty(ticks), np.empty(ticks)
     report_every, place = max(round(1.0 / (_PROGRESS_RATE * period)), 1), s["place"]
-    stale = since_new = 0
+    stale = since_new = silent = 0
+    patience = max(math.ceil(SILENCE / period), SAMPLES / (period * (device.info.rate or np.inf)))
     try:
         for k in range(ticks):
             _, wakes[k], skipped = clock.wait()
@@ -144,6 +149,12 @@ def move_axis(
             force[k] = wrench[index]
             stale += not is_new
             since_new = 0 if has_come else since_new
+            silent = 0 if has_come else silent + 1
+            if silent > patience:
+                raise IdentificationError(
+                    f"the device gave no new sample for {format_si(silent * period, 's')} while it "
+                    f"pushed along {axis}; check its link and its power"
+                )
             if progress is not None and k % report_every == 0:
                 progress(k / ticks)
     finally:
