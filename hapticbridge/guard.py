@@ -311,7 +311,7 @@ _FIND_PUMP = (
 )
 _DIVERGED = (
     "the simulation is no longer finite (force, pose or energy); the scene diverged, so lower the "
-    "stiffness or the period"
+    "stiffness or the period, or see with 'hapticbridge check SCENE' what pumps"
 )
 
 

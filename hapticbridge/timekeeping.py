@@ -221,7 +221,7 @@ class Timekeeping:
 
     @property
     def _unproved(self) -> str:
-        """What is missing for a verdict on the device, in a clause."""
+        """Number that is missing for a verdict on the device, in a clause."""
         felt = [each for each in self.in_time if each.is_felt]
         if any(each.available is None for each in felt):
             return "its damping is unknown ('hapticbridge identify' measures it)"

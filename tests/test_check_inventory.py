@@ -153,7 +153,7 @@ def test_what_cannot_influence_the_grip_is_named(tmp_path: Path) -> None:
     scene = bench(tmp_path / "scene")
     idle = {each.place.element: each for each in inventory_of(scene).idle}
     assert set(idle) == {"body 'slider'", "body 'block'", "geom 'cap'", "geom 'stop'"}
-    assert "never meets the tool" in idle["body 'block'"].reason
+    assert "never touches the tool" in idle["body 'block'"].reason
     assert idle["geom 'cap'"].reason == inventory.VISUAL
     assert idle["geom 'stop'"].reason == "fixed and never met in the motion"
     assert idle["body 'block'"].place.file == "parts.xml"

@@ -201,7 +201,7 @@ def _idle(
     tree = model.body_treeid
     reached = reached_trees(model, tool, met)
     idle = [
-        Idle(places.body(body), f"never meets the tool, directly or not{when}")
+        Idle(places.body(body), f"never touches the tool, nor what moves it{when}")
         for body in range(1, model.nbody)
         if tree[body] >= 0 and int(tree[body]) not in reached
     ]
