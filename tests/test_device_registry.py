@@ -65,3 +65,14 @@ def test_a_device_whose_profile_is_broken_is_let_go(monkeypatch: pytest.MonkeyPa
     assert device.closed == 1
     assert library.open_device("falcon:profile=none") is device
     assert device.closed == 1
+
+
+def test_a_profile_that_is_taken_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        library, "driver_named", lambda _: replace(DRIVER, open=lambda *_: Counted())
+    )
+    told: list[str] = []
+    library.open_device("falcon:profile=none", notify=told.append)
+    assert not told
+    library.open_device("falcon:profile=omega3", notify=told.append)
+    assert told == ["what 'falcon' leaves out is taken from the profile 'Force Dimension omega.3'"]

@@ -259,6 +259,7 @@ def open_device(spec: str, *, notify: Notify = ignore_message, **options: object
                     notify(f"no profile of '{model}' exists; profiles: {choices(models)}")
             if profile is not None:
                 device.info = profile.fill(device.info)
+                notify(f"what '{name}' leaves out is taken from the profile '{profile.name}'")
         return device
     if name not in _OPENERS:
         names = [*_OPENERS, *DRIVERS, *installed_drivers()]
