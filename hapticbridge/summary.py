@@ -322,7 +322,8 @@ class Summary:
 
     def _verdict_lines(self) -> Iterator[str]:
         tick, port = self.fault or (0, "")
-        used = f", {format_share(self.slack_share)} of the slack used" if self.slack_share else ""
+        used = f"at its worst tick {format_share(self.slack_share)} of the slack used"
+        used = f", {used}" if self.slack_share else ""
         since = f", from tick {tick} on" if port else ""
         judged = "" if port else "environment "  # the device has a line of its own
         until = ", then the guard stopped the run" if self.stopped_by == "trip" else ""

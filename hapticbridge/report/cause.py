@@ -376,7 +376,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         concern, _, remedy = concerns[0].rpartition("; write ")
         return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
     if method.hazard:
-        return _method_cause(method, f"{where}, whose setting is as recommended; ")
+        return _method_cause(method, "the contacts are set as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
