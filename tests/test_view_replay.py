@@ -57,7 +57,7 @@ def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay:
         row = records[max(round(sight.time * 1000) - 1, 0)]
         np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
         np.testing.assert_allclose(sight.handle, row["handle_position"])
-    still = replay.at(1.2)  # before a handle that stands still is probed
+    still = replay.at(1.1)  # before a handle that stands still is probed
     assert np.linalg.norm(still.hand_force) > 1
     np.testing.assert_allclose(still.hand_force, -still.tool_force)  # as force_scale is 1
     assert len(still.contact_places) == 1
