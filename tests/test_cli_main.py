@@ -305,9 +305,10 @@ def test_a_signal_that_a_library_swallowed_comes_again(monkeypatch: pytest.Monke
 def test_long_work_is_named_once_where_nothing_is_animated(monkeypatch: pytest.MonkeyPatch) -> None:
     lines, has_told = list[str](), threading.Event()
 
-    def note(words: str) -> None:
-        lines.append(words)
-        has_told.set()
+    def note(words: str = "") -> None:
+        if words:  # older versions of rich end a bar that was off with an empty line
+            lines.append(words)
+            has_told.set()
 
     monkeypatch.setattr(terminal.err, "print", note)
     monkeypatch.setattr(terminal, "REPRINT", 0.0)
