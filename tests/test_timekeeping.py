@@ -402,3 +402,22 @@ def test_a_first_sample_far_from_the_start_is_refused() -> None:
 def at_home(sample: NDArray[np.void]) -> NDArray[np.void]:
     sample["position"][0] = 0.0
     return sample
+
+
+def kept_time() -> timekeeping.Timekeeping:
+    """Returns the time that a short run in simulated time kept."""
+    with Bridge("point_mass", "simulated", clock=SimulatedClock()) as bridge:
+        return bridge.run(0.05).timekeeping
+
+
+def test_a_force_that_the_watch_lowered_refutes_a_device_that_is_not_judged() -> None:
+    kept = kept_time()
+    assert kept.certified(None) is None
+    assert replace(kept, watch="the force was lowered").certified(None) is False
+
+
+def test_a_silence_of_the_device_is_the_cause_and_not_the_clock() -> None:
+    silent = replace(kept_time(), is_kept=False, silence="the device gave no new sample for 1 s")
+    assert "no new sample for 1 s; check its link" in silent.fault
+    assert "doctor" not in silent.fault
+    assert "doctor" in replace(silent, share=0.5).fault
