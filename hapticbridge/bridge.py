@@ -42,6 +42,7 @@ from hapticbridge.hands import (
 )
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
+from hapticbridge.kernel.mujoco_c import without_timers
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
@@ -229,6 +230,7 @@ class Bridge:
         with ExitStack() as stack:
             stack.callback(session.note_stop)
             stack.enter_context(stopping_on_signals(self.stop_on_signal))
+            stack.enter_context(without_timers())
             if self.setup.is_realtime:
                 session.note_grants(stack.enter_context(real_time()))
             try:

@@ -21,6 +21,7 @@ from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.hands import simulate_hands
+from hapticbridge.kernel.mujoco_c import without_timers
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -170,6 +171,7 @@ class Resimulator:
         """Energy that the environment may have created so far, in J."""
         return self.binding.slack
 
+    @without_timers()
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 

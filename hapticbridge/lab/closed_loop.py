@@ -24,7 +24,7 @@ from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled, compiled_for_threads, direct
 from hapticbridge.kernel.codes import State
-from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
+from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at, without_timers
 from hapticbridge.kernel.state import STATE_DTYPE, BoundKernel
 from hapticbridge.kernel.tick import shown_tick, whole_tick
 from hapticbridge.options import RunSetup
@@ -218,15 +218,16 @@ class ClosedLoop:
         records = np.zeros(ticks if keep_records else 0, TICK_DTYPE)
         signal, depths, most = np.zeros(ticks), np.zeros(ticks), np.zeros(1)
         outputs, began = (signal, depths, most, records), time.thread_time()
-        done = _machine_code()(
-            (binding.state, slow.state),
-            (binding.row, slow.row, np.zeros(1, SAMPLE_DTYPE)),
-            scene_ticks,
-            *device.stepper,
-            sample,
-            intervals,
-            *outputs,
-        )
+        with without_timers():
+            done = _machine_code()(
+                (binding.state, slow.state),
+                (binding.row, slow.row, np.zeros(1, SAMPLE_DTYPE)),
+                scene_ticks,
+                *device.stepper,
+                sample,
+                intervals,
+                *outputs,
+            )
         seconds = time.thread_time() - began
         state, ledger = binding.state, Ledger.of(binding.state)
         last = signal[-(ticks // 5) :] if done == ticks else signal[:done]

@@ -6,7 +6,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
@@ -24,6 +24,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.hands import Grasp
 from hapticbridge.jit import direct
+from hapticbridge.kernel.mujoco_c import without_timers
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.chart.chart import machine, one_core
@@ -64,7 +65,8 @@ class Variant:
         name: Name in tables.
         has_islands: True if MuJoCo divides the scene into islands that are solved separately.
         method: Rendering method; None for the default.
-        is_bare: True if MuJoCo's step runs alone, without the bridge's arithmetic.
+        is_bare: True if MuJoCo's step runs alone, without the bridge's arithmetic and with the
+            timers of its stages, which a run turns off.
         sleeps: True if MuJoCo lets bodies at rest sleep. The bridge refuses that (a sleeping tool
             would not feel its coupling), so it is measured with the bare step.
     """
@@ -111,7 +113,7 @@ def tick_times(
         SceneError: The scene cannot be rendered.
     """
     model, data = scene.model, scene.data
-    with _flags(model, variant):
+    with _flags(model, variant), nullcontext() if variant.is_bare else without_timers():
         method = variant.method or default_method(substeps)
         parameters = unguarded_parameters(scene, COUPLING, PERIOD, substeps, method)
         scene.reset()
