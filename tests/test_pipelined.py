@@ -21,7 +21,7 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import Scheme
-from hapticbridge.kernel.handle import take_handle_frames
+from hapticbridge.kernel.handle import take_actuator_velocities, take_handle_frames
 from hapticbridge.kernel.tick import can_split, is_sound
 
 TICKS = 400
@@ -98,32 +98,38 @@ OF_THE_HANDLE = ("xpos", "xquat", "xmat", "xipos", "ximat", "site_xpos", "site_x
 
 @pytest.mark.parametrize("name", ["point_mass", "hex_key", "drawer", "pliers"])
 def test_what_depends_on_the_handle_is_what_mujoco_computes_to_the_bit(name: str) -> None:
-    """Against MuJoCo's kinematics and transmission of the whole scene, at random poses."""
+    """Against MuJoCo's stages of the whole scene, at random poses and velocities."""
     rng = np.random.default_rng(7)
     with fast(name, ScriptedDevice(still)) as bridge:
         state, model, data = bridge.session.kernel.state[0], bridge.scene.model, bridge.scene.data
         assert state["mj"]["is_handle_alone"]
         handle, take = int(state["mj"]["handle_mocap_id"]), direct(take_handle_frames, state)
+        take_velocities = direct(take_actuator_velocities, state["mj"])
         for k in range(300):
             data.qpos[:] = model.qpos0 + 0.3 * rng.normal(size=model.nq) * (k > 0)
             mujoco.mj_normalizeQuat(model, data.qpos)
+            data.qvel[:] = rng.normal(size=model.nv)
             mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
             data.mocap_pos[handle] = rng.normal(size=3)
             turn = rng.normal(size=4) if k % 3 else np.eye(4)[0]
             data.mocap_quat[handle] = turn / (np.linalg.norm(turn) if k % 2 else 1.0)
             take(state)
+            take_velocities(state["mj"])
             found = _of_the_handle(data)
             mujoco.mj_kinematics(model, data)
             mujoco.mj_transmission(model, data)
+            mujoco.mj_fwdVelocity(model, data)
             assert found == _of_the_handle(data)
 
 
 def _of_the_handle(data: mujoco.MjData) -> list[list[float]]:
-    """Returns all frames, and lengths and moments of the actuators."""
+    """Returns all frames, the actuators' numbers, and what the velocity stage computes besides."""
     end = data.moment_rowadr[-1] + data.moment_rownnz[-1]
     parts = [getattr(data, name) for name in OF_THE_HANDLE]
     parts += [data.actuator_length, data.moment_rownnz, data.moment_rowadr]
-    parts += [data.moment_colind[:end], data.actuator_moment[:end]]
+    parts += [data.moment_colind[:end], data.actuator_moment[:end], data.actuator_velocity]
+    parts += [data.cvel, data.qfrc_passive, data.qfrc_bias, data.efc_vel]
     return [part.ravel().tolist() for part in parts]
 
 

@@ -13,6 +13,7 @@ from hapticbridge.kernel.mujoco_c import (
     ints,
     mj_kinematics,
     mj_transmission,
+    mju_mul_mat_vec_sparse,
     mju_normalize4,
     mju_quat2mat,
     mju_sub_quat,
@@ -315,6 +316,28 @@ def take_handle_frames(s: State) -> None:
         return
     _move_handle_body(mj)
     _turn_actuators(mj)
+
+
+@compiled
+def turns_actuators_alone(mj: Part) -> bool:
+    """Returns True if in MuJoCo's velocity stage only those actuators depend on the handle."""
+    return bool(mj.is_handle_alone != 0 and mj.held_qpos == 0)
+
+
+@compiled
+def take_actuator_velocities(mj: Part) -> None:
+    """Computes the velocities of the coupling's actuators, as MuJoCo's velocity stage does."""
+    first = mj.coupling_output_adr
+    mju_mul_mat_vec_sparse(
+        mj.actuator_velocity + 8 * first,
+        mj.actuator_moment,
+        mj.qvel,
+        6,
+        mj.moment_rownnz + 4 * first,
+        mj.moment_rowadr + 4 * first,
+        mj.moment_colind,
+        0,
+    )
 
 
 @compiled

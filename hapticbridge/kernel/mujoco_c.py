@@ -62,6 +62,9 @@ mj_mul_m: Any = external("mj_mulM", "void(intp, intp, intp, intp)")
 mj_mul_jac: Any = external("mj_mulJacVec", "void(intp, intp, intp, intp)")
 mj_solve_m: Any = external("mj_solveM", "void(intp, intp, intp, intp, int32)")
 mj_apply_ft: Any = external("mj_applyFT", "void(intp, intp, intp, intp, intp, int32, intp)")
+mju_mul_mat_vec_sparse: Any = external(
+    "mju_mulMatVecSparse", "void(intp, intp, intp, int32, intp, intp, intp, intp)"
+)
 mju_normalize4: Any = external("mju_normalize4", "double(intp)")
 mju_quat2mat: Any = external("mju_quat2Mat", "void(intp, intp)")
 mju_sub_quat: Any = external("mju_subQuat", "void(intp, intp, intp)")
@@ -321,6 +324,7 @@ _DATA_ARRAYS = (
     "xfrc_applied",
     "actuator_force",
     "actuator_length",
+    "actuator_velocity",
     "moment_rownnz",
     "moment_rowadr",
     "moment_colind",

@@ -407,7 +407,7 @@ def aim_contacts(s: State) -> None:
     if contact.is_rigid and ints(s.mj.nefc, 1)[0] > 0:
         has_energy = _spendable(s) > 0.0 or s.energy.mocap_has_moved
         contact.share = 1.0 if has_energy else 0.0
-        contact.corrections = contact.is_shifted = 0
+        contact.corrections = contact.is_shifted = contact.is_aimed = 0
         ints(contact.solver, 1)[0] = contact.own_solver
         _aim(s)
         contact.is_aimed = 1

@@ -50,7 +50,9 @@ from hapticbridge.kernel.handle import (
     move_device,
     move_handle,
     place_handle,
+    take_actuator_velocities,
     take_handle_frames,
+    turns_actuators_alone,
 )
 from hapticbridge.kernel.law import (
     charge_lateness,
@@ -301,9 +303,10 @@ def before_step(
 # MuJoCo's step is a chain of stages: positions (kinematics, inertia, collisions, constraints),
 # velocities, forces, solver, integration. In the first stage, only the handle's pose and the six
 # actuators' moments depend on the device, because the handle has no mass and no geom. The live loop
-# therefore runs that stage on the new state as soon as the wrench is sent. When the sample comes,
-# the handle is placed, moments and velocities are computed, and MuJoCo's second half (``mj_step2``)
-# does the rest. Every number equals that of a whole step to the bit.
+# therefore runs that stage on the new state as soon as the wrench is sent, and the velocity stage
+# where the velocities of those actuators alone depend on it. When the sample comes, the handle is
+# placed, moments and velocities are computed, and MuJoCo's second half (``mj_step2``) does the
+# rest. Every number equals that of a whole step to the bit.
 #
 # A whole step is done if more depends on the sample or the scene may have been changed: at the
 # first tick, after a pause, after a move of a mocap body, and if a position or velocity is so large
@@ -331,7 +334,7 @@ def can_split(model: mujoco.MjModel, scheme: int) -> bool:
 
 @compiled
 def take_handle_in(s: State) -> None:
-    """Repeats the parts of the position stage that depend on the handle, then the velocity stage.
+    """Repeats what depends on the handle in the stages of positions and velocities.
 
     They cannot fail after a position stage that has just succeeded through Python.
     """
@@ -339,9 +342,18 @@ def take_handle_in(s: State) -> None:
     take_handle_frames(s)
     if mj.nsensor > 0:
         mj_sensor_pos(mj.model, mj.data)
-    mj_fwd_velocity(mj.model, mj.data)
+    if turns_actuators_alone(mj):
+        take_actuator_velocities(mj)
+    else:
+        take_velocities(s)
     if mj.nsensor > 0:
         mj_sensor_vel(mj.model, mj.data)
+
+
+@compiled
+def take_velocities(s: State) -> None:
+    """Runs the velocity stage, and makes the contacts of the coming step rigid."""
+    mj_fwd_velocity(s.mj.model, s.mj.data)
     aim_contacts(s)
 
 
@@ -560,6 +572,8 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     end_tick(s, row)
+    if loop.has_positions and turns_actuators_alone(s.mj):
+        take_velocities(s)
     return OK
 
 
