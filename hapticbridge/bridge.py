@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import Clock, RealClock
-from hapticbridge.commands import Command, Repeat
-from hapticbridge.commands.command import Stop
+from hapticbridge.commands import Command, Repeat, Stop
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_read, checked_write

@@ -50,7 +50,7 @@ INTERFACE = {
         "recording.repair.repair",
         "export.export",
     ),
-    "Changes during a run": ("commands.command.Couple", "commands.command.Switch"),
+    "Changes during a run": ("commands.Couple", "commands.Switch"),
     "Many runs": ("sweep.sweep.sweep", "sweep.points.grid", "sweep.results.Table"),
     "Errors": (
         "errors.HapticBridgeError",

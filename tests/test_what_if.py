@@ -120,7 +120,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
 
 def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("INTERVAL", "RESET_INTERVAL"):  # no time passes between them
-        monkeypatch.setattr(f"hapticbridge.commands.execution.{name}", 0.0)
+        monkeypatch.setattr(f"hapticbridge.commands.{name}", 0.0)
     path, motion = tmp_path / "run.mcap", tmp_path / "tap.csv"
     motion.write_text(TAP)
     device = f"simulated:path={motion}"

@@ -1,6 +1,6 @@
 """Parameters and external actions of a recorded run, from metadata and events.
 
-This is the second reading of the events. ``commands.execution`` applies them one by one to the
+This is the second reading of the events. ``commands`` applies them one by one to the
 kernel; here they become arrays over ticks.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.certificate import delay_ticks, required_axis_damping
-from hapticbridge.commands.execution import bits_in, coupling_in, tuning_ticks
+from hapticbridge.commands import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
