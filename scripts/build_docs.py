@@ -51,7 +51,7 @@ INTERFACE = {
         "export.export",
     ),
     "Changes during a run": ("commands.Couple", "commands.Switch"),
-    "Many runs": ("sweep.sweep.sweep", "sweep.points.grid", "sweep.results.Table"),
+    "Many runs": ("sweep.sweep", "sweep.grid", "sweep.Table"),
     "Errors": (
         "errors.HapticBridgeError",
         "errors.SafetyTrip",

@@ -25,7 +25,7 @@ from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 from hapticbridge.theory.device_limits import quantization_limit
 
 RANGE = (0.1, 2.0)

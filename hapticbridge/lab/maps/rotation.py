@@ -26,7 +26,7 @@ from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
 """Principal moments of inertia of the tool about x, y, z in kg m². They all differ, so that it
