@@ -28,7 +28,7 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export", "export_viewers", "dataset", "recorded_scene"),
+    ("guard", "summary", "timekeeping", "export", "dataset", "recorded_scene"),
     ("testing",),
     ("commands", "check"),
     ("audit", "compare", "options"),

@@ -31,8 +31,8 @@ DRIVERS = {
     "serial": "hapticbridge.device.rawhid.serial",
     "pid": "hapticbridge.device.pid.device",
     "wheel": "hapticbridge.device.wheel.device",
-    "haply": "hapticbridge.device.haply.device",
-    "forcedimension": "hapticbridge.device.force_dimension.device",
+    "haply": "hapticbridge.device.haply",
+    "forcedimension": "hapticbridge.device.force_dimension",
     "touch": "hapticbridge.device.touch.device",
 }
 """Module of each driver by the driver's name, in the order in which drivers are listed. The module
