@@ -56,8 +56,8 @@ from hapticbridge.realtime import (
 )
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
+from hapticbridge.recording.ring import Snapshot
 from hapticbridge.recording.seal import Signer
-from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare, prepare_hands
 from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
 from hapticbridge.signals import deferring_stops

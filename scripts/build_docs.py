@@ -35,7 +35,7 @@ suppress_warnings = ["myst.xref_missing", "docutils", "ref.python"]
 
 INTERFACE = {
     "Run": ("bridge.Bridge", "options.BridgeOptions", "options.Workspace", "guard.Limits"),
-    "Result": ("summary.Summary", "audit.audit", "audit.report.AuditReport"),
+    "Result": ("summary.Summary", "audit.audit", "audit.verdict.AuditReport"),
     "Scene and coupling": ("scene.load.load_scene", "scene.scene.Scene", "coupling.Coupling"),
     "Device": (
         "device.base.Device",
@@ -47,7 +47,7 @@ INTERFACE = {
     "Recording": (
         "recording.reader.read_recording",
         "recording.reader.Recording",
-        "recording.repair.repair",
+        "recording.writer.repair",
         "export.export",
     ),
     "Changes during a run": ("commands.Couple", "commands.Switch"),

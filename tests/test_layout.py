@@ -192,7 +192,6 @@ SMALL = 80
 
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
-    "hapticbridge.recording.repair",  # the public call of the command
     "hapticbridge.device.discovery",  # devices that are plugged in, for every driver
 }
 """Modules that are small on purpose."""

@@ -20,7 +20,6 @@ from hapticbridge.theory.bounds import (
     stiffest_coupling,
     worst_frequency,
 )
-from hapticbridge.theory.device_limits import quantization_limit
 from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of, search_grid
 from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid, Discretization
 from hapticbridge.theory.virtual_mass import (
@@ -28,7 +27,7 @@ from hapticbridge.theory.virtual_mass import (
     environment_minimum_damping,
     minimum_mass,
 )
-from hapticbridge.theory.z_width import z_width
+from hapticbridge.theory.z_width import quantization_limit, z_width
 
 T = 1e-3
 positive = st.floats(1e-6, 1e6)

@@ -20,7 +20,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
 from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
-from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.recording.ring import Snapshot
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 

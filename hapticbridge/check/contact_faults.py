@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import SceneUnderCheck
-from hapticbridge.check.fault import Fault, length, number, others
+from hapticbridge.check.case import Fault, SceneUnderCheck, length, number, others
 from hapticbridge.check.observe import clearances
 from hapticbridge.check.physics import body_inertia, constraint_stiffness, depth_under
 from hapticbridge.check.source_map import Place

@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import SceneUnderCheck
-from hapticbridge.check.fault import Fault
+from hapticbridge.check.case import Fault, SceneUnderCheck
 from hapticbridge.check.observe import Setting, not_finite, rehearsal_parameters
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE

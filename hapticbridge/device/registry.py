@@ -15,7 +15,7 @@ from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, check
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
-from hapticbridge.device.simulated.hand import Hand
+from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices, nearest
 from hapticbridge.kernel.codes import JOINT

@@ -719,7 +719,7 @@ def publish_positions(
     head: NDArray[np.int64],
     numbers: NDArray[np.float64],
 ) -> None:
-    """Copies the scene's positions and contacts to a snapshot (``recording.snapshot``).
+    """Copies the scene's positions and contacts to a snapshot (``recording.ring``).
 
     Call it after MuJoCo's step and before the next one, while the step's contact forces exist. The
     tick reads nothing that it changes.

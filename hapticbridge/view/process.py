@@ -1,6 +1,6 @@
 """Process that shows a run while it continues. The loop never waits for it.
 
-It reads the newest positions of the scene (``recording.snapshot``) and the records of the ring, and
+It reads the newest positions of the scene (``recording.ring``) and the records of the ring, and
 draws them on the page. It ends when its input does.
 """
 
@@ -29,7 +29,7 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
-from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of

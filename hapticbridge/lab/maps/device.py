@@ -26,7 +26,7 @@ from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
-from hapticbridge.theory.device_limits import quantization_limit
+from hapticbridge.theory.z_width import quantization_limit
 
 RANGE = (0.1, 2.0)
 """Ranges of β and of σ, even in their logarithms."""
