@@ -35,7 +35,7 @@ from hapticbridge.hands import DeviceGroup
 from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
-from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands, publish_hands
+from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
@@ -197,14 +197,13 @@ class TickKernel:
         self.before: Callable[..., int]
         self.answer: Callable[..., int]
         self.finish: Callable[..., int]
-        self._publish: Callable[..., bool]
+        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
         if sample.size > 1:
             self._load_hands(sample.size)
             return
         self.before = direct(before_step, state, sample, row, 0, 0.0)
         self.answer = direct(answer_step, state, row, 0)
         self.finish = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
-        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 
     def _load_hands(self, count: int) -> None:
         """Loads the machine code of several hands, whose ticks have one step and no half."""
@@ -213,7 +212,6 @@ class TickKernel:
         self.before = direct(before_hands, states, self.sample, own, 0, 0.0)
         self.answer = direct(answer_hands, states, own, 0)
         self.finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0, True)
-        self._publish = direct(publish_hands, own, rows, cursors, 0, 0, 0, 0, 0)
 
     def bind_hands(self, hands: BoundHands) -> None:
         """Attaches the arrays of a scene that several hands hold."""

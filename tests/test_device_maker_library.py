@@ -14,8 +14,7 @@ import pytest
 from emulated.dhd_stub import Stub
 from emulated.hd_stub import HdStub
 
-from hapticbridge.device import force_dimension as force_dimension
-from hapticbridge.device import open_device
+from hapticbridge.device import force_dimension, open_device
 from hapticbridge.device.force_dimension import Dhd
 from hapticbridge.device.touch import device as touch
 from hapticbridge.device.touch.servo import Hd
