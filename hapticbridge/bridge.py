@@ -435,7 +435,7 @@ class Bridge:
     @property
     def ledger(self) -> Ledger:
         """Energies so far, by port; of several hands, those at the first one's."""
-        return Ledger.of(self.session.kernel.bound.state)
+        return Ledger.from_state(self.session.kernel.bound.state)
 
     def latest_records(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest ``count`` ticks' records (``TICK_DTYPE``), oldest first.

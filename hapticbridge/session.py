@@ -655,7 +655,7 @@ class Session:
             start_potential=self._start_potential,
         )
         hands = [
-            Summary.of(
+            Summary.from_state(
                 self.kernel.state[hand : hand + 1],
                 self.hand_parameters[hand],
                 setup.info,
@@ -666,6 +666,8 @@ class Session:
             for hand, setup in enumerate(self._setups)
         ]
         if len(self._before_trip):  # the tick that tripped is half done and not recorded
-            hands = [each.at(at) for each, at in zip(hands, self._before_trip, strict=True)]
+            hands = [
+                each.at_record(row) for each, row in zip(hands, self._before_trip, strict=True)
+            ]
         first, *others = hands
         return Summary.of_hands((first, *others)) if others else first

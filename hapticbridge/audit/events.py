@@ -52,7 +52,7 @@ class RunEvents:
     _switched: tuple[Array, NDArray[np.int64]]
 
     @classmethod
-    def of(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
+    def from_recording(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
         """Reads the events of a recording.
 
         Raises:
@@ -167,7 +167,7 @@ class AuditedRun:
             raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
         linear, angular = info.dissipating_damping
         parameters = replace(parameters, device_damping=linear, device_rotational_damping=angular)
-        return cls(info, method, parameters, RunEvents.of(recording, parameters))
+        return cls(info, method, parameters, RunEvents.from_recording(recording, parameters))
 
     @property
     def worst(self) -> RunParameters:

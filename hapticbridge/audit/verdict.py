@@ -675,7 +675,7 @@ def _time_facts(
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
         mean_jitter=timing.jitter / max(timing.ticks, 1),
-        delay_energy=timing.most_uncovered,
+        delay_energy=timing.max_uncovered,
         is_realtime=any(event.get("event") == "real_time" for event in recording.events),
         flags=recording.flags,
         has_tripped=any(event.get("event") == "trip" for event in recording.events),
@@ -685,7 +685,7 @@ def _time_facts(
         silent_tick=timing.silent_tick,
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
-    kept = Timekeeping.of(times, run.worst, conditions)
+    kept = Timekeeping.from_times(times, run.worst, conditions)
     facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified)}
     if kept.conditions:
         facts["damping_margin"] = damping_margin(kept.conditions)

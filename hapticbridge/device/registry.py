@@ -85,10 +85,10 @@ def driver_named(name: str) -> Driver | None:
             f"the package {package} names {entry.value} as the device '{name}'; it must be a "
             "hapticbridge.device.driver.Driver of that name"
         )
-    return _told(found, package)
+    return _with_device_errors(found, package)
 
 
-def _told(driver: Driver, package: str) -> Driver:
+def _with_device_errors(driver: Driver, package: str) -> Driver:
     """Returns the driver of a package with every error of its functions as a ``DeviceError``."""
     about = f"the device '{driver.name}' of the package {package}"
 

@@ -84,7 +84,7 @@ class StabilityMap:
     sentences: Callable[[Mapping[str, Any]], Sentences]
 
     @classmethod
-    def of(cls, module: Any) -> StabilityMap:
+    def from_module(cls, module: Any) -> StabilityMap:
         """Returns the map that a module holds under the names of these attributes."""
         names = ("points", "evaluate", "summarize", "draw", "sentences")
         functions = {name: getattr(module, name) for name in names}

@@ -234,7 +234,7 @@ def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.vo
 
 
 def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
-    ledger = Ledger.of(binding.state)
+    ledger = Ledger.from_state(binding.state)
     handle = Rotation.from_quat(records["handle_quaternion"][:, [1, 2, 3, 0]])
     tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])
     between = (handle * tool.inv()).as_rotvec()
