@@ -73,8 +73,6 @@ def test_axes_do_not_mix() -> None:
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")
 INTEGRATORS: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
 WALL = Coupling(1000, 1, 0, 0)
-EYE = np.eye(2)
-RAGGED: Any = [[1, 2], [3]]
 THETA = np.union1d(np.linspace(1e-4, np.pi, 8001), np.geomspace(1e-5, 1, 2001))
 stiffnesses = st.floats(1, 1e5)
 

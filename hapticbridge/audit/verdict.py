@@ -107,7 +107,7 @@ class AuditReport:
 
     path: Path
     verdict: Verdict
-    environment: Literal["strict", "within slack", "active"] | None
+    environment: Environment | None
     certified: bool | None
     reason: str
     tick: int | None = None

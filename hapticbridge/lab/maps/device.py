@@ -353,10 +353,6 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
     )
 
 
-SMALLEST = 1e-4
-"""Deviation in per cent that stems from rounding alone; no smaller one is quoted."""
-
-
 DEFAULT_POINTS = 400
 """Approximate number of points by default."""
 
