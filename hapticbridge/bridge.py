@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import Clock, RealClock
-from hapticbridge.commands import Command, Repeat
-from hapticbridge.commands.command import Stop
+from hapticbridge.commands import Command, Repeat, Stop
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_read, checked_write
@@ -438,7 +437,7 @@ class Bridge:
     @property
     def ledger(self) -> Ledger:
         """Energies so far, by port; of several hands, those at the first one's."""
-        return Ledger.of(self.session.kernel.bound.state)
+        return Ledger.from_state(self.session.kernel.bound.state)
 
     def latest_records(self, count: int) -> NDArray[np.void]:
         """Returns copies of the newest ``count`` ticks' records (``TICK_DTYPE``), oldest first.

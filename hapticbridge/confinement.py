@@ -56,7 +56,7 @@ PATIENCE, SHARE = 10.0, 5.0
 """Time in s that a child may take beyond ``SHARE`` times its processor time. A child that waits
 uses no processor; on a busy machine an honest one has a fifth of it."""
 
-LARGEST_FILE, MOST_FILES = 256 << 20, 256
+LARGEST_FILE, MAX_FILES = 256 << 20, 256
 """Size in bytes of a file that the child may write, and number of files it may have open."""
 
 LARGEST_ANSWER = 1 << 29
@@ -389,7 +389,7 @@ def confine(
         return {}
     _limit_memory(memory)
     _lower(resource.RLIMIT_FSIZE, LARGEST_FILE)
-    _lower(resource.RLIMIT_NOFILE, MOST_FILES)
+    _lower(resource.RLIMIT_NOFILE, MAX_FILES)
     _lower(resource.RLIMIT_CORE, 0)
     allow_time(COMPILE_TIME)
     return {

@@ -34,7 +34,7 @@ from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recorded_scene import bounds_for
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.recording.snapshot import MAX_CONTACTS
+from hapticbridge.recording.ring import MAX_CONTACTS
 from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4

@@ -25,7 +25,7 @@ from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import calling_on_error
-from hapticbridge.device.simulated.hand import DEFAULT_HAND
+from hapticbridge.device.simulated.dynamics import DEFAULT_HAND
 from hapticbridge.errors import (
     DeviceError,
     HapticBridgeError,

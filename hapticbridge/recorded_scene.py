@@ -121,7 +121,7 @@ def load_machine_code(name: str, contact: str, is_slow: bool, is_of_hands: bool 
 
 # Scene from its sources
 
-MOST_STEPS = 4
+MAX_STEPS = 4
 """Names that one path is joined from: asset folder, name in an include, in a model, in a file."""
 
 
@@ -145,7 +145,7 @@ def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
         if inner.suffix != ".toml"
     ]
     # a name may be taken relative to another file and to an asset folder that climbs, too
-    folder = folder.joinpath(*MOST_STEPS * max(climbs, default=0) * ["inner"])
+    folder = folder.joinpath(*MAX_STEPS * max(climbs, default=0) * ["inner"])
     for name, (inner, data) in files.items():
         # a foreign recording must not write outside the folder
         if inner.is_absolute() or ".." in inner.parts or "\\" in name or ":" in name:

@@ -42,7 +42,7 @@ LIGHT = 0.1
 """Wrench in N and N m below which changes are measured against it. A tool that rests on a table
 has no load to compare with."""
 
-MAX_WORK, LEAST_STEPS = 6e5, 100
+MAX_WORK, MIN_STEPS = 6e5, 100
 """Largest work of one rehearsal in degrees of freedom and constraint rows, summed over its steps,
 and the steps that it always takes. A unit costs 3 to 7 µs: a scene of 130 takes all steps, one of
 400 half of them. More would let heavy scenes start later; a limit in seconds would give another
@@ -97,7 +97,7 @@ class Rehearsal:
                 step(self.model, data)
                 finish(record)
                 work += self.model.nv + data.nefc
-                is_long = work > MAX_WORK and done >= LEAST_STEPS
+                is_long = work > MAX_WORK and done >= MIN_STEPS
                 if is_long or not np.isfinite(data.qvel).all():
                     return
                 wrench, forces = np.zeros(6), data.actuator_force[self._outputs]
@@ -231,7 +231,7 @@ Farther away a tool pulls more, and one that a device can hold longer would be c
 SLOWEST_TOPPLING = 1.0
 """Rate in 1/s from which a tool topples. A hand leads a slower one, such as a pole of 15 m."""
 
-LEAST_LEVER = 1e-3
+MIN_LEVER = 1e-3
 """Way of the grip over the way of the joints in a mode, in m, below which the mode leaves the grip
 where it is, and the hand cannot feel it."""
 
@@ -273,7 +273,7 @@ def toppling_force(scene: Scene, parameters: RunParameters) -> float:
     mode = np.zeros(model.nv)
     mode[dofs] = root.T @ modes[:, 0]
     way = float(np.linalg.norm(jacobian @ mode))
-    if squares[0] > -(SLOWEST_TOPPLING**2) or way < LEAST_LEVER * float(np.linalg.norm(mode)):
+    if squares[0] > -(SLOWEST_TOPPLING**2) or way < MIN_LEVER * float(np.linalg.norm(mode)):
         return 0.0
     mujoco.mj_integratePos(model, data.qpos, mode, TIPPED / way)
     mujoco.mj_kinematics(model, data)

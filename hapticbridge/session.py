@@ -35,7 +35,7 @@ from hapticbridge.hands import DeviceGroup
 from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
-from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands, publish_hands
+from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
@@ -56,8 +56,8 @@ from hapticbridge.realtime import (
 )
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
+from hapticbridge.recording.ring import Snapshot
 from hapticbridge.recording.seal import Signer
-from hapticbridge.recording.snapshot import Snapshot
 from hapticbridge.rendering import prepare, prepare_hands
 from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
 from hapticbridge.signals import deferring_stops
@@ -197,14 +197,13 @@ class TickKernel:
         self.before: Callable[..., int]
         self.answer: Callable[..., int]
         self.finish: Callable[..., int]
-        self._publish: Callable[..., bool]
+        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
         if sample.size > 1:
             self._load_hands(sample.size)
             return
         self.before = direct(before_step, state, sample, row, 0, 0.0)
         self.answer = direct(answer_step, state, row, 0)
         self.finish = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
-        self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
 
     def _load_hands(self, count: int) -> None:
         """Loads the machine code of several hands, whose ticks have one step and no half."""
@@ -213,7 +212,6 @@ class TickKernel:
         self.before = direct(before_hands, states, self.sample, own, 0, 0.0)
         self.answer = direct(answer_hands, states, own, 0)
         self.finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0, True)
-        self._publish = direct(publish_hands, own, rows, cursors, 0, 0, 0, 0, 0)
 
     def bind_hands(self, hands: BoundHands) -> None:
         """Attaches the arrays of a scene that several hands hold."""
@@ -657,7 +655,7 @@ class Session:
             start_potential=self._start_potential,
         )
         hands = [
-            Summary.of(
+            Summary.from_state(
                 self.kernel.state[hand : hand + 1],
                 self.hand_parameters[hand],
                 setup.info,
@@ -668,6 +666,8 @@ class Session:
             for hand, setup in enumerate(self._setups)
         ]
         if len(self._before_trip):  # the tick that tripped is half done and not recorded
-            hands = [each.at(at) for each, at in zip(hands, self._before_trip, strict=True)]
+            hands = [
+                each.at_record(row) for each, row in zip(hands, self._before_trip, strict=True)
+            ]
         first, *others = hands
         return Summary.of_hands((first, *others)) if others else first

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -38,12 +38,18 @@ def stopping_on_signals(
     def handle(number: int, _frame: FrameType | None) -> None:
         stop(signal.Signals(number).name)
 
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     others = (signal.SIG_IGN, None)
-    heeded = [number for number in numbers if signal.getsignal(number) not in others]
-    previous = {number: signal.signal(number, handle) for number in heeded}
+    with _handling([n for n in numbers if signal.getsignal(n) not in others], handle):
+        yield
+
+
+@contextmanager
+def _handling(
+    numbers: Iterable[int], handle: Callable[[int, FrameType | None], None]
+) -> Iterator[None]:
+    """Handles signals in the context, in the main thread only; their handlers come back after."""
+    is_main = threading.current_thread() is threading.main_thread()
+    previous = {number: signal.signal(number, handle) for number in numbers if is_main}
     try:
         yield
     finally:
@@ -217,11 +223,5 @@ def leaving_on_signals() -> Iterator[None]:
         os._exit(code)
 
     usual = (signal.default_int_handler, signal.SIG_DFL)
-    is_main = threading.current_thread() is threading.main_thread()
-    heeded = [n for n in ENDING_SIGNALS if is_main and signal.getsignal(n) in usual]
-    previous = {number: signal.signal(number, leave) for number in heeded}
-    try:
+    with _handling([n for n in ENDING_SIGNALS if signal.getsignal(n) in usual], leave):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

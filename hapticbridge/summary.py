@@ -103,7 +103,7 @@ class Ledger:
     first_device_excess: int | None
 
     @classmethod
-    def of(cls, state: NDArray[np.void]) -> Ledger:
+    def from_state(cls, state: NDArray[np.void]) -> Ledger:
         """Reads the ledger from the kernel's state (``STATE_DTYPE``, one element)."""
         energy = state["energy"][0]
         values = {name: float(energy[name]) for name in _ENERGIES}
@@ -261,7 +261,7 @@ class Summary:
     device: str = ""
     hands: tuple[Summary, ...] = ()
 
-    def at(self, record: np.void) -> Summary:
+    def at_record(self, record: np.void) -> Summary:
         """Returns the summary with the energies of a tick's record."""
         names = record.dtype.names or ()
         found = {name: float(record[name]) for name in self.energies if name in names}
@@ -401,7 +401,7 @@ class Summary:
         return "active" if self.fault is not None else "passive"
 
     @classmethod
-    def of(
+    def from_state(
         cls,
         state: NDArray[np.void],
         parameters: RunParameters,
@@ -411,7 +411,7 @@ class Summary:
         outcome: RunOutcome,
     ) -> Summary:
         """Builds the summary of a run from the kernel's state and the loop's counters."""
-        ledger = Ledger.of(state)
+        ledger = Ledger.from_state(state)
         conditions = run_conditions(info, parameters, method)
         timing = state["timing"][0]
         due = outcome.ticks + outcome.skipped
@@ -421,7 +421,7 @@ class Summary:
             due=due,
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
             mean_jitter=float(timing["jitter"]) / max(outcome.ticks, 1),
-            delay_energy=float(timing["most_uncovered"]),
+            delay_energy=float(timing["max_uncovered"]),
             is_realtime=outcome.is_realtime,
             flags=int(state["watch"]["flags"][0]),
             has_tripped=outcome.stopped_by == "trip",
@@ -431,7 +431,9 @@ class Summary:
             silent_tick=int(state["guard"]["silent_tick"][0]),
         )
         peaks: dict[str, Any] = {name: float(state["loop"][name][0]) for name in _PEAKS}
-        timekeeping = Timekeeping.of(times, parameters, conditions if method.has_law else ())
+        timekeeping = Timekeeping.from_times(
+            times, parameters, conditions if method.has_law else ()
+        )
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,

@@ -101,13 +101,15 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
         worst = float(worst_frequency(law, step, **loop))
         return Alternative(name, needed, worst, (frequency, spectrum))
 
-    def by(method: Method) -> Alternative:
+    def by_method(method: Method) -> Alternative:
         used = method.law_coupling(requested, period)
         shown = RunCoupling.of(method, period, requested).effective or used
         name = f"{method.name}: B = {shown.damping:.4g} effective (law {used.damping:.4g})"
         return way(name, law=used)
 
-    methods = [by(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))]
+    methods = [
+        by_method(method) for method in dict.fromkeys((default_method(), COMPENSATED, IMPLICIT))
+    ]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
     # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B

@@ -177,7 +177,7 @@ class Timekeeping:
     silence: str
 
     @classmethod
-    def of(
+    def from_times(
         cls, times: RunTimes, parameters: RunParameters, conditions: Sequence[DampingCondition]
     ) -> Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""

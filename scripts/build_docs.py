@@ -35,7 +35,7 @@ suppress_warnings = ["myst.xref_missing", "docutils", "ref.python"]
 
 INTERFACE = {
     "Run": ("bridge.Bridge", "options.BridgeOptions", "options.Workspace", "guard.Limits"),
-    "Result": ("summary.Summary", "audit.audit", "audit.report.AuditReport"),
+    "Result": ("summary.Summary", "audit.audit", "audit.verdict.AuditReport"),
     "Scene and coupling": ("scene.load.load_scene", "scene.scene.Scene", "coupling.Coupling"),
     "Device": (
         "device.base.Device",
@@ -47,11 +47,11 @@ INTERFACE = {
     "Recording": (
         "recording.reader.read_recording",
         "recording.reader.Recording",
-        "recording.repair.repair",
+        "recording.writer.repair",
         "export.export",
     ),
-    "Changes during a run": ("commands.command.Couple", "commands.command.Switch"),
-    "Many runs": ("sweep.sweep.sweep", "sweep.points.grid", "sweep.results.Table"),
+    "Changes during a run": ("commands.Couple", "commands.Switch"),
+    "Many runs": ("sweep.sweep", "sweep.grid", "sweep.Table"),
     "Errors": (
         "errors.HapticBridgeError",
         "errors.SafetyTrip",

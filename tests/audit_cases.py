@@ -56,7 +56,7 @@ def balance_of(
 ) -> tuple[AuditedBlock, EnergyBalance]:
     """Returns a whole recording as one block, with its balance from the recorded start."""
     state = AuditState.at_start(recording, parameters)
-    events = RunEvents.of(recording, parameters)
+    events = RunEvents.from_recording(recording, parameters)
     return next(energy_balances([recording.ticks], state, events))
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from outside_scenes import hand_rows
 
-from hapticbridge.check.case import SceneUnderCheck, open_case
-from hapticbridge.check.fault import Fault
+from hapticbridge.check.case import Fault, SceneUnderCheck, open_case
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.scene import read_scene, scene_path
 

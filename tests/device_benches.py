@@ -23,8 +23,8 @@ from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.device import Device, SimulatedDevice
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.falcon.device import FalconDevice
-from hapticbridge.device.haply.device import HaplyDevice
-from hapticbridge.device.haply.device import opened as open_haply
+from hapticbridge.device.haply import HaplyDevice
+from hapticbridge.device.haply import opened as open_haply
 from hapticbridge.device.pid.device import PidDevice, open_pid
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.identify import AxisFit, identify

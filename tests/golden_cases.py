@@ -32,8 +32,8 @@ import hapticbridge as hb
 from hapticbridge.cli import main, terminal
 from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
-from hapticbridge.device.force_dimension import dhd
-from hapticbridge.device.touch import hd
+from hapticbridge.device import force_dimension
+from hapticbridge.device.touch import servo
 from hapticbridge.device.transport import hid, usb
 from hapticbridge.device.wheel.evdev import Linux
 from hapticbridge.errors import CommandError
@@ -654,7 +654,7 @@ def session_text(name: str, folder: Path) -> str:
     lines = session_file(name).read_text(encoding="utf-8").splitlines()
     commands = [line.removeprefix(_PROMPT) for line in lines if line.startswith(_PROMPT)]
     plain = {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
-    plain |= dict.fromkeys((dhd.FILES.variable, hd.FILES.variable), "/no/such.so")
+    plain |= dict.fromkeys((force_dimension.FILES.variable, servo.FILES.variable), "/no/such.so")
     shown = []
     models = str(Path(hb.__file__).parents[1])
     for command in commands:

@@ -99,7 +99,7 @@ class Run:
 
     @property
     def ledger(self) -> Ledger:
-        return Ledger.of(self.binding.state)
+        return Ledger.from_state(self.binding.state)
 
     def tool_steps(self) -> Array:
         return np.diff(self.ticks["tool_position"], axis=0, prepend=self.tool_start[None, :3])

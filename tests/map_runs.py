@@ -16,7 +16,7 @@ def boundary_of(
     module: ModuleType, folder: Path, count: int, keep: Callable[[Point], bool] = bool
 ) -> Mapping[str, Any]:
     """Draws a map at those of its points that are kept, none of which may fail."""
-    drawn = StabilityMap.of(module)
+    drawn = StabilityMap.from_module(module)
     few = replace(drawn, points=lambda n: [point for point in drawn.points(n) if keep(point)])
     with ThreadPoolExecutor(2) as executor:
         files = run_map(few, folder, points=count, executor=executor)

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from hapticbridge.scene import SceneSource, read_scene
 
 GRID = 9
-TRIANGLES = 12 * GRID**2
-"""Triangles of each mesh: 972."""
 
 VISUALS = 40
 ITERATIONS = 100

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticbridge.sweep.points import Value, grid
-from hapticbridge.sweep.sweep import sweep
+from hapticbridge.sweep import Value, grid, sweep
 
 LAST_IS_DONE = threading.Event()
 COUNTED = grid(n=range(12), gain=[0.1])

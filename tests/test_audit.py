@@ -73,7 +73,7 @@ def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) 
     # rounding of 200 summed works of 1e-3 J
     for name in ("coupling_work", "device_energy", "environment_energy"):
         np.testing.assert_allclose(getattr(balance, name), ticks[name], rtol=0, atol=1e-14)
-    events = RunEvents.of(held, parameters)
+    events = RunEvents.from_recording(held, parameters)
     found = [*wrench_deviations(block, events), *energy_deviations(block, balance)]
     off = {deviation.field: deviation.amount.max() for deviation in found}
     assert off["wrench_on_tool"] < 1e-11

@@ -14,7 +14,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.kernel.box_contact import CONE, MOST_POINTS, NEAR
+from hapticbridge.kernel.box_contact import CONE, MAX_POINTS, NEAR
 from hapticbridge.kernel.colliders import EXACT_POINTS, bind_colliders, use_exact_points
 from hapticbridge.kernel.rigid_contact import MARGIN as REST
 
@@ -298,7 +298,7 @@ def test_boxes_inside_each_other_give_finite_points(position: tuple[float, ...])
             pair = Pair(two_boxes(np.full(3, 0.01), np.full(3, inner)))
             pair.place(np.array(position), turn)
             gaps, positions, normals = pair.points()
-            assert 0 < gaps.size <= MOST_POINTS
+            assert 0 < gaps.size <= MAX_POINTS
             assert np.isfinite(positions).all()
             assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
 

@@ -15,8 +15,7 @@ from report_runs import ANVIL, LOOSE
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Command, Couple, Mark, Reset, Switch
-from hapticbridge.commands.execution import tuning_ticks
+from hapticbridge.commands import Command, Couple, Mark, Reset, Switch, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CommandError, DeviceError, RecordingError
 from hapticbridge.guard import Limits

@@ -27,17 +27,15 @@ from check_scenes import (
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import lean
-from hapticbridge.check.case import open_case
+from hapticbridge.check.case import Fault, length, open_case, weight
 from hapticbridge.check.contact_faults import shape_faults
-from hapticbridge.check.fault import Fault, length, weight
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.physics import depth_under
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
-from hapticbridge.check.version import SceneVariant, name_everything
-from hapticbridge.check.witness import witness
+from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling

@@ -29,8 +29,7 @@ from hapticbridge.check.simplify import (
     freedom_simplifications,
     shape_simplifications,
 )
-from hapticbridge.check.version import SceneVariant, name_everything
-from hapticbridge.check.witness import witness
+from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion

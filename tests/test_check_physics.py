@@ -12,8 +12,8 @@ from check_scenes import CUP_DEPTH, CUP_ROOM, GOOD_OPTION, case_of, cup_obj, wri
 from outside_scenes import hand_rows, mjcf
 
 from hapticbridge.check import physics
+from hapticbridge.check.case import length, number, weight
 from hapticbridge.check.contact_faults import inertia_of
-from hapticbridge.check.fault import length, number, weight
 from hapticbridge.check.model_faults import creep_speed, dent_of
 from hapticbridge.check.physics import constraint_stiffness, depth_under, mesh_of
 from hapticbridge.scene import scene_path

@@ -18,8 +18,7 @@ from hapticbridge.check.case import motion_for
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, VariantVerdict
 from hapticbridge.check.observe import Setting, quiet
 from hapticbridge.check.simplify import Simplification
-from hapticbridge.check.version import SceneVariant, name_everything
-from hapticbridge.check.witness import CLEARANCE, witness
+from hapticbridge.check.version import CLEARANCE, SceneVariant, name_everything, witness
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import SceneError

@@ -16,6 +16,7 @@ from emulated.rawhid_model import RawHid
 
 from hapticbridge import Bridge, SimulatedClock
 from hapticbridge.cli import devices as command
+from hapticbridge.device import force_dimension, haply
 from hapticbridge.device.discovery import plugged_devices, udev_rules
 from hapticbridge.device.driver import (
     RULES_COMMAND,
@@ -24,11 +25,9 @@ from hapticbridge.device.driver import (
     access_problem,
     permission_problem,
 )
-from hapticbridge.device.force_dimension import dhd
-from hapticbridge.device.haply import device as haply
 from hapticbridge.device.rawhid import serial
 from hapticbridge.device.registry import all_drivers
-from hapticbridge.device.touch import hd
+from hapticbridge.device.touch import servo
 from hapticbridge.device.transport import hid as hid_search
 from hapticbridge.device.transport import usb as usb_bus
 from hapticbridge.device.transport import usb as usb_search
@@ -272,7 +271,7 @@ def test_running_on_a_device_that_is_not_there_is_one_sentence_that_helps(
 def test_what_stands_between_us_and_a_device_is_said_to_be_missing(
     call: Called, monkeypatch: pytest.MonkeyPatch, bus: Path, name: str, words: str
 ) -> None:
-    for variable in (dhd.FILES.variable, hd.FILES.variable):
+    for variable in (force_dimension.FILES.variable, servo.FILES.variable):
         monkeypatch.setenv(variable, "/no/such.so")
     with socket.socket() as unused:
         unused.bind(("localhost", 0))  # nobody listens there

@@ -56,7 +56,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.device.touch",
         "hapticbridge.device.transport",
         "hapticbridge.device.wheel",
-        "hapticbridge.audit.report",
+        "hapticbridge.audit.verdict",
         "hapticbridge.check.lean",
         "hapticbridge.check.run_faults",
         "hapticbridge.realtime.doctor",
@@ -208,7 +208,7 @@ def test_a_handler_that_is_not_pythons_own_is_kept(number: int, usual: Any) -> N
         signal.signal(number, before)
 
 
-@pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.stability.run_map"])
+@pytest.mark.parametrize("where", ["tyro.cli", "hapticbridge.cli.chart.run_map"])
 def test_ctrl_c_is_one_word_and_exit_code_130(
     where: str, call: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:

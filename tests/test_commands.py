@@ -13,17 +13,21 @@ from hypothesis import strategies as st
 
 from hapticbridge.certificate import required_axis_damping
 from hapticbridge.commands import (
+    INTERVAL,
+    LONGEST_LINE,
+    MAX_WAITING,
+    RESET_INTERVAL,
     Command,
     CommandQueue,
     Couple,
     CouplingLimits,
     Mark,
     Reset,
+    Stop,
     Switch,
     command_of,
+    line_of,
 )
-from hapticbridge.commands.command import LONGEST_LINE, Stop, line_of
-from hapticbridge.commands.execution import INTERVAL, MAX_WAITING, RESET_INTERVAL
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.rendering import method_named

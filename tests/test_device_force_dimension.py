@@ -12,12 +12,11 @@ from emulated.dhd_stub import CALL, OMEGA3, OMEGA6, OMEGA7, SIGMA7, Stub
 from emulated.hid_seam import DrivingClock
 
 import hapticbridge as hb
+from hapticbridge.device import force_dimension as forcedimension
 from hapticbridge.device import open_device
 from hapticbridge.device.base import checked_rotation
 from hapticbridge.device.driver import FoundDevice
-from hapticbridge.device.force_dimension import device as forcedimension
-from hapticbridge.device.force_dimension.device import ForceDimensionDevice
-from hapticbridge.device.force_dimension.dhd import FILES, MODELS
+from hapticbridge.device.force_dimension import FILES, MODELS, ForceDimensionDevice
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import quaternion_log

@@ -15,11 +15,9 @@ from emulated.haply_service import CENTRE, HaplyService, serving
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticbridge.device import SimulatedDevice, open_device
+from hapticbridge.device import SimulatedDevice, haply, open_device
 from hapticbridge.device import watchdog as silence
-from hapticbridge.device.haply import device as haply
-from hapticbridge.device.haply import messages
-from hapticbridge.device.haply.device import FORCE_LIMIT, HaplyDevice
+from hapticbridge.device.haply import FORCE_LIMIT, HaplyDevice
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.device.transport import websocket as transport
 from hapticbridge.errors import DeviceError, DeviceLost
@@ -255,13 +253,13 @@ told = st.fixed_dictionaries({"inverse3": entries | number})
 
 @given(st.text() | told.map(json.dumps))
 def test_whatever_comes_the_position_is_finite_or_there_is_none(message: str) -> None:
-    for answer in (lambda: messages.state(message, "049D"), lambda: messages.inventory(message)):
+    for answer in (lambda: haply.state_of(message, "049D"), lambda: haply.inventory(message)):
         try:
             found = answer()
         except DeviceError as error:
             assert "\n" not in str(error)
             continue
-        if isinstance(found, messages.State):
+        if isinstance(found, haply.State):
             assert np.isfinite(found.position).all()
 
 
@@ -286,19 +284,19 @@ def test_one_of_several_is_chosen_by_its_number() -> None:
 def test_a_number_that_is_no_name_is_refused(device_id: object) -> None:
     told = {"session_id": 1, "inverse3": [{"device_id": device_id}]}
     with pytest.raises(DeviceError, match="without a device_id"):
-        messages.inventory(json.dumps(told))
+        haply.inventory(json.dumps(told))
 
 
 def test_scaled_positions_are_refused_because_their_work_is_none() -> None:
     bench = HaplyBench()
     told = json.loads(bench.service.inventory())
     told["inverse3"][0]["config"]["mount"]["scale"]["y"] = 2
-    (listed,) = messages.inventory(json.dumps(told))
+    (listed,) = haply.inventory(json.dumps(told))
     assert listed.is_scaled
     with pytest.raises(DeviceError, match="scales the positions of 049D"):
-        messages.refuse_scaled(listed)
-    (listed,) = messages.inventory(bench.service.inventory())
-    messages.refuse_scaled(listed)
+        haply.refuse_scaled(listed)
+    (listed,) = haply.inventory(bench.service.inventory())
+    haply.refuse_scaled(listed)
 
 
 def test_numbers_and_limits_come_from_whoever_knows_them() -> None:

@@ -14,11 +14,10 @@ import pytest
 from emulated.dhd_stub import Stub
 from emulated.hd_stub import HdStub
 
-from hapticbridge.device import open_device
-from hapticbridge.device.force_dimension import device as force_dimension
-from hapticbridge.device.force_dimension.dhd import Dhd
+from hapticbridge.device import force_dimension, open_device
+from hapticbridge.device.force_dimension import Dhd
 from hapticbridge.device.touch import device as touch
-from hapticbridge.device.touch.hd import Hd
+from hapticbridge.device.touch.servo import Hd
 from hapticbridge.device.transport.maker_library import LibraryFiles, MakerLibrary
 from hapticbridge.errors import DeviceError
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device import profile as shelf
-from hapticbridge.device.force_dimension.dhd import MODELS
+from hapticbridge.device.force_dimension import MODELS
 from hapticbridge.device.profile import Profile, Quantity, read_profile
 from hapticbridge.errors import DeviceError
 

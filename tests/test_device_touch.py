@@ -16,8 +16,7 @@ from hapticbridge.device import open_device
 from hapticbridge.device.driver import FoundDevice, ignore_message
 from hapticbridge.device.touch import device as touch
 from hapticbridge.device.touch.device import RealWaiting, TouchDevice, open_touch
-from hapticbridge.device.touch.hd import FILES, Hd
-from hapticbridge.device.touch.servo import Servo
+from hapticbridge.device.touch.servo import FILES, Hd, Servo
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag

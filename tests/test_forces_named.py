@@ -16,7 +16,7 @@ from hapticbridge.film_process import Stage
 from hapticbridge.options import Workspace
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.report.facts import head_facts
+from hapticbridge.report.page import head_facts
 from hapticbridge.summary import Summary
 from hapticbridge.units import format_forces, format_si, format_wrenches
 from hapticbridge.view.replay import Replay

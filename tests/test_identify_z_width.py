@@ -8,8 +8,8 @@ import pytest
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.identify.z_width import MeasuredLimit, WallBench
-from hapticbridge.theory.device_limits import free_device_stiffness
 from hapticbridge.theory.sampled_loop import WorstHand
+from hapticbridge.theory.z_width import free_device_stiffness
 
 PERIOD = 1e-3
 

@@ -135,7 +135,7 @@ def test_a_thin_peg_that_spins_at_the_force_level_creates_no_energy(
         rows = np.zeros(800, TICK_DTYPE)
         assert simulate(kernel.state, samples, kernel.row, rows) == 800
         assert (rows["flags"] & TickFlag.FORCE_LIMITED).any()
-        assert Ledger.of(kernel.state).environment == "strict"
+        assert Ledger.from_state(kernel.state).environment == "strict"
 
 
 # --- what is rendered, and what the device needs --------------------------------------------------
@@ -318,7 +318,7 @@ def led(
     binding = bound(scene, method, asked, period)
     rows = np.zeros(len(path), TICK_DTYPE)
     assert simulate(binding.state, samples, binding.row, rows) == len(path)
-    return rows, Ledger.of(binding.state)
+    return rows, Ledger.from_state(binding.state)
 
 
 def circling(period: float, frequency: float, duration: float = 1.0) -> Array:
@@ -432,7 +432,7 @@ def test_changing_over_creates_no_more_energy_than_the_implicit_contact_does(nam
         rows = np.zeros(len(samples), TICK_DTYPE)
         assert simulate(binding.state, samples, binding.row, rows) == len(samples)
         created[method] = float(rows["environment_energy"].max())
-        assert name == "peg_in_hole" or Ledger.of(binding.state).environment == "strict"
+        assert name == "peg_in_hole" or Ledger.from_state(binding.state).environment == "strict"
     # the jamming peg creates energy in the implicit form already: 7.0 mJ, and 5.1 mJ
     assert created["lossless"] < max(created["implicit"], 1e-12)
 
@@ -477,7 +477,7 @@ def pressed(more: float, damping: float, ticks: int = 4000) -> tuple[Array, np.n
         assert after_step(state, row, 0) == OK
         rows[k] = row[0]
     is_lossless = (rows["flags"] & int(TickFlag.MIDPOINT)) != 0
-    return rows["wrench_on_tool"][:, 0], is_lossless, Ledger.of(state).environment
+    return rows["wrench_on_tool"][:, 0], is_lossless, Ledger.from_state(state).environment
 
 
 def test_unequal_damping_makes_a_limit_cycle_that_equal_damping_does_not() -> None:

@@ -17,7 +17,7 @@ from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
 from hapticbridge.audit.events import AuditedRun
-from hapticbridge.audit.replay import AuditedHand, compare_resimulation
+from hapticbridge.audit.replay import AuditedHand, comparison
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -45,10 +45,9 @@ def check_again(outcome: Outcome, folder: Path) -> None:
     """The two other routes agree: all that the audit minds is that the trips were taken out."""
     assert outcome.report.reason.startswith("guard parameter 'speed' is inf")
     recording = open_recording(folder / "run.mcap")
-    replayed = compare_resimulation(
-        [AuditedHand(recording, AuditedRun.of(recording))], is_trusted=True
-    )
-    assert replayed.agreement == "bit for bit"
+    hands = [AuditedHand(recording, AuditedRun.of(recording))]
+    with comparison(hands, is_trusted=True) as replayed:
+        assert replayed().agreement == "bit for bit"
 
 
 def largest(outcome: Outcome, after: int) -> float:

@@ -228,9 +228,9 @@ def test_engine_that_fails_while_it_is_timed_loses_those_rounds_alone() -> None:
     setting = Setting(METHODS["explicit"], FINE)
     run = EngineRun(Altered(), workload("point_mass").peer_work(), setting)
     run.scores()
-    assert run.go() > 0
+    assert run.run() > 0
     run.engine = Altered(fails_at=10)
-    assert np.isnan(run.go())
+    assert np.isnan(run.run())
 
 
 def test_engine_that_throws_the_tool_away_has_diverged_and_is_timed_as_far_as_it_came(

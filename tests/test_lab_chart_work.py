@@ -27,7 +27,7 @@ def test_plate_stands_on_as_many_contacts_as_it_has_feet() -> None:
     families = tuple(family for family in work.FAMILIES if family.name == "contacts")
     chart = work.measure_work(families, most=30, rounds=1)
     for variant in work.METHOD_VARIANTS:
-        assert [p.contacts for p in chart.of(families[0], variant)] == [1, 3, 10, 30]
+        assert [p.contacts for p in chart.points_of(families[0], variant)] == [1, 3, 10, 30]
     assert {point.freedoms for point in chart.points} == {6}
 
 

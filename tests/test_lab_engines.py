@@ -298,8 +298,8 @@ def test_two_simulations_of_one_engine_do_not_meet(engine: Engine) -> None:
 
 
 def test_contacts_count_what_touches() -> None:
-    assert Contacts.of([]) == (0, 0.0)
-    assert Contacts.of([-1e-3, 0.0, 2e-6]) == (2, 2e-6)
+    assert Contacts.from_depths([]) == (0, 0.0)
+    assert Contacts.from_depths([-1e-3, 0.0, 2e-6]) == (2, 2e-6)
 
 
 def test_drake_says_nan_where_it_refuses_to_go_on() -> None:

@@ -29,7 +29,7 @@ from hapticbridge.lab.maps.base import (
     verdict_numbers,
 )
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Outcome, Table, table_of
+from hapticbridge.sweep import Outcome, Table, table_of
 
 calls: list[Point] = []
 

@@ -25,7 +25,7 @@ from hapticbridge.lab.maps.restitution import (
     points,
     restitution_of,
 )
-from hapticbridge.sweep.sweep import sweep
+from hapticbridge.sweep import sweep
 from hapticbridge.theory.impact import ImpactBody
 
 GAINING: Point = {

@@ -78,7 +78,7 @@ def explicit(function: Any) -> Any:
         (integrators, "discrete_passivity_section", "integrate_particle", explicit, "(13)"),
         (integrators, "implicit_euler_section", "integrate_particle", heavier(1.01), "(16)"),
         (integrators, "explicit_euler_section", "integrate_particle", heavier(1.01), "(18)"),
-        (integrators, "virtual_mass_section", "least_in_mujoco", scaled(1.003), "(19)"),
+        (integrators, "virtual_mass_section", "smallest_mass_in_mujoco", scaled(1.003), "(19)"),
         (
             integrators,
             "virtual_mass_section",

@@ -28,7 +28,7 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export", "export_viewers", "dataset", "recorded_scene"),
+    ("guard", "summary", "timekeeping", "export", "dataset", "recorded_scene"),
     ("testing",),
     ("commands", "check"),
     ("audit", "compare", "options"),
@@ -192,7 +192,6 @@ SMALL = 80
 
 INTERFACES = {
     "hapticbridge.lazy",  # imported by package files, which are not counted
-    "hapticbridge.recording.repair",  # the public call of the command
     "hapticbridge.device.discovery",  # devices that are plugged in, for every driver
 }
 """Modules that are small on purpose."""

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import hapticbridge as hb
-import hapticbridge.audit.report
+import hapticbridge.audit.verdict
 from hapticbridge.lazy import lazy_exports
 
 

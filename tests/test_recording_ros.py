@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.recording import RecordingWriter, read_recording
-from hapticbridge.recording.repair import repair
 from hapticbridge.recording.ros_messages import RATE, TOPICS, Messages
+from hapticbridge.recording.writer import repair
 
 TURN = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 """Rotation from the device's frame to the scene's: its x is the scene's y."""

@@ -31,8 +31,14 @@ from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import Cause, likely_cause, what_would_do
 from hapticbridge.report.evidence import Evidence, decimated, draw_recording
-from hapticbridge.report.facts import MAX_EVENTS, MAX_INPUTS, event_rows, guard_facts
-from hapticbridge.report.page import is_warned, notes
+from hapticbridge.report.page import (
+    MAX_EVENTS,
+    MAX_INPUTS,
+    event_rows,
+    guard_facts,
+    is_warned,
+    notes,
+)
 from hapticbridge.report.plots import BINS, activities, draw_motion, draw_timing
 from hapticbridge.units import format_si
 

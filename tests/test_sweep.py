@@ -26,10 +26,18 @@ from hypothesis import strategies as st
 from hapticbridge.errors import StudyError
 from hapticbridge.files import install_command
 from hapticbridge.signals import holding_interrupts
-from hapticbridge.sweep import Interrupted, Table, grid, sweep
-from hapticbridge.sweep.points import plain, point_key
-from hapticbridge.sweep.results import Outcome, ResultFile
-from hapticbridge.sweep.sweep import WORKER_DIED, cores
+from hapticbridge.sweep import (
+    WORKER_DIED,
+    Interrupted,
+    Outcome,
+    ResultFile,
+    Table,
+    cores,
+    grid,
+    plain,
+    point_key,
+    sweep,
+)
 
 POINTS = grid(stiffness=[1000, 3000.0, 1e4 / 3], damping=np.linspace(0.1, 0.3, 3), tool="peg")
 

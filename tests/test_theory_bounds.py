@@ -20,7 +20,6 @@ from hapticbridge.theory.bounds import (
     stiffest_coupling,
     worst_frequency,
 )
-from hapticbridge.theory.device_limits import quantization_limit
 from hapticbridge.theory.spectrum import damping_spectrum, damping_spectrum_of, search_grid
 from hapticbridge.theory.transfer import MAX_DELAY, CouplingGrid, Discretization
 from hapticbridge.theory.virtual_mass import (
@@ -28,7 +27,7 @@ from hapticbridge.theory.virtual_mass import (
     environment_minimum_damping,
     minimum_mass,
 )
-from hapticbridge.theory.z_width import z_width
+from hapticbridge.theory.z_width import quantization_limit, z_width
 
 T = 1e-3
 positive = st.floats(1e-6, 1e6)
@@ -74,8 +73,6 @@ def test_axes_do_not_mix() -> None:
 SCHEMES: tuple[Discretization, ...] = ("backward", "tustin")
 INTEGRATORS: tuple[Integrator, ...] = ("implicit", "semi_implicit", "explicit")
 WALL = Coupling(1000, 1, 0, 0)
-EYE = np.eye(2)
-RAGGED: Any = [[1, 2], [3]]
 THETA = np.union1d(np.linspace(1e-4, np.pi, 8001), np.geomspace(1e-5, 1, 2001))
 stiffnesses = st.floats(1, 1e5)
 

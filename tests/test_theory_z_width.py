@@ -18,9 +18,16 @@ from hapticbridge.device import open_device
 from hapticbridge.errors import CouplingError
 from hapticbridge.rendering import default_method
 from hapticbridge.theory.bounds import minimum_damping, worst_frequency
-from hapticbridge.theory.device_limits import free_device_damping, free_device_stiffness
 from hapticbridge.theory.transfer import CouplingGrid
-from hapticbridge.theory.z_width import ANY_HAND, NO_LIMIT_CYCLES, WALL, WITHOUT_HAND, z_width
+from hapticbridge.theory.z_width import (
+    ANY_HAND,
+    NO_LIMIT_CYCLES,
+    WALL,
+    WITHOUT_HAND,
+    free_device_damping,
+    free_device_stiffness,
+    z_width,
+)
 
 T = 1e-3
 

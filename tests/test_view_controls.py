@@ -22,8 +22,7 @@ from test_commands import allowance
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Couple, Switch, command_of
-from hapticbridge.commands.command import Stop
+from hapticbridge.commands import Couple, Stop, Switch, command_of
 from hapticbridge.errors import HapticBridgeError, SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording

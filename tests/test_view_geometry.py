@@ -191,7 +191,7 @@ def test_the_ghost_is_all_of_the_tool_that_is_seen_and_a_little_larger() -> None
 @pytest.mark.parametrize("stretch", [1e-4, 0.4])
 def test_spring_and_arrow_point_to_where_the_hand_is_pulled(stretch: float) -> None:
     canvas: Any = Canvas()
-    ghost = Ghost(canvas, Scenery.of(mujoco.MjModel.from_xml_string(TOOL), "grip"))
+    ghost = Ghost(canvas, Scenery.from_model(mujoco.MjModel.from_xml_string(TOOL), "grip"))
     seen = sight((0, 0, -stretch), (0, 0, 5.0))  # pushed down, the tool is above
     ghost.show(seen, 10.0, 20.0)
     line = canvas.__dict__["/coupling"].points

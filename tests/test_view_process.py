@@ -20,7 +20,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
 from hapticbridge.film_process import Stage
 from hapticbridge.recording import Attachment, Ring, read_recording
-from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.recording.ring import Snapshot
 
 pytest.importorskip("viser", reason="needs the extra 'view'")
 
@@ -105,7 +105,7 @@ def test_a_live_view_has_every_body_where_the_run_simulated_again_has_it(
     for sight in sights:
         stage.show(stage.tick_at(sight.time))
         seen = stage.contacts(), stage.hand_force
-        again = Sight.of(stage.model, stage.data, stage.row, Tendons(stage.model), *seen)
+        again = Sight.from_scene(stage.model, stage.data, stage.row, Tendons(stage.model), *seen)
         assert sight.time == again.time
         np.testing.assert_array_equal(sight.places, again.places)
         np.testing.assert_array_equal(sight.turns, again.turns)

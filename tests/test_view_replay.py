@@ -53,17 +53,17 @@ def test_sights_stand_where_the_record_says_and_contacts_carry_the_force(replay:
     records = read_recording(replay.recording.path).ticks
     ball = Stage(replay.recording).model.body("ball").id
     for moment in (0.0, 0.4, 1.2):
-        sight = replay.at(moment)
+        sight = replay.sight_at(moment)
         row = records[max(round(sight.time * 1000) - 1, 0)]
         np.testing.assert_allclose(sight.places[ball], row["tool_position"], atol=1e-9)
         np.testing.assert_allclose(sight.handle, row["handle_position"])
-    still = replay.at(1.1)  # before a handle that stands still is probed
+    still = replay.sight_at(1.1)  # before a handle that stands still is probed
     assert np.linalg.norm(still.hand_force) > 1
     np.testing.assert_allclose(still.hand_force, -still.tool_force)  # as force_scale is 1
     assert len(still.contact_places) == 1
     # at rest what the coupling pushes the floor gives back
     np.testing.assert_allclose(still.contact_forces.sum(axis=0), -still.tool_force, atol=2e-2)
-    assert not len(replay.at(0.0).contact_places)
+    assert not len(replay.sight_at(0.0).contact_places)
 
 
 def test_a_port_that_cannot_be_had_is_named_and_not_exchanged(replay: Replay, call: Called) -> None:
@@ -148,7 +148,7 @@ def test_a_saved_page_holds_the_whole_run(replay: Replay, call: Called, tmp_path
     ]
     assert len(moves) > 10
     for time, position in moves:
-        np.testing.assert_allclose(position, replay.at(time).places[ball], atol=1e-6)
+        np.testing.assert_allclose(position, replay.sight_at(time).places[ball], atol=1e-6)
 
 
 @pytest.mark.parametrize(

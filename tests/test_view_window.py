@@ -11,8 +11,7 @@ import types
 
 import pytest
 
-from hapticbridge.commands import Command, Couple, Switch
-from hapticbridge.commands.command import Stop, line_of
+from hapticbridge.commands import Command, Couple, Stop, Switch, line_of
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.view.window import Address, Window
 

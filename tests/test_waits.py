@@ -76,17 +76,17 @@ REASONS = {
     "confinement.py: os.read(self._reading, min(size - len(pieces), 1 << 20))": "poll has data",
     "audit/replay.py: child.result()": "it has a time limit of its own",
     # studies
-    "sweep/sweep.py: wait(running, return_when=FIRST_COMPLETED)": USERS,
-    "sweep/sweep.py: wait(running)": USERS,
-    "sweep/sweep.py: future.exception()": "its future is done",
-    "sweep/sweep.py: future.result()": "its future is done",
-    "sweep/sweep.py: pool.submit(_outcomes, function, [point]).result()": USERS,
-    "sweep/sweep.py: probe.result()": "imports a module in a process, which ends or breaks",
-    "sweep/sweep.py: pool.shutdown(wait=True, cancel_futures=True)": USERS,
-    "sweep/sweep.py: barrier.wait()": "a worker ends with its parent",
-    "sweep/sweep.py: connection.wait([parent.sentinel])": DAEMON,
-    "sweep/sweep.py: with ThreadPoolExecutor(1)": "asyncio.wait_for in it",
-    "sweep/sweep.py: thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()": (
+    "sweep.py: wait(running, return_when=FIRST_COMPLETED)": USERS,
+    "sweep.py: wait(running)": USERS,
+    "sweep.py: future.exception()": "its future is done",
+    "sweep.py: future.result()": "its future is done",
+    "sweep.py: pool.submit(_outcomes, function, [point]).result()": USERS,
+    "sweep.py: probe.result()": "imports a module in a process, which ends or breaks",
+    "sweep.py: pool.shutdown(wait=True, cancel_futures=True)": USERS,
+    "sweep.py: barrier.wait()": "a worker ends with its parent",
+    "sweep.py: connection.wait([parent.sentinel])": DAEMON,
+    "sweep.py: with ThreadPoolExecutor(1)": "asyncio.wait_for in it",
+    "sweep.py: thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()": (
         "asyncio.wait_for in it"
     ),
     "compare.py: for line in stream": "no wait: records of a file",

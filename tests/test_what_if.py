@@ -120,7 +120,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
 
 def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("INTERVAL", "RESET_INTERVAL"):  # no time passes between them
-        monkeypatch.setattr(f"hapticbridge.commands.execution.{name}", 0.0)
+        monkeypatch.setattr(f"hapticbridge.commands.{name}", 0.0)
     path, motion = tmp_path / "run.mcap", tmp_path / "tap.csv"
     motion.write_text(TAP)
     device = f"simulated:path={motion}"
@@ -138,7 +138,7 @@ def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     changes = [e for e in slow if e["event"] == "coupling"]
     assert [(e["tick"], e["ticks"]) for e in changes] == [(50, 250)]
     assert changes[0]["damping"] == pytest.approx(max(1.0 - 1500 * 0.002 / 2, 0.0))
-    [run] = RecordedRun.of([read_recording(path)], tmp_path / "scene")
+    [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
     for method, kept in (("direct", False), ("weld", True)):
         again = Repetition([run], [run.settings.changed({"method": method})])
         assert (again.keeps_resets, again.keeps_couplings) == (kept, False)
@@ -368,7 +368,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
     assert (before["flags"] & int(flag)).any()
     assert before.tobytes() == after.tobytes()
     if name == "limits":
-        [run] = RecordedRun.of([read_recording(path)], tmp_path / "scene")
+        [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
         again = run.limits
         assert astuple(again) == pytest.approx(astuple(EVERY_LIMIT))
     elif name == "old samples":

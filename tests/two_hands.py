@@ -17,6 +17,7 @@ from hapticbridge.kernel.ledger import meter_ports
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundHands
 from hapticbridge.kernel.tick import active_contacts, advance, keep_wrench, send_wrench
+from hapticbridge.pose import dot
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.rendering import Method, method_named, prepare
 from hapticbridge.scene import Scene, load_scene
@@ -161,7 +162,8 @@ def one_after_the_other(
     meter_ports(states[0])
     for i in range(states.size):
         force, torque, moved, turned = limited_wrench_after_step(states[i], True)
-        keep_wrench(states[i], force, torque, moved, turned)
+        work = dot(force, moved) + dot(torque, turned)
+        keep_wrench(states[i], work, force, torque, moved, turned)
     for i in range(states.size):
         if send_wrench(states[i], rows[i : i + 1], active_contacts(states[0])) != OK:
             return False

@@ -1,12 +1,12 @@
 """Verdict on a recording, from the recording alone; never imports the bridge.
 
-Read ``verdict`` first; its function decide() alone names the verdict. The audit checks that the
-file is whole (``structure``), computes the energies again in plain NumPy (``energy``), checks the
-wrench against the coupling law (``motion``) and the guard's limits (``wrench_limits``), the time
-that the run kept (``timing``), that no part contradicts another (``agreement``), and simulates the
-scene again (``replay``). ``events`` holds the external actions of the run and the state that goes
-from block to block, ``report`` the result, ``batch`` audits folders. Heavy imports are deferred to
-the first call.
+Read ``verdict`` first: the result, and the function decide(), which alone names the verdict. The
+audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
+(``energy``), checks the wrench against the coupling law (``motion``) and the guard's limits
+(``wrench_limits``), the time that the run kept (``timing``), that no part contradicts another
+(``agreement``), and simulates the scene again (``replay``). ``events`` holds the external actions
+of the run and the state that goes from block to block, ``batch`` audits folders. Heavy imports are
+deferred to the first call.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from hapticbridge.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from hapticbridge.audit.report import AuditReport as AuditReport
-    from hapticbridge.audit.report import verdict_words as verdict_words
+    from hapticbridge.audit.verdict import AuditReport as AuditReport
+    from hapticbridge.audit.verdict import verdict_words as verdict_words
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)
 

@@ -19,9 +19,7 @@ from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
 from hapticbridge.recording.seal import trusted_keys
-from hapticbridge.sweep.points import Value
-from hapticbridge.sweep.results import Interrupted, Table, check_format
-from hapticbridge.sweep.sweep import sweep
+from hapticbridge.sweep import Interrupted, Table, Value, check_format, sweep
 
 FEW = 8
 """Number of recordings below which no processes are started. A process takes 3 s to start, as long

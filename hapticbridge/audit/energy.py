@@ -187,7 +187,7 @@ class EnergyBalance:
     sums: dict[str, float]
 
     @classmethod
-    def of(
+    def from_block(
         cls, block: AuditedBlock, events: RunEvents, delay: int, others_work: Array | float = 0.0
     ) -> EnergyBalance:
         """Computes the balance of a block; see ``energy_balances``.
@@ -409,9 +409,9 @@ def energy_balances(
         while waiting and (newest is None or sum(map(len, waiting)) - len(waiting[0]) >= delay):
             ticks = waiting.popleft()
             following = np.concatenate([ticks[:0], *waiting])[:delay]
-            block = AuditedBlock.of(ticks, following, state, events)
+            block = AuditedBlock.from_records(ticks, following, state, events)
             others_work = 0.0 if others is None else next(others)
-            balance = EnergyBalance.of(block, events, delay, others_work)
+            balance = EnergyBalance.from_block(block, events, delay, others_work)
             yield block, balance
             state = block.state_after(balance.sums)
 

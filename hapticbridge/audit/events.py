@@ -1,6 +1,6 @@
 """Parameters and external actions of a recorded run, from metadata and events.
 
-This is the second reading of the events. ``commands.execution`` applies them one by one to the
+This is the second reading of the events. ``commands`` applies them one by one to the
 kernel; here they become arrays over ticks.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.certificate import delay_ticks, required_axis_damping
-from hapticbridge.commands.execution import bits_in, coupling_in, tuning_ticks
+from hapticbridge.commands import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -52,7 +52,7 @@ class RunEvents:
     _switched: tuple[Array, NDArray[np.int64]]
 
     @classmethod
-    def of(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
+    def from_recording(cls, recording: RecordingFile, parameters: RunParameters) -> RunEvents:
         """Reads the events of a recording.
 
         Raises:
@@ -167,7 +167,7 @@ class AuditedRun:
             raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
         linear, angular = info.dissipating_damping
         parameters = replace(parameters, device_damping=linear, device_rotational_damping=angular)
-        return cls(info, method, parameters, RunEvents.of(recording, parameters))
+        return cls(info, method, parameters, RunEvents.from_recording(recording, parameters))
 
     @property
     def worst(self) -> RunParameters:

@@ -87,7 +87,7 @@ class Motion:
     tool_before: Array
 
     @classmethod
-    def of(
+    def from_records(
         cls, ticks: NDArray[np.void], state: AuditState, events: RunEvents, share: Array
     ) -> Motion:
         """Computes the motion of consecutive records; ``share`` is r_{k−1}, (n,)."""

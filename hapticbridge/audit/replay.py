@@ -329,30 +329,22 @@ def blocks_of_hands(hands: Sequence[AuditedHand]) -> Iterator[NDArray[np.void]]:
         yield np.stack(blocks, axis=1)
 
 
-def compare_resimulation(
-    hands: Sequence[AuditedHand], *, is_trusted: bool = False
-) -> ReplayOutcome:
-    """Simulates the recorded device motion again and compares every number except times.
-
-    It is done in a child process with limits (``confinement``), unless the recording is trusted.
-
-    Raises:
-        ForeignSceneError: The child process crashed, or exceeded its limits.
-        RecordingError: The attachments contradict the metadata, or an event is damaged; the file
-            was changed.
-    """
-    with comparison(hands, is_trusted=is_trusted) as outcome:
-        return outcome()
-
-
 @contextmanager
 def comparison(
     hands: Sequence[AuditedHand], *, is_trusted: bool = False
 ) -> Iterator[Callable[[], ReplayOutcome]]:
-    """Starts ``compare_resimulation`` beside the work in the context.
+    """Simulates the recorded device motion again and compares every number except times.
+
+    It is done beside the work in the context, in a child process with limits (``confinement``),
+    unless the recording is trusted.
 
     Yields:
         Function that waits for the outcome.
+
+    Raises:
+        ForeignSceneError: By that function: the child process crashed, or exceeded its limits.
+        RecordingError: By that function: the attachments contradict the metadata, or an event is
+            damaged; the file was changed.
     """
     recording, parameters = hands[0].recording, hands[0].run.parameters
     if reason := obstacle(recording):

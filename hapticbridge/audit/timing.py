@@ -50,7 +50,7 @@ class TimingTally:
         delays: Sum of the times from sample to force in s.
         jitter: Sum of the times in s by which samples came later than the one before, each after
             its own deadline.
-        most_uncovered: Largest energy in J that delays may have given to the hand.
+        max_uncovered: Largest energy in J that delays may have given to the hand.
         lent: Energies in J that late samples cost and b has not burned yet, by kind of axis.
         uncovered: Energies A in J by kind of axis.
         last_square: Squared motions of the last tick, by kind of axis.
@@ -71,7 +71,7 @@ class TimingTally:
     skipped: int = 0
     delays: float = 0.0
     jitter: float = 0.0
-    most_uncovered: float = 0.0
+    max_uncovered: float = 0.0
     lent: Array = field(default_factory=_no_energy)
     uncovered: Array = field(default_factory=_no_energy)
     last_square: Array = field(default_factory=_no_energy)
@@ -131,7 +131,7 @@ class TimingTally:
             self.last_square[kind], self.owed[kind] = square[-1], debt[-1]
         ratio = force_scale / scale
         held = np.minimum(ratio * owed, np.maximum(ticks["device_energy"] - self._burn(block), 0.0))
-        self.most_uncovered = max(self.most_uncovered, float(np.max(ratio * total + held)))
+        self.max_uncovered = max(self.max_uncovered, float(np.max(ratio * total + held)))
 
     def _burn(self, block: AuditedBlock) -> Array:
         """Returns the energy that the device's damping has burned at least by each tick, (n,)."""

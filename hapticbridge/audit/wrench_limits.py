@@ -79,7 +79,7 @@ class AuditedBlock:
     scene_ticks: int
 
     @classmethod
-    def of(
+    def from_records(
         cls,
         ticks: NDArray[np.void],
         following: NDArray[np.void],
@@ -101,7 +101,7 @@ class AuditedBlock:
             ticks=ticks,
             following=following,
             state=state,
-            motion=Motion.of(ticks, state, events, before),
+            motion=Motion.from_records(ticks, state, events, before),
             is_first=is_first,
             interval=_sample_intervals(ticks, state, parameters.period),
             share_before=before,

@@ -2,8 +2,8 @@
 
 ``case`` runs a scene through its motion as a bridge would; ``observe`` records it. ``inventory``
 counts the parts of the model. ``model_faults``, ``contact_faults`` and ``run_faults`` list what is
-wrong, each a ``fault`` with its place in the files (``source_map``). ``cost`` measures the time of
-a tick. ``lean`` tries the edits of ``simplify`` on a ``version`` of the scene and compares its
-motion (``witness``) and forces (``perception``) with the original; ``lean_output`` writes the
-result. ``physics`` holds shared formulas.
+wrong, each with its place in the files (``source_map``). ``cost`` measures the time of a tick.
+``lean`` tries the edits of ``simplify`` on a ``version`` of the scene and compares its motion and
+its forces (``perception``) with the original; ``lean_output`` writes the result. ``physics`` holds
+shared formulas.
 """

@@ -1,4 +1,4 @@
-"""A scene under check: source, compiled model, motion and observation."""
+"""A scene under check (source, compiled model, motion, observation), and the faults found in it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.observe import Observation, Setting, observe, quiet
-from hapticbridge.check.source_map import Places
+from hapticbridge.check.source_map import Place, Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
 from hapticbridge.device.trajectory import lissajous
@@ -24,6 +24,53 @@ from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import RIGID, default_method
 from hapticbridge.scene import Scene, SceneSource, compile_scene
+
+# Faults, each with its place and remedy
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault of a scene.
+
+    Attributes:
+        kind: Name of the kind of fault.
+        place: File, line and element.
+        sentence: Description with its numbers.
+        change: Text to write at the place.
+        is_note: True if a run works as well without the change; the scene counts as sound.
+    """
+
+    kind: str
+    place: Place
+    sentence: str
+    change: str
+    is_note: bool = False
+
+
+def number(value: float) -> str:
+    """Formats a number with three digits and no exponent: ``2500``, ``0.0375``."""
+    if not math.isfinite(value):
+        return "infinite"
+    return np.format_float_positional(float(f"{value:.3g}"), trim="-")
+
+
+def length(value: float) -> str:
+    """Formats a length given in m: ``375 µm``, ``4.2 mm``, ``3.1 m``."""
+    for unit, size in (("m", 1.0), ("mm", 1e-3)):
+        if abs(value) >= size:
+            return f"{number(value / size)} {unit}"
+    return f"{number(1e6 * value)} µm"
+
+
+def weight(mass: float) -> str:
+    """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
+    return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
+
+
+def others(count: int) -> str:
+    """Returns " and N more", or nothing for N = 0."""
+    return f" and {count} more" if count > 0 else ""
+
 
 # Motion for a check: the scene's own hand path, a file of poses, or a recording
 

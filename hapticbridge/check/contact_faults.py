@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import SceneUnderCheck
-from hapticbridge.check.fault import Fault, length, number, others
+from hapticbridge.check.case import Fault, SceneUnderCheck, length, number, others
 from hapticbridge.check.observe import clearances
 from hapticbridge.check.physics import body_inertia, constraint_stiffness, depth_under
 from hapticbridge.check.source_map import Place
-from hapticbridge.kernel.colliders import MOST_VERTICES
+from hapticbridge.kernel.colliders import MAX_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
 from hapticbridge.scene.compile import START_KEYFRAME
 from hapticbridge.scene.contacts import (
@@ -105,7 +104,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             boxes.append((first, second))
         is_flat = kinds <= {*_FLAT} and _FLAT[1] in kinds
         corners = max(_corners(model, first), _corners(model, second))
-        if is_flat and (not case.is_rigid or corners > MOST_VERTICES):
+        if is_flat and (not case.is_rigid or corners > MAX_VERTICES):
             meshes.append((first, second))
     if boxes:
         yield Fault(
@@ -122,7 +121,7 @@ def shape_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             case.places.geom(_tool_geom(meshes[0], is_tool)),
             f"{pair_names(case, meshes)} meet with the normal of either face, up to 84 mrad off "
             "the one that is touched; a tilted tool without friction sank 2.5 mm in that way",
-            f"boxes, spheres and capsules instead, or meshes of at most {MOST_VERTICES} corners "
+            f"boxes, spheres and capsules instead, or meshes of at most {MAX_VERTICES} corners "
             f"(now {count}) and --contact rigid for the run",
         )
 

@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import SceneUnderCheck
-from hapticbridge.check.fault import Fault
+from hapticbridge.check.case import Fault, SceneUnderCheck
 from hapticbridge.check.observe import Setting, not_finite, rehearsal_parameters
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.clock import LOWEST_RATE
@@ -56,7 +55,7 @@ class TimingStats:
     p99: float
 
     @classmethod
-    def of(cls, times: NDArray[np.float64]) -> TimingStats:
+    def from_times(cls, times: NDArray[np.float64]) -> TimingStats:
         """Computes the distribution of times in s."""
         if not times.size:
             return cls(0, float("nan"), float("nan"))
@@ -220,12 +219,15 @@ def measure_cost(
     report_progress(PASSES + 1)
     time_of, contacts_of = np.min(passes, axis=0), in_contact[WARM_UP:]
     is_free = contacts_of == 0
-    free, contact = TimingStats.of(time_of[is_free]), TimingStats.of(time_of[~is_free])
-    all_ticks = TimingStats.of(time_of)
+    free, contact = (
+        TimingStats.from_times(time_of[is_free]),
+        TimingStats.from_times(time_of[~is_free]),
+    )
+    all_ticks = TimingStats.from_times(time_of)
     medians = {
         name: (
-            TimingStats.of(times[touching == 0]).median,
-            TimingStats.of(times[touching > 0]).median,
+            TimingStats.from_times(times[touching == 0]).median,
+            TimingStats.from_times(times[touching > 0]).median,
         )
         for name, times in stages.items()
     }

@@ -24,8 +24,7 @@ from hapticbridge.check.simplify import (
     shape_simplifications,
     solver_simplifications,
 )
-from hapticbridge.check.version import SceneVariant, name_everything
-from hapticbridge.check.witness import witness
+from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.scene import SceneSource

@@ -9,8 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.case import STAND_IN_INERTIA, STAND_IN_MASS, CompiledScene, SceneUnderCheck
-from hapticbridge.check.fault import Fault, length, number, others, weight
+from hapticbridge.check.case import (
+    STAND_IN_INERTIA,
+    STAND_IN_MASS,
+    CompiledScene,
+    Fault,
+    SceneUnderCheck,
+    length,
+    number,
+    others,
+    weight,
+)
 from hapticbridge.check.inventory import VISUAL, geom_uses
 from hapticbridge.check.physics import (
     body_inertia,

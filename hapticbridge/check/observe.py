@@ -231,7 +231,7 @@ def rehearse(scene: Scene, samples: NDArray[np.void], setting: Setting) -> Playb
     seconds = time.thread_time() - start
     if done < samples.size:
         raise not_finite(scene, done, samples.size)
-    ledger = Ledger.of(binding.state)
+    ledger = Ledger.from_state(binding.state)
     return Playback(
         records=rows,
         environment=ledger.environment,
@@ -285,7 +285,7 @@ MIN_FORCE = 0.05
 POSTURES = 100
 """Approximate number of postures kept; a motion of 8 s passes a hole in more than two of them."""
 
-MAX_WORK, LEAST_TICKS = 2e6, 500
+MAX_WORK, MIN_TICKS = 2e6, 500
 """Largest work of an observation in degrees of freedom and constraint rows, summed over its ticks,
 and the ticks that it always takes. A unit costs 3 to 7 µs. A scene of 400 is observed for 5 s, a
 heavier one for less."""
@@ -367,7 +367,7 @@ def observe(
     postures, every = [], max(samples.size // POSTURES, 1)
     force, full, work, done = np.zeros(samples.size), 0, 0, samples.size
     for k in range(samples.size):
-        if work > MAX_WORK and k >= LEAST_TICKS:
+        if work > MAX_WORK and k >= MIN_TICKS:
             done = k
             break
         if before(state, samples[k : k + 1], row, 0, period) != OK:
@@ -388,7 +388,7 @@ def observe(
             postures.append(data.qpos.copy())
         if progress is not None and k % PROGRESS_EVERY == 0:
             progress(k, samples.size)
-    ledger = Ledger.of(state)
+    ledger = Ledger.from_state(state)
     return Observation(
         meetings=meetings,
         postures=np.array(postures),

@@ -136,7 +136,7 @@ def own_motion(source: SceneSource, scene: Scene, setting: Setting) -> OwnMotion
         1 mm for lengths of 10 to 20 mm between the fingers, 2.2 mm for 80 mm.
     """
     with quiet():
-        alone = _FileMotion.of(source)
+        alone = _FileMotion.simulate(source)
         return None if alone is None else alone.against(scene, setting)
 
 
@@ -150,7 +150,7 @@ class _FileMotion:
     seconds: float
 
     @classmethod
-    def of(cls, source: SceneSource) -> Self | None:
+    def simulate(cls, source: SceneSource) -> Self | None:
         """Moves the scene; returns None if it diverges."""
         model = plain_model(source)
         data = mujoco.MjData(model)
@@ -242,7 +242,7 @@ def own_substeps(
         SceneError: The scene does not compile.
     """
     with quiet():
-        alone = _FileMotion.of(source)
+        alone = _FileMotion.simulate(source)
         if alone is None:
             return 1, None
         one = alone.against(scene, replace(setting, substeps=1))

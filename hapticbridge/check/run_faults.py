@@ -8,14 +8,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import SceneUnderCheck
+from hapticbridge.check.case import Fault, SceneUnderCheck, number
 from hapticbridge.check.contact_faults import (
     contact_faults,
     margin_faults,
     shape_faults,
     start_faults,
 )
-from hapticbridge.check.fault import Fault, number
 from hapticbridge.check.model_faults import (
     UNITS,
     constraint_faults,

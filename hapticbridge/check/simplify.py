@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from hapticbridge.check.physics import IDENTITY, matrix_of, pose_in, quaternion_of, rotation_vector
-from hapticbridge.check.version import SceneVariant, census, model_of
-from hapticbridge.check.witness import MotionTrace
+from hapticbridge.check.version import MotionTrace, SceneVariant, census, model_of
 
 OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
 """Losses of a simplification that a hand cannot notice in one motion."""

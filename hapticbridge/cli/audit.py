@@ -34,7 +34,7 @@ from hapticbridge.recording.reader import CUT, read_hands
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.sweep.results import Interrupted, Table
+from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences

@@ -16,9 +16,17 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.case import DEFAULT_PERIOD, LARGEST_WORKSPACE, SceneUnderCheck, open_case
+from hapticbridge.check.case import (
+    DEFAULT_PERIOD,
+    LARGEST_WORKSPACE,
+    Fault,
+    SceneUnderCheck,
+    length,
+    open_case,
+    others,
+    weight,
+)
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
-from hapticbridge.check.fault import Fault, length, others, weight
 from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,

@@ -60,6 +60,7 @@ _MODULES = {
     "repair": "audit",
     "render": "view",
     "bound": "zwidth",
+    "stability": "chart",
 }
 """Modules of commands that share one; any other command has a module of its name."""
 

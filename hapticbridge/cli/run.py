@@ -194,7 +194,7 @@ def announce_measured(bridge: Bridge) -> None:
         err.print(head + escape(sentence))
 
 
-MOST_FAULTS = 2
+MAX_FAULTS = 2
 """Number of a scene's faults that a run repeats."""
 
 
@@ -202,7 +202,7 @@ def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
     """Returns the worst of what ``hapticbridge check`` finds without a motion."""
     return tuple(
         f"{fault.sentence} ({fault.place}; 'hapticbridge check' says what to write instead)"
-        for fault in islice(worst_faults(source, scene), MOST_FAULTS)
+        for fault in islice(worst_faults(source, scene), MAX_FAULTS)
     )
 
 

@@ -16,8 +16,8 @@ from hapticbridge.device.registry import open_device as open_device
 from hapticbridge.device.simulated.device import GrippingDevice as GrippingDevice
 from hapticbridge.device.simulated.device import SimulatedDevice as SimulatedDevice
 from hapticbridge.device.simulated.device import scene_hand as scene_hand
-from hapticbridge.device.simulated.hand import DEFAULT_HAND as DEFAULT_HAND
-from hapticbridge.device.simulated.hand import Hand as Hand
+from hapticbridge.device.simulated.dynamics import DEFAULT_HAND as DEFAULT_HAND
+from hapticbridge.device.simulated.dynamics import Hand as Hand
 from hapticbridge.device.trajectory import Motion as Motion
 from hapticbridge.device.trajectory import ReplayDevice as ReplayDevice
 from hapticbridge.device.trajectory import TrajectoryDevice as TrajectoryDevice

@@ -432,7 +432,7 @@ def _is_ours(device: Device) -> bool:
     return type(device).__module__.startswith("hapticbridge.")
 
 
-def _told(call: str, error: Exception) -> DeviceError:
+def _as_device_error(call: str, error: Exception) -> DeviceError:
     """Returns the error itself if it is a ``DeviceError``, else one that names the failed call."""
     if isinstance(error, DeviceError):
         return error
@@ -445,7 +445,7 @@ def telling(call: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise _told(call, error) from error
+        raise _as_device_error(call, error) from error
 
 
 def checked(device: Device) -> Device:
@@ -470,7 +470,7 @@ def checked_start(device: Device) -> Callable[[float], NDArray[np.void]]:
     if _is_ours(device):
         return device.start
 
-    def told(period: float) -> NDArray[np.void]:
+    def checked(period: float) -> NDArray[np.void]:
         with telling(f"device '{device.info.name}': start"):
             sample = device.start(period)
         if not isinstance(sample, np.ndarray) or sample.dtype != SAMPLE_DTYPE or sample.ndim != 1:
@@ -480,7 +480,7 @@ def checked_start(device: Device) -> Callable[[float], NDArray[np.void]]:
             )
         return sample
 
-    return told
+    return checked
 
 
 def checked_close(device: Device) -> Callable[[], None]:
@@ -492,11 +492,11 @@ def checked_close(device: Device) -> Callable[[], None]:
     if _is_ours(device):
         return device.close
 
-    def told() -> None:
+    def checked() -> None:
         with telling(f"device '{device.info.name}': close"):
             device.close()
 
-    return told
+    return checked
 
 
 def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
@@ -509,13 +509,13 @@ def checked_write(device: Device) -> Callable[[NDArray[np.float64]], None]:
         return device.write
     write, call = device.write, f"device '{device.info.name}': write"
 
-    def told(wrench: NDArray[np.float64]) -> None:
+    def checked(wrench: NDArray[np.float64]) -> None:
         try:  # as telling(), without an object per tick
             write(wrench)
         except Exception as error:
-            raise _told(call, error) from error
+            raise _as_device_error(call, error) from error
 
-    return told
+    return checked
 
 
 def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
@@ -530,11 +530,11 @@ def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
     read, name = device.read, device.info.name
     call = f"device '{name}': read"
 
-    def told(sample: NDArray[np.void]) -> int:
+    def checked(sample: NDArray[np.void]) -> int:
         try:
             flags = read(sample)
         except Exception as error:
-            raise _told(call, error) from error
+            raise _as_device_error(call, error) from error
         if not isinstance(flags, int | np.integer):
             raise DeviceError(
                 f"device '{name}': read returned {shown(flags)}; it must be 0 for a new sample, or "
@@ -542,4 +542,4 @@ def checked_read(device: Device) -> Callable[[NDArray[np.void]], int]:
             )
         return int(flags)
 
-    return told
+    return checked

@@ -15,7 +15,7 @@ from hapticbridge.device.base import Device, DeviceInfo, calling_on_error, check
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, Options, ignore_message
 from hapticbridge.device.profile import modelled, profile_named, profile_of
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice, scene_hand
-from hapticbridge.device.simulated.hand import Hand
+from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices, nearest
 from hapticbridge.kernel.codes import JOINT
@@ -31,8 +31,8 @@ DRIVERS = {
     "serial": "hapticbridge.device.rawhid.serial",
     "pid": "hapticbridge.device.pid.device",
     "wheel": "hapticbridge.device.wheel.device",
-    "haply": "hapticbridge.device.haply.device",
-    "forcedimension": "hapticbridge.device.force_dimension.device",
+    "haply": "hapticbridge.device.haply",
+    "forcedimension": "hapticbridge.device.force_dimension",
     "touch": "hapticbridge.device.touch.device",
 }
 """Module of each driver by the driver's name, in the order in which drivers are listed. The module
@@ -85,10 +85,10 @@ def driver_named(name: str) -> Driver | None:
             f"the package {package} names {entry.value} as the device '{name}'; it must be a "
             "hapticbridge.device.driver.Driver of that name"
         )
-    return _told(found, package)
+    return _with_device_errors(found, package)
 
 
-def _told(driver: Driver, package: str) -> Driver:
+def _with_device_errors(driver: Driver, package: str) -> Driver:
     """Returns the driver of a package with every error of its functions as a ``DeviceError``."""
     about = f"the device '{driver.name}' of the package {package}"
 

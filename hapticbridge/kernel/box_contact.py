@@ -60,7 +60,7 @@ NEARNESS = 0.1
 ALIKE = 0.9999
 """Cosine of the angle of two normals above which they count as equal, without unit."""
 
-MOST_POINTS = 8
+MAX_POINTS = 8
 """Largest number of points of a pair; MuJoCo stops with an error at more. Two faces on each other
 have at most 8 in common. Of more points those with the smallest gaps stay."""
 
@@ -99,7 +99,7 @@ def _add(points: Numbers, count: int, gap: float, p: Any, n: Any, near: float) -
                 return count
         if points[one] > worst:
             at, worst = one, points[one]
-    if count < MOST_POINTS:
+    if count < MAX_POINTS:
         _write(points, POINT * count, gap, p, n)
         return count + 1
     if at >= 0:
@@ -375,7 +375,7 @@ def box_points(
     """Finds the contact points of two boxes.
 
     Args:
-        points: Place for ``MOST_POINTS`` of 10 numbers: the gap in m, the position half-way, the
+        points: Place for ``MAX_POINTS`` of 10 numbers: the gap in m, the position half-way, the
             normal from the first box to the second, and zeros.
         one: Position, axes by rows (9 numbers) and half-sizes of the first box.
         other: Those of the second box.

@@ -42,7 +42,7 @@ import numpy as np
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import callback, compiled, external
 from hapticbridge.kernel.box_contact import (
-    MOST_POINTS,
+    MAX_POINTS,
     POINT,
     Numbers,
     box_points,
@@ -72,7 +72,7 @@ _CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
 _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _BOX, _MESH = int(mujoco.mjtGeom.mjGEOM_BOX), int(mujoco.mjtGeom.mjGEOM_MESH)
 
-MOST_VERTICES = 128
+MAX_VERTICES = 128
 """Largest number of vertices or faces of a mesh whose points are corrected. The time grows with it:
 about 0.1 µs for 8 vertices, 1 µs for 100."""
 
@@ -113,7 +113,7 @@ def box_box(model: int, data: int, contacts: int, first: int, second: int, margi
     """
     if not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return int(_mjc_box_box(model, data, contacts, first, second, margin))
-    points = floats(contacts, POINT * MOST_POINTS)
+    points = floats(contacts, POINT * MAX_POINTS)
     return box_points(points, _shape(model, data, first), _shape(model, data, second), margin)
 
 
@@ -245,7 +245,7 @@ def flat_flat(model: int, data: int, contacts: int, first: int, second: int, mar
     if count == 0 or not ints(model + _FLAGS, 1)[0] & EXACT_POINTS:
         return count
     one, other = _flat(model, first), _flat(model, second)
-    if max(one[1], other[1], one[3], other[3]) > MOST_VERTICES:
+    if max(one[1], other[1], one[3], other[3]) > MAX_VERTICES:
         return count
     a, b = _shape(model, data, first), _shape(model, data, second)
     points = floats(contacts, POINT * count)

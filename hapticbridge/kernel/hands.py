@@ -41,21 +41,20 @@ from hapticbridge.kernel.ledger import (
     refresh_energies,
     take_back,
 )
-from hapticbridge.kernel.mujoco_c import release_fence
 from hapticbridge.kernel.rigid_contact import fill_tank, finish_contacts, follow_speed
 from hapticbridge.kernel.tick import (
-    HEAD,
-    TAIL,
     active_contacts,
     advance,
     end_tick,
     keep_wrench,
+    publish,
     refuse_tick,
     send_wrench,
     set_external_flags,
     take_sample,
 )
 from hapticbridge.kernel.timing import note_delay
+from hapticbridge.pose import dot
 
 
 @compiled
@@ -105,7 +104,8 @@ def answer_hands(states: NDArray[np.void], rows: NDArray[np.void], _substep: int
     settle_levels(states)
     for i in range(states.size):
         force, torque, moved, turned = settled_wrench(states[i])
-        keep_wrench(states[i], force, torque, moved, turned)
+        work = dot(force, moved) + dot(torque, turned)
+        keep_wrench(states[i], work, force, torque, moved, turned)
     end_mocap_moves(scene)
     if scene.contact.is_rigid:
         finish_contacts(scene)
@@ -149,35 +149,6 @@ def close_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
 
 
 @compiled
-def publish_hands(
-    rows: NDArray[np.void],
-    ring: NDArray[np.void],
-    cursors: NDArray[np.int64],
-    deadline_ns: int,
-    wake_ns: int,
-    read_ns: int,
-    write_ns: int,
-    flags: int,
-) -> bool:
-    """Completes the records of all hands and hands them to the ring at once, in order.
-
-    Returns:
-        As ``tick.publish``.
-    """
-    head = cursors[HEAD]
-    if head - cursors[TAIL] > ring.size - rows.size:
-        return False
-    for i in range(rows.size):
-        r = rows[i]
-        r.deadline_ns, r.wake_ns, r.read_ns, r.write_ns = deadline_ns, wake_ns, read_ns, write_ns
-        r.flags |= flags
-        ring[(head + i) % ring.size] = r
-    release_fence()
-    cursors[HEAD] = head + rows.size
-    return True
-
-
-@compiled
 def finish_hands(
     states: NDArray[np.void],
     rows: NDArray[np.void],
@@ -190,10 +161,10 @@ def finish_hands(
     flags: int,
     _has_positions: bool,
 ) -> int:
-    """Runs ``close_hands`` and ``publish_hands`` in one call.
+    """Runs ``close_hands`` and ``tick.publish`` in one call.
 
     Returns:
-        The result of ``close_hands``, or ``RING_FULL``; with the latter, repeat ``publish_hands``.
+        The result of ``close_hands``, or ``RING_FULL``; with the latter, repeat ``tick.publish``.
     """
     code = close_hands(states, rows)
     if code != OK:
@@ -201,7 +172,7 @@ def finish_hands(
     for i in range(states.size):
         note_delay(states[i], deadline_ns, read_ns, write_ns)
         rows[i].flags |= states[i].loop.external_flags
-    taken = publish_hands(rows, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
+    taken = publish(rows, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 
 

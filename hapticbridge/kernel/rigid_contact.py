@@ -99,10 +99,10 @@ SUNK = 5e-6
 """Depth in m by which a sliding contact may sink in a step before the step is repeated. A smaller
 value repeats more steps, and looks for sinks at slower sliding: from 12 mm/s on at μ = 0.4."""
 
-MOST_CORRECTIONS = 3
+MAX_CORRECTIONS = 3
 """Largest number of such repetitions of a step."""
 
-MOST_ROWS = 1024
+MAX_ROWS = 1024
 """Largest number of constraint rows with which sinks are looked for; 340 contacts with friction."""
 
 SPENDABLE = 0.9
@@ -135,7 +135,7 @@ _GRADIENT, _STATISTIC = struct_of("mjSolverStat").gradient.offset, sizeof(struct
 
 _BALL = int(mujoco.mjtJoint.mjJNT_BALL)
 
-_MOST_KEPT = int(mujoco.mjNSOLVER)
+_MAX_KEPT = int(mujoco.mjNSOLVER)
 
 _NEWTON, _CG = int(mujoco.mjtSolver.mjSOL_NEWTON), int(mujoco.mjtSolver.mjSOL_CG)
 
@@ -226,7 +226,7 @@ def bind_contact(
         owned[name] = np.zeros(max(int(contact["row_capacity"]), 1))
     is_spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
     owned["leashes"] = (is_spatial & (model.tendon_range[:, 0] <= 0.0)).astype(np.int32)
-    owned["end_velocity"] = np.zeros(MOST_ROWS)
+    owned["end_velocity"] = np.zeros(MAX_ROWS)
     meets = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     meets[model.pair_geom1] = meets[model.pair_geom2] = True
     is_moving = model.body_weldid[model.geom_bodyid] > 0
@@ -259,7 +259,7 @@ def _aim(s: State) -> None:
     velocities = floats(pointer_at(mj.efc_vel), count)
     positions = floats(pointer_at(mj.efc_pos), count)
     margins = floats(pointer_at(mj.efc_margin), count)
-    ends = floats(s.contact.end_velocity, MOST_ROWS)
+    ends = floats(s.contact.end_velocity, MAX_ROWS)
     contacts = pointer_at(mj.contact)
     s.contact.lift = 0.0
     for c in range(ints(mj.ncon, 1)[0]):
@@ -429,7 +429,7 @@ def _change_solver(s: State) -> bool:
     worst, islands = 0.0, max(ints(mj.nisland, 1)[0], 1)
     for island, iterations in enumerate(ints(mj.solver_niter, min(islands, 20))):
         if iterations > 0:
-            last = island * _MOST_KEPT + min(iterations, _MOST_KEPT) - 1
+            last = island * _MAX_KEPT + min(iterations, _MAX_KEPT) - 1
             worst = max(worst, floats(contact.statistics + last * _STATISTIC + _GRADIENT, 1)[0])
     if worst <= contact.stalled:
         return False
@@ -468,7 +468,7 @@ def _has_sunk(s: State) -> bool:
     """Returns True if a contact sank in the step because it slid less than at the start."""
     mj, h, contact = s.mj, s.run.timestep, s.contact
     count = ints(mj.nefc, 1)[0]
-    if h * contact.lift <= SUNK or count > MOST_ROWS:
+    if h * contact.lift <= SUNK or count > MAX_ROWS:
         return False
     mj_mul_jac(mj.model, mj.data, contact.end_velocity, mj.qvel)
     ends, contacts = floats(contact.end_velocity, count), pointer_at(mj.contact)
@@ -498,7 +498,7 @@ def aim_again(s: State) -> bool:
     if _change_solver(s):
         contact.repetitions += 1
         return True
-    if contact.corrections < MOST_CORRECTIONS and _has_sunk(s):
+    if contact.corrections < MAX_CORRECTIONS and _has_sunk(s):
         contact.corrections += 1
         contact.repetitions += 1
         _aim(s)

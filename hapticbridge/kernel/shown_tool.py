@@ -186,7 +186,7 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     the tank allow.
     """
     s = state[0]
-    pose, given, k, level = s.pose, sample[0], s.coupling, s.level.level
+    pose, scene_sample, k, level = s.pose, sample[0], s.coupling, s.level.level
     s.shown.age, s.shown.waits = 0, 1
     tool, orientation = vector_of(s.shown.newest), quaternion_of(s.shown.newest[3:7])
     stretch = subtract(vector_of(pose.handle_position), tool)
@@ -195,16 +195,18 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     energy_r = spring_energy(k.rotational_stiffness, norm(twist), level[1])
     allowed = max(_credit(s) + s.shown.tank, 0.0)
     if energy + energy_r <= allowed:
-        store_vector(given.position, vector_of(pose.handle_position))
-        store_quaternion(given.quaternion, quaternion_of(pose.handle_quaternion))
+        store_vector(scene_sample.position, vector_of(pose.handle_position))
+        store_quaternion(scene_sample.quaternion, quaternion_of(pose.handle_quaternion))
         return
     share = allowed / (energy + energy_r)
     if energy > 0.0:
         stretch = within(stretch, spring_length(k.stiffness, share * energy, level[0]))
     if energy_r > 0.0:
         twist = within(twist, spring_length(k.rotational_stiffness, share * energy_r, level[1]))
-    store_vector(given.position, add(tool, stretch))
-    store_quaternion(given.quaternion, canonical(product(quaternion_exp(twist), orientation)))
+    store_vector(scene_sample.position, add(tool, stretch))
+    store_quaternion(
+        scene_sample.quaternion, canonical(product(quaternion_exp(twist), orientation))
+    )
 
 
 @compiled
@@ -345,7 +347,7 @@ def _shown_at(
 
 
 @compiled
-def _given(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
+def _released_energy(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
     """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
     k, level = s.coupling, s.level.level
@@ -368,17 +370,17 @@ def _paid_share(
     least P.
     """
     step, turn = motion
-    last_given, least = ends
+    last_released, least = ends
     share, work, high, last, trial = 0.0, 0.0, 1.0, 1.0, 0.5
     for _ in range(TRIALS):
-        given = _given(s, before, trial, step, turn)
-        if given < least:
+        released = _released_energy(s, before, trial, step, turn)
+        if released < least:
             high = trial
         else:
-            share, work = trial, given
-        curve = (given / trial - last_given / last) / (last - trial)
-        slope = given / trial + curve * trial
-        last, last_given, trial = trial, given, 0.5 * (share + high)
+            share, work = trial, released
+        curve = (released / trial - last_released / last) / (last - trial)
+        slope = released / trial + curve * trial
+        last, last_released, trial = trial, released, 0.5 * (share + high)
         if share == 0.0:
             trial = high / 16.0
         if curve > 0.0:
@@ -404,7 +406,7 @@ def shown_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     turn = rotation_between(last, orientation)
     before = _stored(s, vector_of(pose.tool_position), last)
     share, least = 1.0, -max(shown.tank, 0.0)
-    work = _given(s, before, share, step, turn)
+    work = _released_energy(s, before, share, step, turn)
     if work < least:
         shown.held_back += 1
         share, work = _paid_share(s, before, (step, turn), (work, least))

@@ -453,9 +453,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     end_mocap_moves(s)
     if s.contact.is_rigid:
         finish_contacts(s)
-    loop.law_work = (
-        s.shown.work if scheme == Scheme.SHOWN else dot(force, moved) + dot(torque, turned)
-    )
+    work = s.shown.work if scheme == Scheme.SHOWN else dot(force, moved) + dot(torque, turned)
     if count > 1:
         share = 1.0 / count
         force, torque = scaled(share, force), scaled(share, torque)
@@ -463,10 +461,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
             w, m = loop.wrench_on_tool, loop.motion
             force, torque = add(vector_of(w), force), add(vector_of(w[3:6]), torque)
             moved, turned = add(vector_of(m), moved), add(vector_of(m[3:6]), turned)
-    store_vector(loop.motion[0:3], moved)
-    store_vector(loop.motion[3:6], turned)
-    store_vector(loop.wrench_on_tool[0:3], force)
-    store_vector(loop.wrench_on_tool[3:6], torque)
+    keep_wrench(s, work, force, torque, moved, turned)
     if not is_last:
         add_coupling_work(s.energy, loop.law_work)
         take_mean_bias_in_substep(s)
@@ -475,10 +470,12 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
 
 
 @compiled
-def keep_wrench(s: State, force: Vector, torque: Vector, moved: Vector, turned: Vector) -> None:
-    """Keeps a wrench on the tool, its work and the tool's motion, with one evaluation per tick."""
+def keep_wrench(
+    s: State, work: float, force: Vector, torque: Vector, moved: Vector, turned: Vector
+) -> None:
+    """Keeps the wrench on the tool, the work of its newest evaluation and the tool's motion."""
     loop = s.loop
-    loop.law_work = dot(force, moved) + dot(torque, turned)
+    loop.law_work = work
     store_vector(loop.motion[0:3], moved)
     store_vector(loop.motion[3:6], turned)
     store_vector(loop.wrench_on_tool[0:3], force)
@@ -674,7 +671,7 @@ SEQUENCE, NUMBER, CONTACTS = 0, 1, 2
 
 @compiled
 def publish(
-    row: NDArray[np.void],
+    rows: NDArray[np.void],
     ring: NDArray[np.void],
     cursors: NDArray[np.int64],
     deadline_ns: int,
@@ -683,20 +680,21 @@ def publish(
     write_ns: int,
     flags: int,
 ) -> bool:
-    """Completes the record with its times and hands it to the ring (single producer).
+    """Completes a tick's records, one per hand, and hands them to the ring (single producer).
 
     Returns:
         False if the ring is full; nothing was written then, and the call can be repeated.
     """
     head = cursors[HEAD]
-    if head - cursors[TAIL] >= ring.size:
+    if head - cursors[TAIL] > ring.size - rows.size:
         return False
-    r = row[0]
-    r.deadline_ns, r.wake_ns, r.read_ns, r.write_ns = deadline_ns, wake_ns, read_ns, write_ns
-    r.flags |= flags
-    ring[head % ring.size] = r
+    for i in range(rows.size):
+        r = rows[i]
+        r.deadline_ns, r.wake_ns, r.read_ns, r.write_ns = deadline_ns, wake_ns, read_ns, write_ns
+        r.flags |= flags
+        ring[(head + i) % ring.size] = r
     release_fence()
-    cursors[HEAD] = head + 1
+    cursors[HEAD] = head + rows.size
     return True
 
 
@@ -733,7 +731,7 @@ def publish_positions(
     head: NDArray[np.int64],
     numbers: NDArray[np.float64],
 ) -> None:
-    """Copies the scene's positions and contacts to a snapshot (``recording.snapshot``).
+    """Copies the scene's positions and contacts to a snapshot (``recording.ring``).
 
     Call it after MuJoCo's step and before the next one, while the step's contact forces exist. The
     tick reads nothing that it changes.

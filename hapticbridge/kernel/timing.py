@@ -50,7 +50,7 @@ TIMING_DTYPE = np.dtype(
         ("lent", "<f8", 2),  # energies in J in the scene, of translation and rotation
         ("uncovered", "<f8", 2),  # A
         ("last_square", "<f8", 2),  # d² of the last tick in m² and rad²
-        ("most_uncovered", "<f8"),  # largest sum of A and of what is owed so far, in J at the hand
+        ("max_uncovered", "<f8"),  # largest sum of A and of what is owed so far, in J at the hand
     ]
 )
 """Sub-record ``timing``, written by this module alone."""
@@ -98,7 +98,7 @@ def meter_debt(s: State) -> None:
     """Notes the most that delays may have given, once the springs have paid for a late sample."""
     t, owed, ratio = s.timing, s.coupling.owed, s.run.force_scale / s.run.scale
     held = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
-    t.most_uncovered = max(t.most_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + held)
+    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + held)
 
 
 @compiled

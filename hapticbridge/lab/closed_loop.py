@@ -229,7 +229,7 @@ class ClosedLoop:
                 *outputs,
             )
         seconds = time.thread_time() - began
-        state, ledger = binding.state, Ledger.of(binding.state)
+        state, ledger = binding.state, Ledger.from_state(binding.state)
         last = signal[-(ticks // 5) :] if done == ticks else signal[:done]
         return LoopOutcome(
             ticks=done,

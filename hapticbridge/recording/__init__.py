@@ -2,9 +2,9 @@
 
 Read ``format`` first, the definition of a recording. Records leave the loop through ``ring``,
 events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;
-``snapshot`` holds the scene's positions for a viewer. ``writer`` writes a file. ``reader`` reads
-one, whole or damaged, through ``container``; ``repair`` rewrites a file that was cut. ``seal``
-holds the digest of the contents, the hash chain over the file, and the signature.
+``ring`` also holds the scene's newest positions for a viewer. ``writer`` writes a file, and a file
+that was cut anew. ``reader`` reads one, whole or damaged, through ``container``. ``seal`` holds the
+digest of the contents, the hash chain over the file, and the signature.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment
@@ -13,8 +13,8 @@ from hapticbridge.recording.reader import RecordingFile as RecordingFile
 from hapticbridge.recording.reader import open_recording as open_recording
 from hapticbridge.recording.reader import read_recording as read_recording
 from hapticbridge.recording.recorder import Recorder as Recorder
-from hapticbridge.recording.repair import repair as repair
 from hapticbridge.recording.ring import HEAD as HEAD
 from hapticbridge.recording.ring import TAIL as TAIL
 from hapticbridge.recording.ring import Ring as Ring
 from hapticbridge.recording.writer import RecordingWriter as RecordingWriter
+from hapticbridge.recording.writer import repair as repair

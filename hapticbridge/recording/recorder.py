@@ -29,10 +29,9 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_hands, read_with_attachments
-from hapticbridge.recording.repair import rewrite
 from hapticbridge.recording.ring import TAIL, Ring
 from hapticbridge.recording.seal import Signer
-from hapticbridge.recording.writer import check_contents, is_being_recorded
+from hapticbridge.recording.writer import check_contents, is_being_recorded, rewrite
 from hapticbridge.signals import deferring_stops
 
 # Second reader of a run

@@ -24,13 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.files import read_json
+from hapticbridge.recording.format import CDR_HEADER
 
 RATE = 60
 """Messages per second on each topic, for 1 kHz: one in 16 or 17 ticks. What is looked at needs no
 more, and the file grows by a tenth."""
-
-CDR_HEADER = b"\x00\x01\x00\x00"
-"""Header of little-endian CDR without options; alignment counts from behind it."""
 
 WORLD, HANDLE, TOOL = "world", "handle", "tool"
 """Names of the frames."""

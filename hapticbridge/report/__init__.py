@@ -1,7 +1,7 @@
 """Plots and HTML pages of a recorded run.
 
-Read ``page`` first. It shows an ``evidence``, described by ``facts``, drawn by ``plots``. ``cause``
-names the likely cause of an active run and its remedy.
+Read ``page`` first. It shows the facts of a run and its ``evidence``, drawn by ``plots``.
+``cause`` names the likely cause of an active run and its remedy.
 """
 
 from hapticbridge.report.evidence import DRAWABLE as DRAWABLE

@@ -245,14 +245,14 @@ def draw_timing(evidence: Evidence) -> Figure:
     return figure
 
 
-LEAST_LATENESS = 1.0
+MIN_LATENESS = 1.0
 """Lateness in µs below which ticks are drawn at the left edge: a clock is read no finer."""
 
 
 def _draw_lateness(axes: Axes, evidence: Evidence) -> None:
-    lateness = np.maximum(1e6 * evidence.lateness, LEAST_LATENESS)
+    lateness = np.maximum(1e6 * evidence.lateness, MIN_LATENESS)
     period = 1e6 * evidence.parameters.period
-    bins = np.geomspace(LEAST_LATENESS, max(lateness.max(), 10 * LEAST_LATENESS), 81)
+    bins = np.geomspace(MIN_LATENESS, max(lateness.max(), 10 * MIN_LATENESS), 81)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.hist(lateness, bins=list(bins), color="#1a5fb4", log=True, label="ticks")

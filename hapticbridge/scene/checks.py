@@ -250,7 +250,7 @@ FARTHEST = 1e3
 off by more than the 1e-9 N that the audit takes for tampering."""
 
 
-def check_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
+def check_start(data: mujoco.MjData, grip: str) -> None:
     """Raises SceneError for a start that is not finite, or a tool beyond ``FARTHEST``.
 
     ``data`` must be at the start, after ``mj_forward``.

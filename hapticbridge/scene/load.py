@@ -288,7 +288,7 @@ def compile_scene(
         for each in dict.fromkeys(grips):
             scene.changes += limit_motors_alone(model, scene.data, each, as_is=as_is)
     if checks_start:
-        check_start(model, scene.data, grips[0])
+        check_start(scene.data, grips[0])
     if as_is:
         refuse_overlap(model, scene.data, grips[0])
     else:

@@ -2,10 +2,9 @@
 
 Device damping: ``transfer`` holds the sampled coupling and a transmission line, ``spectrum`` the
 damping needed at each frequency, ``bounds`` its supremum (also with delay) and the damping that
-each method adds.
-``sampled_loop`` finds the same limit in the time domain with the worst hand. ``virtual_mass``
-treats the tool's integrator. ``device_limits``
-(quantisation, friction, a free device) bounds a ``z_width``.
+each method adds. ``sampled_loop`` finds the same limit in the time domain with the worst hand.
+``virtual_mass`` treats the tool's integrator. ``z_width`` adds the limits by quantisation, by
+friction and of a free device.
 
 Reference mechanics: ``rigid_body`` moves a body by four integrators of known energy and a mass
 behind the coupling; ``impact`` is Routh's method with three laws of restitution.
@@ -17,10 +16,6 @@ from hapticbridge.theory.bounds import maximum_stiffness as maximum_stiffness
 from hapticbridge.theory.bounds import minimum_damping as minimum_damping
 from hapticbridge.theory.bounds import stiffest_coupling as stiffest_coupling
 from hapticbridge.theory.bounds import worst_frequency as worst_frequency
-from hapticbridge.theory.device_limits import QuantizationLimit as QuantizationLimit
-from hapticbridge.theory.device_limits import free_device_damping as free_device_damping
-from hapticbridge.theory.device_limits import free_device_stiffness as free_device_stiffness
-from hapticbridge.theory.device_limits import quantization_limit as quantization_limit
 from hapticbridge.theory.impact import Impact as Impact
 from hapticbridge.theory.impact import ImpactBody as ImpactBody
 from hapticbridge.theory.impact import Mode as Mode
@@ -49,5 +44,9 @@ from hapticbridge.theory.virtual_mass import (
 )
 from hapticbridge.theory.virtual_mass import minimum_mass as minimum_mass
 from hapticbridge.theory.z_width import LimitLine as LimitLine
+from hapticbridge.theory.z_width import QuantizationLimit as QuantizationLimit
 from hapticbridge.theory.z_width import ZWidth as ZWidth
+from hapticbridge.theory.z_width import free_device_damping as free_device_damping
+from hapticbridge.theory.z_width import free_device_stiffness as free_device_stiffness
+from hapticbridge.theory.z_width import quantization_limit as quantization_limit
 from hapticbridge.theory.z_width import z_width as z_width

@@ -88,7 +88,7 @@ def worst_frequency(
         is reached at Nyquist or infinite there. Accurate to about 1e-7 of π/T, because the spectrum
         is flat at its top. Of several equal maxima any one.
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time)
+    law = SampledLaw.validated(coupling, period, discretization, delay, filter_time)
     k, b, period, samples, tau, is_ringing = law
     if samples == 0:
         return plain(np.full(k.shape, np.pi / period))
@@ -190,7 +190,7 @@ def minimum_damping(
     References:
         Brown & Colgate 1997, eqs. (6), (7); Colgate & Schenkel 1997 (wall).
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time, axis)
+    law = SampledLaw.validated(coupling, period, discretization, delay, filter_time, axis)
     stiffness, damping, period, delay, filter_time, unbounded = law
     if delay:
         # without low-pass, Tustin's bound is finite only for B' = 0, where both rules agree

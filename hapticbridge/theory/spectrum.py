@@ -87,7 +87,7 @@ def damping_spectrum(
     References:
         Brown & Colgate 1997, eqs. (2), (4), (5); Colgate & Schenkel 1997.
     """
-    law = SampledLaw.of(coupling, period, discretization, delay, filter_time)
+    law = SampledLaw.validated(coupling, period, discretization, delay, filter_time)
     period, delay, filter_time = law.period, law.delay, law.filter_time
     theta = angles(frequency, period)
     stiffness, damping = (

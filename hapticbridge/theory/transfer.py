@@ -230,7 +230,7 @@ class SampledLaw(NamedTuple):
     rings: bool
 
     @classmethod
-    def of(
+    def validated(
         cls,
         coupling: Coupling | CouplingGrid,
         period: float,

@@ -18,10 +18,19 @@ from typing import Any
 import numpy as np
 import viser
 
-from hapticbridge.commands import Command, Couple, CouplingLimits, Mark, Reset, Switch
-from hapticbridge.commands.allowed import UNITS, AxisCouplingLimits
-from hapticbridge.commands.command import Stop, line_of
-from hapticbridge.commands.execution import INTERVAL
+from hapticbridge.commands import (
+    INTERVAL,
+    UNITS,
+    AxisCouplingLimits,
+    Command,
+    Couple,
+    CouplingLimits,
+    Mark,
+    Reset,
+    Stop,
+    Switch,
+    line_of,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.device.mouse import REST, Pose, line_of_pose

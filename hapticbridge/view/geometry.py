@@ -305,7 +305,7 @@ class Scenery:
     other_tools: tuple[trimesh.Trimesh, ...] = ()
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, grip: str, *others: str) -> Scenery:
+    def from_model(cls, model: mujoco.MjModel, grip: str, *others: str) -> Scenery:
         """Returns what is drawn of a scene; grips are names of sites on the tools."""
         tendons = Tendons(model)
         return cls(

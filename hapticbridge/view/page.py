@@ -83,7 +83,7 @@ class Held:
     tool_force: Array
 
     @classmethod
-    def of(cls, row: NDArray[np.void], hand_force: Array) -> Held:
+    def from_record(cls, row: NDArray[np.void], hand_force: Array) -> Held:
         """Returns what a record, one element of ``TICK_DTYPE``, says of a hand."""
         return cls(
             handle=row["handle_position"][0].copy(),
@@ -127,7 +127,7 @@ class Sight:
     others: tuple[Held, ...] = ()
 
     @classmethod
-    def of(
+    def from_scene(
         cls,
         model: mujoco.MjModel,
         data: mujoco.MjData,

@@ -1,6 +1,6 @@
 """Process that shows a run while it continues. The loop never waits for it.
 
-It reads the newest positions of the scene (``recording.snapshot``) and the records of the ring, and
+It reads the newest positions of the scene (``recording.ring``) and the records of the ring, and
 draws them on the page. It ends when its input does.
 """
 
@@ -29,7 +29,7 @@ from hapticbridge.record import force_on_hand
 from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
-from hapticbridge.recording.snapshot import Snapshot
+from hapticbridge.recording.ring import Snapshot
 from hapticbridge.run_description import parameters_of
 from hapticbridge.timekeeping import watch_sentence
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
@@ -79,7 +79,7 @@ class LiveRun:
         self.model = compile_recorded(run, *self._hands).model
         tell_apart(self.model, *(own.grip for own in self._hands))
         grips = [own.grip for own in self._hands if not own.grip.startswith(JOINT)]
-        self.scenery = Scenery.of(self.model, *grips)
+        self.scenery = Scenery.from_model(self.model, *grips)
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
         self._gathered, self._shown = 0, -1
@@ -102,7 +102,9 @@ class LiveRun:
         self._data.qpos[:] = picture.qpos
         self._data.mocap_pos[:], self._data.mocap_quat[:] = picture.mocap_pos, picture.mocap_quat
         force = force_on_hand(rows[:1], self.parameters.axes)[0] * self._is_held
-        sight = Sight.of(self.model, self._data, rows[:1], self._tendons, picture.contacts, force)
+        sight = Sight.from_scene(
+            self.model, self._data, rows[:1], self._tendons, picture.contacts, force
+        )
         sight = replace(sight, others=tuple(self._others(rows)))
         for held in sight.hands:
             size, pull = np.linalg.norm(held.hand_force), np.linalg.norm(held.tool_force)
@@ -115,7 +117,7 @@ class LiveRun:
         for hand, own in enumerate(self._hands[1:], 1):
             if not own.grip.startswith(JOINT):
                 row = rows[hand : hand + 1]
-                yield Held.of(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])
+                yield Held.from_record(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])
 
     def _gather(self, slack: float) -> None:
         """Adds the records since the last call to the curves, which are those of the first hand."""

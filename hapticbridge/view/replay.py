@@ -98,7 +98,7 @@ class Replay:
         if self._progress is not None:
             self._progress(len(self.sights), self._count)
 
-    def at(self, moment: float) -> Sight:
+    def sight_at(self, moment: float) -> Sight:
         """Returns the instant nearest to a time in s; the first for a value that is no time."""
         if math.isnan(moment):
             return self.sights[0]
@@ -110,17 +110,17 @@ def _played(recording: RecordingFile, worker: Worker) -> None:
     stage = Stage(recording, worker.allow_run)
     step = max(FRAME, stage.duration / MOST)
     count = max(1, int(stage.duration / step) + 1)
-    scenery = Scenery.of(stage.model, stage.parameters.grip, *stage.other_grips).parts()
+    scenery = Scenery.from_model(stage.model, stage.parameters.grip, *stage.other_grips).parts()
     references = {"on_hand": stage.hand_reference, "on_tool": stage.tool_reference}
     worker.tell(scenery | references | {"step": step, "count": count})
     tendons, trace = Tendons(stage.model), Trace(is_held=is_held(stage.recording.meta))
     for number in range(count):
         stage.show(stage.tick_at(min(number * step, stage.duration)))
         trace.add(stage.passed, stage.slack)
-        sight = Sight.of(
+        sight = Sight.from_scene(
             stage.model, stage.data, stage.row, tendons, stage.contacts(), stage.hand_force
         )
-        sight = replace(sight, others=tuple(Held.of(*each) for each in stage.others()))
+        sight = replace(sight, others=tuple(Held.from_record(*each) for each in stage.others()))
         worker.tell([sight.parts(), trace.newest])
 
 
@@ -163,7 +163,7 @@ class Theatre:
 
     def show(self, moment: float) -> None:
         """Shows the instant nearest to a time in s."""
-        sight = self._replay.at(moment)
+        sight = self._replay.sight_at(moment)
         self._page.show(sight)
         self._page.status.content = f"**{sight.time:.3f} s**, {self._page.forces(sight)}"
 

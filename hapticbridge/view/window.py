@@ -21,9 +21,7 @@ from typing import IO, cast
 from urllib.parse import parse_qs, urlsplit
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.commands import Command, command_of
-from hapticbridge.commands.command import LONGEST_LINE
-from hapticbridge.commands.execution import INTERVAL
+from hapticbridge.commands import INTERVAL, LONGEST_LINE, Command, command_of
 from hapticbridge.device.mouse import Pose, pose_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
 from hapticbridge.files import install_command

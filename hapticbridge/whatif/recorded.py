@@ -79,7 +79,7 @@ class RecordedRun:
     scene_file: Path
 
     @classmethod
-    def of(cls, hands: Sequence[Recording], folder: Path) -> tuple[RecordedRun, ...]:
+    def from_hands(cls, hands: Sequence[Recording], folder: Path) -> tuple[RecordedRun, ...]:
         """Takes a recording apart, into a run per hand.
 
         The scene's files are unpacked to ``folder``.

@@ -20,7 +20,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import delay_ticks
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands.execution import coupling_in, tuning_ticks
+from hapticbridge.commands import coupling_in, tuning_ticks
 from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
 from hapticbridge.device.simulated.device import SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice

@@ -172,7 +172,7 @@ def what_if(
     recordings = read_hands(path)
     with TemporaryDirectory(prefix="hapticbridge-") as name:
         folder = Path(name)
-        hands = RecordedRun.of(recordings, folder / "scene")
+        hands = RecordedRun.from_hands(recordings, folder / "scene")
         if len(hands[0].ticks) < 3:
             raise RecordingError(
                 f"'{recordings[0].path}' has {len(hands[0].ticks)} ticks; a what-if needs 3"
@@ -181,7 +181,7 @@ def what_if(
         return _Experiment(hands, report, file, progress, judge, in_process).changed(changes)
 
 
-START_TIME, MOST_TIMES = 40.0, 100.0
+START_TIME, MAX_TIMES = 40.0, 100.0
 """Processor time in s for the start of a bridge, which rehearses slow scenes for up to 37 s; and
 largest work of a changed run relative to the recorded one."""
 
@@ -329,7 +329,7 @@ class _Experiment:
             work,
             f"the scene of '{run.recording.path}'",
             trusted=self.in_process,
-            seconds=START_TIME + min(times, MOST_TIMES) * bounds["seconds"],
+            seconds=START_TIME + min(times, MAX_TIMES) * bounds["seconds"],
             reads=bounds["reads"],
             writes=(self.path.parent,),
         )

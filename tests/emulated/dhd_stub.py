@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from emulated.library_stub import LibraryStub
 from hapticbridge.device import Motion
-from hapticbridge.device.force_dimension.device import ForceDimensionDevice
-from hapticbridge.device.force_dimension.dhd import Dhd
+from hapticbridge.device.force_dimension import Dhd, ForceDimensionDevice
 
 OMEGA3, OMEGA6, OMEGA7, SIGMA7 = 33, 34, 35, 104
 CALL = 100e-6

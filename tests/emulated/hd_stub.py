@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from emulated.library_stub import LibraryStub
 from hapticbridge.device import Motion
 from hapticbridge.device.touch.device import TouchDevice
-from hapticbridge.device.touch.hd import Hd
+from hapticbridge.device.touch.servo import Hd
 
 
 class HdStub(LibraryStub):

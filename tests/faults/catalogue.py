@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.simulated.hand import DEFAULT_HAND, Hand
+from hapticbridge.device.simulated.dynamics import DEFAULT_HAND, Hand
 from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.guard import Limits
 from hapticbridge.recording.recorder import recorder_process

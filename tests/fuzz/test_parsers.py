@@ -14,7 +14,7 @@ from audit_cases import tapped
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.commands.command import command_of
+from hapticbridge.commands import command_of
 from hapticbridge.confinement import unpacked
 from hapticbridge.device import DeviceInfo, spacemouse
 from hapticbridge.device.falcon.protocol import read_firmware

@@ -1,4 +1,4 @@
 """Simulated device in a simulated hand.
 
-``device`` is the driver, ``dynamics`` its exact compiled step, ``hand`` the parameters of the hand.
+``device`` is the driver, ``dynamics`` the hand and the exact compiled step.
 """

@@ -27,15 +27,17 @@ from hapticbridge.device.base import (
     checked_write,
 )
 from hapticbridge.device.simulated.dynamics import (
+    DEFAULT_HAND,
     FREE,
     IN_A_HAND,
     MAX_DELAY,
+    NO_HAND,
     ON_A_LINE,
     STATE_DTYPE,
+    Hand,
     next_sample,
     sampled_axis,
 )
-from hapticbridge.device.simulated.hand import DEFAULT_HAND, NO_HAND, Hand
 from hapticbridge.device.trajectory import Motion, read_motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.jit import direct

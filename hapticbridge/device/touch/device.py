@@ -36,7 +36,7 @@ from hapticbridge.device.base import (
     stated_switch,
 )
 from hapticbridge.device.driver import Driver, FoundDevice, Notify, UsbId, ignore_message
-from hapticbridge.device.touch.hd import (
+from hapticbridge.device.touch.servo import (
     BY_ENCODER_RESET,
     BY_INKWELL,
     BY_ITSELF,
@@ -55,8 +55,9 @@ from hapticbridge.device.touch.hd import (
     SERIAL_NUMBER,
     TOP_PRIORITY,
     Hd,
+    Servo,
+    ServoSample,
 )
-from hapticbridge.device.touch.servo import Servo, ServoSample
 from hapticbridge.device.transport import usb as usb_search
 from hapticbridge.device.watchdog import SILENCE, SilenceDetector, watchdog_time
 from hapticbridge.errors import DeviceError, DeviceLost

@@ -18,7 +18,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
 from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, scene_run
 from hapticbridge.lab.chart.engine_run import EngineRun
-from hapticbridge.lab.chart.setting import OWN, Setting, who
+from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
 from hapticbridge.lab.engines.base import Engine, open_engine
 from hapticbridge.run_description import processor
@@ -174,7 +174,7 @@ def interleaved_costs(
             break
         costs = np.zeros(len(runs))
         for index in generator.permutation(len(runs)):
-            costs[index] = runs[index].go() / runs[index].seconds
+            costs[index] = runs[index].run() / runs[index].seconds
             done += 1
             if progress is not None:
                 progress(done)
@@ -325,7 +325,7 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:
     for each in points:
         felt = each.score.jnd
         if each.is_usual and math.isfinite(felt) and felt >= RESOLVED:
-            series.setdefault(who(each.setting), []).append((each.setting.period, felt))
+            series.setdefault(simulator_name(each.setting), []).append((each.setting.period, felt))
     return {name: _order(sorted(values)[:3]) for name, values in series.items() if len(values) > 2}
 
 
@@ -361,7 +361,7 @@ class Chart:
     notes: tuple[str, ...] = ()
     engines: Mapping[str, Engine] = field(default_factory=dict)
 
-    def of(self, panel: Panel) -> list[Measurement]:
+    def points_of(self, panel: Panel) -> list[Measurement]:
         """Returns the points of a panel."""
         return [each for each in self.measurements if each.panel == panel.key]
 
@@ -373,7 +373,7 @@ class Chart:
         """
         points = [
             each
-            for each in self.of(panel)
+            for each in self.points_of(panel)
             if each.is_sound and each.is_comparable and each.setting.method.has_law
         ]
         chosen = pareto_front(
@@ -383,7 +383,7 @@ class Chart:
 
     def orders(self, panel: Panel) -> dict[str, Order]:
         """Returns the order of convergence by method."""
-        return convergence_orders(self.of(panel))
+        return convergence_orders(self.points_of(panel))
 
 
 def measure_chart(
@@ -424,7 +424,7 @@ def measure_chart(
                 run = _opened(workload, setting, peer_work)
                 runs.append((setting, run, dict(run.scores())))
             except HapticBridgeError as error:
-                skipped.setdefault(who(setting), str(error))
+                skipped.setdefault(simulator_name(setting), str(error))
         if not runs:
             raise StudyError(
                 f"workload '{workload.name}': no point could be simulated; first: "

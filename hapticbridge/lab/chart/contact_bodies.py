@@ -217,7 +217,7 @@ class SlidingBlock(Staged):
         (take,) = takes
         if take.has_diverged:
             return {BLOCK_PANEL.key: diverged(take.created, take.ended)}
-        records = take.at(self._grid).copy()
+        records = take.records_at(self._grid).copy()
         # the weight rests on a compliant contact, and the handle carries a share of it, so only the
         # motion along the floor is judged
         records["wrench_on_tool"][:, 1:] = 0.0
@@ -517,7 +517,7 @@ class Tap(Staged):
         (take,) = takes
         if take.has_diverged:
             return {TAP_PANEL.key: diverged(take.created, take.ended)}
-        records = take.at(self._grid)
+        records = take.records_at(self._grid)
         has_touched = bool(np.any(records["contacts"] > 0))
         score = score_of(
             self._reference,

@@ -112,7 +112,7 @@ class EngineRun:
             "engine_settings": f"{self.engine.name} {self.engine.version}; {text}",
         }
 
-    def go(self) -> float:
+    def run(self) -> float:
         """Runs it; returns the processor time in s of the steps, nan if none was completed."""
         if not any(self._ticks):
             return float("nan")

@@ -141,7 +141,7 @@ class DrivenMass(Staged):
         (take,) = takes
         if take.has_diverged:
             return {DRIVEN_PANEL.key: diverged(take.created, take.ended)}
-        records = take.at(self._grid)
+        records = take.records_at(self._grid)
         return {
             DRIVEN_PANEL.key: score_of(
                 self._reference, records, created=take.created, verdict=take.environment
@@ -256,7 +256,7 @@ class SpinningBody(Staged):
         (take,) = takes
         if take.has_diverged:
             return {SPINNING_PANEL.key: diverged(take.created, take.ended)}
-        records = take.at(self._grid)
+        records = take.records_at(self._grid)
         score = score_of(
             self._reference,
             records,
@@ -378,7 +378,7 @@ class SpringArm(Staged):
             return {ARM_PANEL.key: diverged(take.created, take.ended)}
         score = score_of(
             self._reference,
-            take.at(self._grid),
+            take.records_at(self._grid),
             created=take.created,
             verdict=take.environment,
         )

@@ -22,7 +22,7 @@ from matplotlib.ticker import NullFormatter
 from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null, prepared_folder
 from hapticbridge.lab.chart.chart import Chart, Measurement, Order
-from hapticbridge.lab.chart.setting import OWN, Setting, who
+from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, Verdict
 from hapticbridge.options import DEFAULT_OPTIONS
 from hapticbridge.plotting import new_figure, write_picture
@@ -195,11 +195,11 @@ def standing(points: Sequence[Measurement]) -> str:
     return (
         f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is not on the front. Ahead: "
         f"{names}. The best has 1/{error:.2g} of its error at 1/{cost:.2g} of its cost{but}. "
-        f"{_what_it_takes(points, best.score.jnd)}"
+        f"{_period_words(points, best.score.jnd)}"
     )
 
 
-def _what_it_takes(points: Sequence[Measurement], error: float) -> str:
+def _period_words(points: Sequence[Measurement], error: float) -> str:
     """States the period at which the default's method reaches an error in JND."""
     own = sorted(
         (each.setting.period, each.score.jnd)
@@ -328,7 +328,7 @@ WARNING = "#c00000"
 
 def colours_of(chart: Chart) -> dict[str, Any]:
     """Returns a colour for every method and engine."""
-    names = list(dict.fromkeys(who(each.setting) for each in chart.measurements))
+    names = list(dict.fromkeys(simulator_name(each.setting) for each in chart.measurements))
     return {name: colormaps["tab20"](i % 20) for i, name in enumerate(names)}
 
 
@@ -365,9 +365,9 @@ def draw_chart(chart: Chart) -> Figure:
 
 
 def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any]) -> None:
-    points, orders = chart.of(panel), chart.orders(panel)
+    points, orders = chart.points_of(panel), chart.orders(panel)
     for name, colour in colours.items():
-        selected = [each for each in points if who(each.setting) == name]
+        selected = [each for each in points if simulator_name(each.setting) == name]
         if not selected:
             continue
         axes.plot([], [], "-", color=colour, lw=2, label=_named(name, selected, orders.get(name)))
@@ -388,7 +388,7 @@ def _draw_panel(axes: Axes, chart: Chart, panel: Panel, colours: dict[str, Any])
     if best is not None:
         axes.plot(
             best.cost.median, drawn_error(best), "*", ms=13, mfc="none", mec="black", mew=1.3,
-            label=f"recommended for 1 kHz: {who(best.setting)}", zorder=5,
+            label=f"recommended for 1 kHz: {simulator_name(best.setting)}", zorder=5,
         )  # fmt: skip
         for label in _passed_over(best, chart.front(panel), points):
             axes.plot([], [], " ", label=label)
@@ -428,8 +428,8 @@ def _passed_over(
     reasons: dict[str, str] = {}
     for each in front:
         found = _objections(each, points) if _is_at_rate(each) else []
-        if found and who(each.setting) != who(best.setting):
-            reasons.setdefault(who(each.setting), found[-1])
+        if found and simulator_name(each.setting) != simulator_name(best.setting):
+            reasons.setdefault(simulator_name(each.setting), found[-1])
     return [
         textwrap.fill(f"not {name}: {reason}", 34, subsequent_indent="  ")
         for name, reason in reasons.items()
@@ -594,9 +594,9 @@ def summary_of(chart: Chart) -> dict[str, Any]:
             "reference": panel.reference,
             "reference_is_truth": panel.is_truth,
             "recommendation": recommendation(
-                chart.of(panel), chart.machine, is_truth=panel.is_truth
+                chart.points_of(panel), chart.machine, is_truth=panel.is_truth
             ),
-            "standing": standing(chart.of(panel)),
+            "standing": standing(chart.points_of(panel)),
             "front": [
                 {
                     "setting": each.setting.label,

@@ -416,7 +416,7 @@ class Jam(Staged):
         (take,) = takes
         if take.has_diverged:
             return {JAM_PANEL.key: diverged(take.created, take.ended)}
-        records = take.at(self._grid)
+        records = take.records_at(self._grid)
         has_left = bool(np.abs(records["tool_position"]).max() > LEFT)
         depth = np.zeros(1) if has_left else penetrations(records)
         force = np.linalg.norm(records["wrench_on_tool"][:, :3], axis=1)

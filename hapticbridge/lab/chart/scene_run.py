@@ -94,7 +94,7 @@ class Stage:
         starts: Sequence[Start | None] = (None,),
     ) -> None:
         self._scene = scene
-        self._shipped = ShippedOptions.of(scene.model)
+        self._shipped = ShippedOptions.from_model(scene.model)
         self._path = path
         self.duration = duration
         self.coupling = coupling
@@ -208,7 +208,7 @@ class Stage:
     def _take(
         self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int
     ) -> Take:
-        warnings, ledger = self._scene.data.warning, Ledger.of(binding.state)
+        warnings, ledger = self._scene.data.warning, Ledger.from_state(binding.state)
         ended = ""
         if rows.size < ticks:
             ended = f"a number was not finite after {setting.period * rows.size:.4g} s"
@@ -238,7 +238,7 @@ class SceneRun:
         """Contacts and solver of this point, for a table."""
         return self._stage.shipped.chosen(self._setting)
 
-    def go(self) -> float:
+    def run(self) -> float:
         """Runs it; returns the processor time in s."""
         return self._stage.play(self._setting)
 
@@ -312,7 +312,7 @@ class OwnReferences:
         self._period, self._count = finest / refinement, round(duration / grid)
         self._found: dict[str, OwnReference | None] = {}
 
-    def of(self, method: Method) -> OwnReference | None:
+    def reference_of(self, method: Method) -> OwnReference | None:
         """Returns a method's reference; None if it diverges even at this step."""
         if method.name not in self._found:
             setting = Setting(method, self._period)
@@ -327,12 +327,12 @@ class OwnReferences:
         """Compares the first part of a take with its method's reference."""
         if take.setting.engine != OWN:
             return Score(jnd=NAN)  # the method is not on the chart
-        reference = self.of(take.setting.method)
+        reference = self.reference_of(take.setting.method)
         if take.has_diverged:
             return diverged(take.created, take.ended)
         if reference is None:
             return Score(jnd=NAN, created=take.created, verdict=take.environment)
-        records = take.at(self._grid)[: self._count]
+        records = take.records_at(self._grid)[: self._count]
         touches = reference.records["contacts"] > 0
         has_lost = touches.any() and np.mean(records["contacts"][touches] > 0) < TOUCHING
         return score_of(

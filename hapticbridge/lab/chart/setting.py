@@ -105,7 +105,7 @@ class Setting:
         return ", ".join(parts)
 
 
-def who(setting: Setting) -> str:
+def simulator_name(setting: Setting) -> str:
     """Returns the method's name, or the engine's if it is another."""
     return setting.method.name if setting.engine == OWN else setting.engine
 
@@ -120,7 +120,7 @@ class ShippedOptions:
     iterations: int
 
     @classmethod
-    def of(cls, model: mujoco.MjModel) -> ShippedOptions:
+    def from_model(cls, model: mujoco.MjModel) -> ShippedOptions:
         """Keeps the values of the scene's file."""
         return cls(
             model.geom_solref.copy(),

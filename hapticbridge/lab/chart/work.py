@@ -432,17 +432,17 @@ class WorkChart:
     machine: str
     loops: tuple[LoopCost, ...] = ()
 
-    def of(self, family: Family, variant: Variant) -> list[Work]:
+    def points_of(self, family: Family, variant: Variant) -> list[Work]:
         """Returns the points of a family by size."""
         return [p for p in self.points if (p.family, p.variant) == (family.name, variant.name)]
 
     def variants(self, family: Family) -> list[Variant]:
         """Returns the measured variants of a family."""
-        return [variant for variant in VARIANTS if self.of(family, variant)]
+        return [variant for variant in VARIANTS if self.points_of(family, variant)]
 
     def growth(self, family: Family, variant: Variant) -> Growth | None:
         """Returns the growth of the time with the larger sizes; None for fewer than two."""
-        points = self.of(family, variant)
+        points = self.points_of(family, variant)
         return growth_of(
             np.array([each.size for each in points], dtype=np.float64),
             np.array([each.time.median for each in points]),
@@ -456,7 +456,7 @@ class WorkChart:
         times = {
             each.is_bare: point.time.median
             for each in (variant, ALONE)
-            for point in self.of(family, each)
+            for point in self.points_of(family, each)
             if point.size == size
         }
         if set(times) != {False, True}:
@@ -531,7 +531,7 @@ def measure_work(
         progress(rounds * len(jobs), rounds * len(jobs))
     points = []
     for index, (family, variant, size) in enumerate(jobs):
-        spread = TimingStats.of(np.concatenate(times[index]))
+        spread = TimingStats.from_times(np.concatenate(times[index]))
         medians = [float(np.median(each)) for each in times[index]]
         contacts, rows, freedoms = counts[index]
         points.append(
@@ -646,7 +646,7 @@ def _draw_family(axes: Axes, chart: WorkChart, family: Family) -> None:
         return
     for place, variant in enumerate(chart.variants(family)):
         colour = f"C{place}"
-        points = chart.of(family, variant)
+        points = chart.points_of(family, variant)
         sizes = [each.size for each in points]
         growth = chart.growth(family, variant)
         text = variant.name if growth is None else f"{variant.name}: {_power(growth)}"
@@ -683,7 +683,7 @@ def paragraph(chart: WorkChart) -> str:
     facts = []
     for family in FAMILIES:
         for variant in chart.variants(family):
-            points = chart.of(family, variant)
+            points = chart.points_of(family, variant)
             first, last = points[0], points[-1]
             most = max((each.size for each in points if each.rate >= RATE), default=0)
             growth = chart.growth(family, variant)
@@ -704,7 +704,7 @@ def _beyond(chart: WorkChart, family: Family, variant: Variant) -> str:
 
     For the least it is the fixed cost of a tick, the rest grows with the scene.
     """
-    points = chart.of(family, variant)
+    points = chart.points_of(family, variant)
     found = {p.size: chart.beyond(family, variant, p.size) for p in (points[0], points[-1])}
     parts = [
         f"{1e6 * extra[0]:.3g} µs for {size} ({extra[1]:.2f} times the step)"

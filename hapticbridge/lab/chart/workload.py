@@ -150,7 +150,7 @@ class Take:
         """True if it ended early, or MuJoCo rejected its state."""
         return bool(self.ended)
 
-    def at(self, grid: float) -> NDArray[np.void]:
+    def records_at(self, grid: float) -> NDArray[np.void]:
         """Returns the records at whole multiples of a time in s, the first excluded."""
         every = round(grid / self.setting.period)
         return self.records[every - 1 :: every]
@@ -204,7 +204,7 @@ class Run(Protocol):
     def chosen(self) -> Mapping[str, str | int]:
         """Contacts and solver as the engine received them: equal columns for every point."""
 
-    def go(self) -> float:
+    def run(self) -> float:
         """Runs it from the start; returns the processor time in s of the simulation alone."""
 
     def scores(self) -> Mapping[str, Score]:

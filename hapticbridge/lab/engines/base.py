@@ -311,7 +311,7 @@ class Contacts(NamedTuple):
     depth: float
 
     @classmethod
-    def of(cls, depths: Iterable[float]) -> Contacts:
+    def from_depths(cls, depths: Iterable[float]) -> Contacts:
         """Returns the contacts with these depths in m; a negative depth is a gap."""
         touching = [depth for depth in depths if depth >= 0]
         return cls(len(touching), max(touching, default=0.0))

@@ -192,7 +192,9 @@ class PybulletSimulation(HeldSimulation):
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start."""
         points = pybullet.getContactPoints(self._body, physicsClientId=self._client)
-        return base.Contacts.of(-point[8] for point in points)  # its distance, negative where deep
+        return base.Contacts.from_depths(
+            -point[8] for point in points
+        )  # its distance, negative where deep
 
     def close(self) -> None:
         """Ends the Bullet world."""

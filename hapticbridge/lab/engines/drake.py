@@ -156,7 +156,7 @@ class DrakeSimulation(HeldSimulation):
             return base.Contacts(0, 0.0)
         found = self._plant.get_contact_results_output_port().Eval(self._context)
         pairs = range(found.num_point_pair_contacts())
-        points = base.Contacts.of(
+        points = base.Contacts.from_depths(
             found.point_pair_contact_info(i).point_pair().depth for i in pairs
         )
         return points._replace(points=points.points + found.num_hydroelastic_contacts())

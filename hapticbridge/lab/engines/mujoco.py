@@ -141,7 +141,7 @@ class MujocoSimulation(HeldSimulation):
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step."""
         distances = self._data.contact.dist
-        return base.Contacts.of(-float(distance) for distance in distances)
+        return base.Contacts.from_depths(-float(distance) for distance in distances)
 
     def close(self) -> None:
         """Does nothing: MuJoCo holds no resources."""

@@ -70,7 +70,7 @@ class MujocoWarpSimulation(MujocoSimulation):
         """Returns the contacts of the last step."""
         state = self._state
         distances: NDArray[np.float32] = state.contact.dist.numpy()[: int(state.nacon.numpy()[0])]
-        return base.Contacts.of(-float(distance) for distance in distances)
+        return base.Contacts.from_depths(-float(distance) for distance in distances)
 
 
 def engines() -> tuple[base.Engine, ...]:

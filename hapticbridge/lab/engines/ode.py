@@ -354,7 +354,7 @@ class OdeSimulation(HeldSimulation):
 
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start."""
-        return base.Contacts.of(self._depths[: self._touching].tolist())
+        return base.Contacts.from_depths(self._depths[: self._touching].tolist())
 
     def close(self) -> None:
         """Releases ODE's world."""

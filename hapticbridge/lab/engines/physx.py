@@ -161,7 +161,7 @@ class SapienSimulation(HeldSimulation):
         nanometre. A point that carries a force therefore counts as touching.
         """
         points = [point for contact in self._system.get_contacts() for point in contact.points]
-        return base.Contacts.of(
+        return base.Contacts.from_depths(
             max(-point.separation, 0.0) if np.any(point.impulse) else -point.separation
             for point in points
         )

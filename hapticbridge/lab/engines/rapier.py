@@ -131,7 +131,7 @@ class RapierSimulation(HeldSimulation):
 
         A point that carries an impulse counts as touching.
         """
-        return base.Contacts.of(
+        return base.Contacts.from_depths(
             max(-point.dist, 0.0) if point.impulse else -point.dist
             for pair in self._world.narrow_phase.contact_pairs()
             for manifold in pair.manifolds

@@ -23,5 +23,5 @@ from hapticbridge.lab.maps.base import run_map as run_map
 
 _IN_ORDER = (coupling, tool_mass, geometry, contact, rotation, rate, device, restitution)
 
-MAPS = {each.name: each for each in map(StabilityMap.of, _IN_ORDER)}
+MAPS = {each.name: each for each in map(StabilityMap.from_module, _IN_ORDER)}
 """The maps by name, in the recommended order of reading."""

@@ -30,8 +30,7 @@ from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import write_picture
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.load import scene_path
-from hapticbridge.sweep.results import Table, check_format
-from hapticbridge.sweep.sweep import sweep
+from hapticbridge.sweep import Table, check_format, sweep
 from hapticbridge.theory.bounds import maximum_stiffness
 
 Point = dict[str, float | int | str | bool]
@@ -85,7 +84,7 @@ class StabilityMap:
     sentences: Callable[[Mapping[str, Any]], Sentences]
 
     @classmethod
-    def of(cls, module: Any) -> StabilityMap:
+    def from_module(cls, module: Any) -> StabilityMap:
         """Returns the map that a module holds under the names of these attributes."""
         names = ("points", "evaluate", "summarize", "draw", "sentences")
         functions = {name: getattr(module, name) for name in names}

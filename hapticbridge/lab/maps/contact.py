@@ -40,7 +40,7 @@ from hapticbridge.scene.contacts import (
     ContactNumbers,
     contact_numbers,
 )
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 
 LINES = (
     ("strict", "-", f"rule: strict above (τ = {STRICT_STEPS:g} T or more)"),

@@ -19,7 +19,7 @@ from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 
 PERIOD = 1e-3

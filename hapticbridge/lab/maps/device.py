@@ -25,8 +25,8 @@ from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
-from hapticbridge.theory.device_limits import quantization_limit
+from hapticbridge.sweep import Table
+from hapticbridge.theory.z_width import quantization_limit
 
 RANGE = (0.1, 2.0)
 """Ranges of β and of σ, even in their logarithms."""
@@ -351,10 +351,6 @@ def _draw_friction(axes: Axes, found: Mapping[str, Any]) -> None:
     axes.legend(
         handles=[lines, *axes.get_legend_handles_labels()[0]], fontsize="small", loc="upper left"
     )
-
-
-SMALLEST = 1e-4
-"""Deviation in per cent that stems from rounding alone; no smaller one is quoted."""
 
 
 DEFAULT_POINTS = 400

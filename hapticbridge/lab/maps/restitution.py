@@ -22,7 +22,7 @@ from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
 
 MASS, LENGTH = 1.0, 1.0

@@ -26,7 +26,7 @@ from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Ledger
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 
 INERTIA = np.array([1.5e-3, 3.63e-3, 4.53e-3])
 """Principal moments of inertia of the tool about x, y, z in kg m². They all differ, so that it
@@ -234,7 +234,7 @@ def _run(binding: BoundKernel, samples: NDArray[np.void], records: NDArray[np.vo
 
 
 def _read(binding: BoundKernel, records: NDArray[np.void]) -> Spin:
-    ledger = Ledger.of(binding.state)
+    ledger = Ledger.from_state(binding.state)
     handle = Rotation.from_quat(records["handle_quaternion"][:, [1, 2, 3, 0]])
     tool = Rotation.from_quat(records["tool_quaternion"][:, [1, 2, 3, 0]])
     between = (handle * tool.inv()).as_rotvec()

@@ -20,7 +20,7 @@ from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
-from hapticbridge.sweep.results import Table
+from hapticbridge.sweep import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 from hapticbridge.theory.spectrum import needed_for_fixed_environment
 

@@ -41,10 +41,6 @@ with a free light tool keeps about 3e-8 N alive, which neither grows nor falls."
 TOLERANCE = 1e-4
 """Relative width at which a bisection ends. It is below the resolution of ``TICKS``."""
 
-Hand = Callable[[float], float]
-"""Function from the held force on the device in N to the handle's next step, in m/s of mean
-velocity."""
-
 
 class ImplicitMass:
     """The scene ``point_mass`` behind its coupling actuators, one tick per call, along x.

@@ -488,7 +488,7 @@ def _swept(mass: float, delay: int) -> float:
     return float(np.max(top / np.abs(turned) ** 2))
 
 
-def least_in_mujoco(mass: float, integrator: Integrator) -> float:
+def smallest_mass_in_mujoco(mass: float, integrator: Integrator) -> float:
     """Returns the least device damping in N s/m of a mass in kg behind MuJoCo's integrator."""
     loop = SampledLoop(MASS_COUPLING, PERIOD, mass=mass, integrator=integrator)
     frequency = loop.worst_frequency()
@@ -546,7 +546,7 @@ def _checks() -> tuple[list[Check], list[tuple[str, ...]]]:
                 )
             cell = f"{closed:.4f} / {in_time:.4f}" if np.isfinite(closed) else "unstable"
             if integrator != "explicit":
-                measured = least_in_mujoco(mass, integrator)
+                measured = smallest_mass_in_mujoco(mass, integrator)
                 checks.append(
                     Check(
                         quantity=f"{what}b at the limit of stability",

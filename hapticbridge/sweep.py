@@ -1,10 +1,19 @@
-"""A function applied to many points on any executor, resumed from a file of results."""
+"""Sweeps: a function applied to many points on any executor, resumed from a file of results.
+
+The file is JSON Lines. Its first line names the function, the versions of hapticbridge and MuJoCo
+and a digest of the package's sources. Each other line holds one ``point`` with its ``results`` and
+``error``. A line that was cut by a crash is skipped, and its point is computed again.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import csv
 import functools
+import hashlib
+import itertools
+import json
 import math
 import multiprocessing
 import os
@@ -12,7 +21,7 @@ import pickle
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -22,15 +31,357 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from multiprocessing import connection
 from multiprocessing.synchronize import Barrier
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from hapticbridge.errors import StudyError
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.errors import StudyError, choices
 from hapticbridge.files import import_extra
 from hapticbridge.signals import holding_interrupts
-from hapticbridge.sweep.points import Point, Value, checked_points, plain, point_key
-from hapticbridge.sweep.results import Interrupted, Outcome, ResultFile, Table, table_of
+
+# Points: checked mappings of parameters, their keys, and grids of them
+
+Value = float | int | bool | str
+"""Type of a parameter or a result: a number, a flag or text."""
+
+Point = dict[str, Value]
+"""Parameters of one evaluation by name."""
+
+
+def plain(value: object) -> Value:
+    """Converts a value to Python's own float, int, bool or str.
+
+    Every NaN becomes the same NaN, so that equal tables are equal in their bits.
+
+    Raises:
+        ValueError: The value has another type, is an integer beyond 64 bits, or is text that
+            has no UTF-8 form.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ValueError(f"the integer {value:.3e} does not fit into 64 bits")
+    if isinstance(value, float):
+        return math.nan if math.isnan(value) else float(value)
+    if isinstance(value, str):
+        value.encode()
+    if isinstance(value, bool | int | str):
+        return value
+    raise ValueError(f"{value!r:.60} is neither a number nor a flag nor text")
+
+
+def point_key(point: Mapping[str, Value]) -> str:
+    """Returns the key of a point: its names in order with their values, as JSON.
+
+    Floats enter with all their digits, so 0.1 + 0.2 and 0.3 are two points. 1, 1.0 and True are
+    three points, because a function may distinguish them.
+    """
+    return json.dumps(point, sort_keys=True)
+
+
+def grid(**axes: object) -> list[Point]:
+    """Combines the values of several axes; the last axis varies fastest.
+
+    Args:
+        axes: For each parameter its values, or one value for all points.
+
+    Raises:
+        StudyError: There is no axis, an axis is empty or not one-dimensional, or a value is not a
+            finite number, a flag or text.
+    """
+    if not axes:
+        raise StudyError("a grid needs at least one axis")
+    values = []
+    for name, axis in axes.items():
+        is_single = isinstance(axis, str | bytes) or not isinstance(axis, Iterable)
+        row = [axis] if is_single else list(axis)  # type: ignore[call-overload]
+        if not row:
+            raise StudyError(f"axis '{name}' is empty; it must hold at least one value")
+        values.append([_parameter(value, f"axis '{name}'") for value in row])
+    return [dict(zip(axes, combined, strict=True)) for combined in itertools.product(*values)]
+
+
+def checked_points(points: Iterable[Mapping[str, object]]) -> dict[str, Point]:
+    """Returns points by their keys, in order, with plain values.
+
+    Raises:
+        StudyError: There is no point, a point is no mapping, repeats another one or has other
+            parameters than the first, or a value is out of range. The message names the point.
+    """
+    found: dict[str, Point] = {}
+    names: list[str] = []
+    for number, raw in enumerate(points):
+        if not isinstance(raw, Mapping) or not raw:
+            raise StudyError(f"point {number} is {raw!r:.60}; it must be a mapping of parameters")
+        point = {
+            name: _parameter(value, f"point {number}: parameter '{name}'")
+            for name, value in raw.items()
+        }
+        names = names or sorted(point)
+        if sorted(point) != names:
+            raise StudyError(
+                f"point {number} has the parameters {', '.join(point)}; the first point has "
+                f"{', '.join(names)}"
+            )
+        if "error" in point:
+            raise StudyError("no parameter may be named 'error': the sweep adds that column")
+        if point_key(point) in found:
+            raise StudyError(f"point {number} is there twice: {point!r:.200}")
+        found[point_key(point)] = point
+    if not found:
+        raise StudyError("there are no points; a sweep needs at least one")
+    return found
+
+
+def _parameter(value: object, place: str) -> Value:
+    try:
+        found = plain(value)
+    except ValueError as error:
+        raise StudyError(f"{place}: {error}") from None
+    if isinstance(found, float) and not math.isfinite(found):
+        raise StudyError(f"{place} is {found}; it must be finite")
+    return found
+
+
+# Results: the table of all points, and the file that keeps them between runs
+
+FORMATS = ("csv", "parquet")
+
+
+class Outcome(NamedTuple):
+    """Results of one point.
+
+    Attributes:
+        results: Values that the function returned; empty if it failed.
+        error: Type and message of the failure; empty if there was none.
+    """
+
+    results: Mapping[str, Value]
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Columns of equal length, one row per point, in the order of the points.
+
+    A column holds int64, float64, bool, or Python's text (dtype object). Where a point failed,
+    its numbers and flags are NaN and its text is empty, so an integer or flag column with a
+    failed point is float64. ``table.select(~table.failed)`` leaves such rows out.
+
+    Attributes:
+        columns: The parameters, the results in order of first appearance, and ``error``.
+    """
+
+    columns: Mapping[str, NDArray[Any]]
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Returns a column.
+
+        Raises:
+            StudyError: There is no such column.
+        """
+        try:
+            return self.columns[name]
+        except KeyError:
+            raise StudyError(
+                f"the table has no column {name!r:.60}; it has {choices(self.columns)}"
+            ) from None
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """Returns a column of numbers; NaN throughout where no point returned such a result."""
+        return np.asarray(self.columns.get(name, np.full(len(self), np.nan)), dtype=np.float64)
+
+    def texts(self, name: str) -> NDArray[np.object_]:
+        """Returns a column of text; empty texts where no point returned such a result."""
+        return np.asarray(self.columns.get(name, np.full(len(self), "")), dtype=object)
+
+    def __len__(self) -> int:
+        return len(self.columns["error"])
+
+    @property
+    def failed(self) -> NDArray[np.bool_]:
+        """Mask of the points whose function failed; shape (rows,)."""
+        return np.asarray(self.columns["error"] != "", dtype=bool)
+
+    def select(self, rows: NDArray[Any]) -> Table:
+        """Returns a table of the rows selected by a mask or by their numbers; types stay."""
+        return Table({name: column[rows] for name, column in self.columns.items()})
+
+    def write(self, path: str | os.PathLike[str], units: Mapping[str, str] | None = None) -> None:
+        """Writes the table to one file, CSV or Parquet by the name's end.
+
+        Numbers in CSV have as many digits as bring back the same double.
+
+        Args:
+            path: The file.
+            units: Unit of a column by its name; Parquet keeps it as metadata ``unit``.
+
+        Raises:
+            StudyError: The ending is unknown, pyarrow is missing, or the file cannot be written.
+        """
+        path = Path(path)
+        check_format(form := path.suffix.removeprefix("."))
+        columns = {name: column.tolist() for name, column in self.columns.items()}
+        try:
+            if form == "csv":
+                with path.open("w", newline="", encoding="utf-8") as file:
+                    # quoted text: a lone carriage return in it would end the row otherwise
+                    writer = csv.writer(file, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
+                    writer.writerow(columns)
+                    writer.writerows(zip(*columns.values(), strict=True))
+            else:
+                _write_parquet(columns, path, units or {})
+        except OSError as error:
+            raise StudyError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+class Interrupted(KeyboardInterrupt):
+    """Interruption of a sweep by Ctrl-C.
+
+    Attributes:
+        table: One row for each point that was computed, at least one, in the order of the
+            points.
+    """
+
+    def __init__(self, table: Table) -> None:
+        super().__init__()
+        self.table = table
+
+
+def table_of(points: Sequence[Point], outcomes: Sequence[Outcome]) -> Table:
+    """Returns the table of points and their outcomes, in order."""
+    results = dict.fromkeys(name for done in outcomes for name in done.results)
+    columns = {name: _column([point[name] for point in points]) for name in points[0]}
+    columns |= {name: _column([done.results.get(name) for done in outcomes]) for name in results}
+    columns["error"] = np.array([done.error for done in outcomes], dtype=object)
+    return Table(columns)
+
+
+def check_format(name: str) -> None:
+    """Refuses a format that does not exist or cannot be written here.
+
+    Raises:
+        StudyError: The format is unknown, or pyarrow is not installed.
+    """
+    if name not in FORMATS:
+        raise StudyError(f"format {name!r:.60} is unknown; the formats are {choices(FORMATS)}")
+    if name == "parquet":
+        import_extra("pyarrow", "Parquet", "tables", StudyError)
+
+
+def _write_parquet(
+    columns: Mapping[str, list[Value]], path: Path, units: Mapping[str, str]
+) -> None:
+    arrow = import_extra("pyarrow", "Parquet", "tables", StudyError)
+    parquet = import_extra("pyarrow.parquet", "Parquet", "tables", StudyError)
+    arrays = [arrow.array(values, from_pandas=False) for values in columns.values()]
+    fields = [
+        arrow.field(name, array.type, metadata={"unit": units[name]} if name in units else None)
+        for name, array in zip(columns, arrays, strict=True)
+    ]
+    parquet.write_table(arrow.table(arrays, schema=arrow.schema(fields)), path)
+
+
+def _column(values: Sequence[Value | None]) -> NDArray[Any]:
+    """Returns a column of one type: text if any value is, else the widest of the numbers."""
+    types = {type(value) for value in values}
+    if str in types:
+        return np.array(["" if value is None else str(value) for value in values], dtype=object)
+    if float in types or type(None) in types:
+        return np.array([math.nan if v is None else float(v) for v in values], dtype=np.float64)
+    return np.array(values, dtype=np.int64 if int in types else np.bool_)
+
+
+class ResultFile:
+    """The results of one sweep on disk.
+
+    Raises:
+        StudyError: The file cannot be read or written, or holds another sweep.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], function: str) -> None:
+        self.path = Path(path)
+        identity = {
+            "function": function,
+            "hapticbridge": version("hapticbridge"),
+            "mujoco": version("mujoco"),
+            "sources": _sources(),
+        }
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a+b") as file:
+                file.seek(0)
+                first, *self._lines = file.read().split(b"\n")
+                if not first:
+                    file.write(json.dumps(identity).encode() + b"\n")
+                elif self._lines and self._lines[-1]:
+                    file.write(b"\n")  # ends a line that a crash has cut
+        except OSError as error:
+            raise StudyError(f"{self.path}: cannot be written ({error.strerror})") from None
+        found = _parsed(first) if first else identity
+        if found != identity:
+            raise StudyError(
+                f"{self.path}: holds a sweep of {found.get('function')!s:.200} by hapticbridge "
+                f"{found.get('hapticbridge')!s:.40}, not of {function:.200} by "
+                f"{identity['hapticbridge']}, or by other sources or another MuJoCo than now; "
+                "give another folder, or delete this file to start anew"
+            )
+
+    def read(self, wanted: Collection[str]) -> dict[str, Outcome]:
+        """Returns the outcomes of some points, by the points' keys."""
+        found = {}
+        for line in filter(None, map(_parsed, self._lines)):
+            if (key := point_key(line["point"])) in wanted:
+                found[key] = Outcome(line["results"], line["error"])
+        return found
+
+    def add(self, points: Sequence[Point], outcomes: Sequence[Outcome]) -> None:
+        """Appends points and their outcomes.
+
+        Raises:
+            StudyError: The file cannot be written.
+        """
+        lines = [
+            json.dumps({"point": point, "results": dict(done.results), "error": done.error}) + "\n"
+            for point, done in zip(points, outcomes, strict=True)
+        ]
+        try:
+            with self.path.open("a", encoding="ascii") as file:
+                file.writelines(lines)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise StudyError(f"{self.path}: cannot be written ({error.strerror})") from None
+
+
+def _parsed(line: bytes) -> dict[str, Any]:
+    """Returns the JSON object on a line, or an empty one if the line holds none."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+@cache
+def _sources() -> str:
+    """Returns a digest of the package's sources and shipped scenes: they decide the results."""
+    digest = hashlib.blake2b(digest_size=16)
+    package = Path(__file__).parents[1]
+    for path in sorted(package.rglob("*")):
+        if path.suffix in {".py", ".xml"}:
+            digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+# Evaluation of the points
 
 WORKER_DIED = "WorkerDied: its process ended twice while it computed this point"
 
