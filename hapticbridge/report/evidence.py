@@ -115,14 +115,15 @@ def draw_recording(*hands: Recording) -> Figure:
         RecordingError: The recording has no tick, no run parameters, or a number that cannot be
             drawn.
     """
-    figure = new_figure(8 if len(hands) == 1 else 5.5 * len(hands), 8)
+    has_several_hands = len(hands) > 1
+    figure = new_figure(5.5 * len(hands) if has_several_hands else 8, 8)
     columns = figure.subplots(3, len(hands), sharex=True, squeeze=False).T
     for recording, panels in zip(hands, columns, strict=True):
-        _draw_hand(recording, panels, is_alone=len(hands) == 1)
+        _draw_hand(recording, panels, has_several_hands=has_several_hands)
     meta = hands[0].meta
     method, period = method_of(meta), parameters_of(meta).period
     title = printable(f"{meta.get('scene', '')}: method {method.name}, {1 / period:g} Hz")
-    if len(hands) == 1:
+    if not has_several_hands:
         title += f"\n{_coupling_sentence(hands[0])}"
     figure.suptitle(title, fontsize="medium", parse_math=False)
     return figure
@@ -149,7 +150,9 @@ def _coupling_sentence(recording: Recording) -> str:
     return recorded_coupling(recording).sentences()[0]
 
 
-def _draw_hand(recording: Recording, panels: NDArray[np.object_], *, is_alone: bool) -> None:
+def _draw_hand(
+    recording: Recording, panels: NDArray[np.object_], *, has_several_hands: bool
+) -> None:
     ticks, meta = recording.ticks, recording.meta
     if not len(ticks):
         raise RecordingError(f"'{recording.path}' has no tick to draw")
@@ -186,7 +189,7 @@ def _draw_hand(recording: Recording, panels: NDArray[np.object_], *, is_alone: b
     energy_axes.set_xlabel("time (s)")
     for axes in panels:
         finish(axes)
-    if not is_alone:
+    if has_several_hands:
         head = f"{printable(parameters.grip)}: {_coupling_sentence(recording)}"
         head = head.partition(" effective")[0]
         force_axes.set_title(head, fontsize="small", loc="left", pad=46, parse_math=False)
