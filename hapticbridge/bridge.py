@@ -154,7 +154,7 @@ class Bridge:
         options: BridgeOptions,
     ) -> None:
         loaded = scene if isinstance(scene, Scene) else load_scene(scene)
-        if loaded.other_grips:
+        if loaded.has_several_hands:
             grips = choices((loaded.grip, *loaded.other_grips))
             raise SceneError(
                 f"scene '{loaded.name}' was loaded with {1 + len(loaded.other_grips)} grips, and "

@@ -147,7 +147,7 @@ class Stage:
     ) -> None:
         hands: tuple[RecordingFile, ...]
         if isinstance(path, RecordingFile):
-            hands = (path,) if path.hands == 1 else open_hands(path.path)
+            hands = open_hands(path.path) if path.has_several_hands else (path,)
         else:
             hands = open_hands(path)
         opened = hands[0]
@@ -220,7 +220,7 @@ class Stage:
                 self._block, self._at = next(self._rest), 0
             end = min(len(self._block), self._at + tick + 1 - self._run.done)
             recorded = self._block[self._at : end]
-            again = self._run.add(recorded if len(self._hands) > 1 else recorded[:, 0])
+            again = self._run.add(recorded if self.recording.has_several_hands else recorded[:, 0])
             self._refuse_another_run(recorded, again.reshape(-1, len(self._hands)))
             passed.append(recorded[:, 0])
             self._at, self.rows, self.row = end, recorded[-1], recorded[-1:, 0]

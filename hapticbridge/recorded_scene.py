@@ -65,8 +65,8 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
     The machine code of its method is loaded here first: the child inherits it.
     """
     method = method_of(recording.meta)
-    is_of_hands = "hands" in recording.meta
-    load_machine_code(method.name, method.contact, parameters.scene_ticks > 0, is_of_hands)
+    is_slow = parameters.scene_ticks > 0
+    load_machine_code(method.name, method.contact, is_slow, recording.has_several_hands)
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
@@ -74,7 +74,9 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
 
 
 @cache
-def load_machine_code(name: str, contact: str, is_slow: bool, is_of_hands: bool = False) -> None:
+def load_machine_code(
+    name: str, contact: str, is_slow: bool, has_several_hands: bool = False
+) -> None:
     """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
     A child process may not write it, and each would load it again.
@@ -88,7 +90,7 @@ def load_machine_code(name: str, contact: str, is_slow: bool, is_of_hands: bool 
         parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
-        if is_of_hands:
+        if has_several_hands:
             hands = BoundHands(scene.model, scene.data, [parameters])
             alone = np.zeros((1, 1), SAMPLE_DTYPE)
             alone["quaternion"][..., 0] = 1.0

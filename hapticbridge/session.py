@@ -372,7 +372,7 @@ class Session:
     def _prepare(self) -> Coupling | None:
         """Prepares the scene; returns the measured coupling of a weld."""
         setup, scene = self.setup, self.setup.scene
-        if len(self._setups) == 1:
+        if not self.setup.scene.has_several_hands:
             pace = setup.scene_period, setup.substeps
             return prepare(scene, setup.coupling, *pace, setup.method)
         self._update_scenes()  # the model may have been replaced since they were resolved
@@ -393,7 +393,7 @@ class Session:
 
     def _parameters(self, effective: Coupling | None) -> list[RunParameters]:
         """Returns the parameters of each hand; a tool that is too heavy for one is carried."""
-        if len(self._setups) == 1:
+        if not self.setup.scene.has_several_hands:
             return [self.setup.holding(self.kernel.sample, effective)]
         for _ in range(2):
             pairs = zip(self._setups, self._samples(), strict=True)
@@ -422,7 +422,7 @@ class Session:
         for hand, (each, own) in enumerate(zip(self._setups, self._samples(), strict=True)):
             if each.workspace.absolute:
                 state = self.kernel.state[hand : hand + 1]
-                grip = each.scene.grip if len(self._setups) > 1 else ""
+                grip = each.scene.grip if self.setup.scene.has_several_hands else ""
                 refuse_stretched_start(state, own, each.limits, grip)
 
     def _description(self) -> dict[str, str]:

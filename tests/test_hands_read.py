@@ -16,7 +16,8 @@ from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.film import Shot, still
 from hapticbridge.recording.reader import open_hands, read_hands
 from hapticbridge.recording.recorder import salvage
-from hapticbridge.report.evidence import Evidence, draw_recording
+from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.plots import draw_recording
 from hapticbridge.run_description import requested_of
 from hapticbridge.whatif import what_if
 

@@ -30,7 +30,7 @@ from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import Cause, likely_cause, what_would_do
-from hapticbridge.report.evidence import Evidence, decimated, draw_recording
+from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import (
     MAX_EVENTS,
     MAX_INPUTS,
@@ -39,7 +39,14 @@ from hapticbridge.report.page import (
     is_warned,
     notes,
 )
-from hapticbridge.report.plots import BINS, activities, draw_motion, draw_timing
+from hapticbridge.report.plots import (
+    PAGE_BINS,
+    activities,
+    decimated,
+    draw_motion,
+    draw_recording,
+    draw_timing,
+)
 from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")
@@ -78,7 +85,7 @@ def test_a_long_page_stays_small_and_keeps_its_peaks(run_file: Path, tmp_path: P
     ticks["wrench_on_tool"][12_345, 0] = 77.0
     recording, page = changed(quiet, ticks=ticks), tmp_path / "page.html"
     line = draw_motion(evidence_of(recording)).axes[0].get_lines()[0]
-    assert len(np.asarray(line.get_ydata())) <= 2 * BINS + 1
+    assert len(np.asarray(line.get_ydata())) <= 2 * PAGE_BINS + 1
     assert np.asarray(line.get_ydata()).max() == 77.0
     write_report(recording, audit(run_file), page)
     assert 100_000 < page.stat().st_size < 1_000_000  # curves are of constant length

@@ -75,7 +75,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     """
     coupling, method, substeps = setup.coupling, setup.method, setup.substeps
     scene, device = escape(setup.scene.name), escape(setup.info.name)
-    at = f" at '{escape(setup.scene.grip)}'" if setup.scene.other_grips else ""
+    at = f" at '{escape(setup.scene.grip)}'" if setup.scene.has_several_hands else ""
     err.print(
         f"[bold]{scene}[/bold]{at} on {device}, {1 / setup.period:g} Hz, method {method.name}, "
         f"{method.contact} contacts"
@@ -96,7 +96,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         err.print(f"  {method.name}: {escape(method.about)}")
     elif method.name != usual.name and setup.scene.hand == 0:
         lacking = f"takes one MuJoCo step a tick, and this run {substeps}"
-        reason = "has one hand, without a grip axis" if setup.scene.other_grips else lacking
+        reason = "has one hand, without a grip axis" if setup.scene.has_several_hands else lacking
         err.print(f"  {method.name}, because {usual.name} {reason}")
     if method.hazard:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")

@@ -309,6 +309,11 @@ class RecordingFile:
     kept: NDArray[np.void] | None = field(default=None, repr=False, compare=False)
 
     @property
+    def has_several_hands(self) -> bool:
+        """True if several hands hold the scene."""
+        return self.hands > 1
+
+    @property
     def digest(self) -> str | None:
         """SHA-256 stored at the end, or None."""
         return self.seal.get(DIGEST)
@@ -359,7 +364,7 @@ class RecordingFile:
             nonlocal held
             if hand != self.hand:
                 return
-            if self.hands > 1 and self.is_cut:  # it may hold more records of one hand
+            if self.has_several_hands and self.is_cut:  # it may hold more records of one hand
                 run = run[: self.count - found - held]
             runs.append(run)
             held += run.size  # a sum over all runs in every part would be quadratic

@@ -488,7 +488,7 @@ def excess_of(
 
     ``in_process`` is as for ``likely_cause``.
     """
-    if evidence.recording.hands > 1:
+    if evidence.recording.has_several_hands:
         return None
     cause = likely_cause(evidence, report, in_process=in_process)
     if cause is None or report.tick is None:

@@ -21,12 +21,13 @@ from hapticbridge.plotting import inline_svg
 from hapticbridge.record import TickFlag, due_times
 from hapticbridge.recording import Recording
 from hapticbridge.report.cause import excess_of
-from hapticbridge.report.evidence import Evidence, draw_recording
+from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.plots import (
     activities,
     draw_energies,
     draw_moment,
     draw_motion,
+    draw_recording,
     draw_timing,
 )
 from hapticbridge.run_description import meta_float

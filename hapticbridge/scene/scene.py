@@ -119,6 +119,11 @@ class Scene:
         return self if hand == 0 else replace(self, grip=self.other_grips[hand - 1], hand=hand)
 
     @property
+    def has_several_hands(self) -> bool:
+        """True if several hands hold the scene."""
+        return bool(self.other_grips)
+
+    @property
     def joint(self) -> int:
         """Id of the joint that the hand holds; -1 if it holds a site."""
         return held_joint(self.model, self.grip)

@@ -220,7 +220,7 @@ class Controls:
         server: Server of the page.
         allowance: Coupling limits of the device.
         ask: Forwards a command.
-        is_alone: False for a run of several hands, which can only be stopped.
+        has_several_hands: True for a run of several hands, which can only be stopped.
 
     Attributes:
         answer: Text element with the bridge's answer to the last request.
@@ -232,7 +232,7 @@ class Controls:
         allowance: CouplingLimits,
         ask: Callable[[Command], None],
         *,
-        is_alone: bool = True,
+        has_several_hands: bool = False,
     ) -> None:
         self._allowance, self._ask = allowance, ask
         self._touched = 0.0
@@ -240,18 +240,18 @@ class Controls:
         self._turn = threading.Lock()
         self._sliders: tuple[Sliders, ...] = ()
         self._said = {"recording": "", "force": "", "answer": ""}
-        gui = server.gui
+        gui, is_single = server.gui, not has_several_hands
         with gui.add_folder("control"):
             stop = gui.add_button("stop the run", color="red")
-            if allowance.method.has_law and is_alone:
+            if allowance.method.has_law and is_single:
                 self._sliders = tuple(Sliders(gui, s, self._want) for s in allowance.spans)
                 self._bounds = gui.add_markdown(self._ends())
-            self._force = gui.add_checkbox("force", initial_value=True, visible=is_alone)
+            self._force = gui.add_checkbox("force", initial_value=True, visible=is_single)
             self._clutch = gui.add_checkbox(
-                "clutch (the hand moves alone)", initial_value=False, visible=is_alone
+                "clutch (the hand moves alone)", initial_value=False, visible=is_single
             )
-            reset = gui.add_button("back to the start", visible=is_alone)
-            mark = gui.add_button("mark this moment", visible=is_alone)
+            reset = gui.add_button("back to the start", visible=is_single)
+            mark = gui.add_button("mark this moment", visible=is_single)
             self.answer = gui.add_markdown("")
         # state of the run, now or after the waiting commands
         self._gains = [sliders.span.gains(allowance.start) for sliders in self._sliders]

@@ -140,6 +140,7 @@ def run_of(metadata: dict[str, str], files: dict[str, bytes]) -> RecordingFile:
         meta=metadata,
         attachments=files,
         is_cut=True,
+        hands=1 + len(further_hands(metadata)),
     )
 
 
@@ -216,10 +217,10 @@ def run() -> None:
         server = serve(address)
         outlet = Outlet(answers.fileno())
         page = Page(server, live.scenery, live.parameters, dict(run.meta))
-        is_alone = not further_hands(run.meta)
         if job["has_hand"]:
             add_hand(server, live.parameters, live.scenery.extent, outlet.drag)
-        controls = Controls(server, allowance_of(run.meta), outlet.ask, is_alone=is_alone)
+        several = run.has_several_hands
+        controls = Controls(server, allowance_of(run.meta), outlet.ask, has_several_hands=several)
         page.add_curves()
     except HapticBridgeError as error:
         print(json.dumps({"error": str(error)}), file=answers, flush=True)

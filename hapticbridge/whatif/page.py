@@ -16,16 +16,14 @@ from hapticbridge.kernel.codes import JOINT
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.record import due_times
 from hapticbridge.rendering import RunCoupling
-from hapticbridge.report import DRAWABLE, decimated
 from hapticbridge.report.evidence import (
-    BINS,
+    DRAWABLE,
     Evidence,
-    finish,
     is_motion_prescribed,
     recorded_coupling,
 )
 from hapticbridge.report.page import moment_of, write_page
-from hapticbridge.report.plots import BINS as PLOT_BINS
+from hapticbridge.report.plots import PAGE_BINS, PICTURE_BINS, decimated, finish
 from hapticbridge.units import format_energy, format_share, format_si, shown_energies
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
@@ -109,7 +107,7 @@ _STYLES = (("#555555", "-", 2.2), ("#1a5fb4", "-", 1.1), ("#b3261e", "--", 1.1))
 """Colour, line and width in points of each run; the recorded one lies behind the others."""
 
 
-def figure_of(found: WhatIf, bins: int = BINS) -> Figure:
+def figure_of(found: WhatIf, bins: int = PICTURE_BINS) -> Figure:
     """Draws force, handle displacement, and the energies of both ports over time.
 
     The force is that on the hand; on the tool if the recorded motion was prescribed.
@@ -189,7 +187,7 @@ def write_what_if(found: WhatIf, path: Path, scene: bytes | None = None) -> None
         RecordingError: The page cannot be written, or not under this name.
     """
     try:
-        drawn = inline_svg(figure_of(found, PLOT_BINS))
+        drawn = inline_svg(figure_of(found, PAGE_BINS))
     except RecordingError:  # a run that cannot be drawn still has a verdict
         drawn = ""
     write_page(

@@ -292,7 +292,7 @@ Event = Mapping[str, Any]
 
 
 @cache
-def load_bridge_code(method: str, contact: str, is_slow: bool, is_of_hands: bool) -> None:
+def load_bridge_code(method: str, contact: str, is_slow: bool, has_several_hands: bool) -> None:
     """Loads the machine code of a bridge, which is first compiled and kept on disk if missing.
 
     A child process may not write it (``recorded_scene.load_machine_code``).
@@ -300,8 +300,8 @@ def load_bridge_code(method: str, contact: str, is_slow: bool, is_of_hands: bool
     options: dict[str, Any] = {"method": method, "contact": contact, "clock": SimulatedClock()}
     if is_slow:
         options["scene_rate"] = 500.0
-    scene = "plug_and_socket" if is_of_hands else "point_mass"
-    devices = [Grasp("plug"), Grasp("socket")] if is_of_hands else "simulated"
+    scene = "plug_and_socket" if has_several_hands else "point_mass"
+    devices = [Grasp("plug"), Grasp("socket")] if has_several_hands else "simulated"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with Bridge(scene, devices, i_know=True, **options) as bridge:
@@ -319,6 +319,7 @@ class Repetition:
     def __init__(self, hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> None:
         self._hands, self._settings = tuple(hands), tuple(settings)
         self._run, self.settings = self._hands[0], self._settings[0]
+        self._has_several_hands = len(self._hands) > 1
         self._per_tick = 1.0
         self.warned: tuple[str, ...] = ()
 
@@ -373,7 +374,7 @@ class Repetition:
             for hand, each in zip(self._hands, self._settings, strict=True)
         ]
         scene = scene_of(self._hands, settings)
-        if len(self._hands) == 1:
+        if not self._has_several_hands:
             return Bridge(scene, devices[0], settings.coupling, **common, **own[0])
         grasps = [
             Grasp(hand.parameters.grip, device, coupling=each.coupling, **chosen)
@@ -418,7 +419,7 @@ class Repetition:
 
     def _was_tripped_by_state(self) -> bool:
         last = len(self._run.ticks)
-        grips = [hand.parameters.grip for hand in self._hands] if len(self._hands) > 1 else [""]
+        grips = [hand.parameters.grip if self._has_several_hands else "" for hand in self._hands]
         return self._run.trip in [
             trip_reason(code, last, grip) for code in _BY_STATE for grip in grips
         ]

@@ -203,6 +203,11 @@ class _Experiment:
         """The recorded run; of several hands, the first's."""
         return self.hands[0]
 
+    @property
+    def has_several_hands(self) -> bool:
+        """True if several hands hold the scene."""
+        return len(self.hands) > 1
+
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
         """Runs all repetitions and returns the result."""
         run, settings = self.run, [hand.settings for hand in self.hands]
@@ -251,7 +256,7 @@ class _Experiment:
         return ""
 
     def _at(self, hand: RecordedRun) -> str:
-        return f" at '{hand.parameters.grip}'" if len(self.hands) > 1 else ""
+        return f" at '{hand.parameters.grip}'" if self.has_several_hands else ""
 
     def _peaks(self, recordings: Sequence[Recording]) -> dict[str, float]:
         return {
@@ -296,9 +301,8 @@ class _Experiment:
             period, trip = repetition.into(path, devices_in(scene), clock)
             return period, trip, repetition.warned
 
-        load_bridge_code(
-            new.method.name, new.method.contact, new.scene_rate < new.rate, len(self.hands) > 1
-        )
+        method, is_slow = new.method, new.scene_rate < new.rate
+        load_bridge_code(method.name, method.contact, is_slow, self.has_several_hands)
         old = run.settings
         steps = new.rate * new.substeps / (old.rate * old.substeps)
         period, trip, warned = self._in_bounds(work, max(1.0, steps))
