@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from hapticbridge.files import atomic_write
 from hapticbridge.plotting import inline_svg
 from hapticbridge.record import due_times
 from hapticbridge.recording import Recording
-from hapticbridge.report.cause import excess_of
+from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence, draw_recording
 from hapticbridge.report.facts import (
     balance_of,
@@ -195,10 +195,16 @@ def write_report(
         run=run,
         moment=moment,
         lead=lead_sentence(report, None if moment is None else moment["excess"].worst),
-        notes=notes(report),
+        notes=[*notes(report), *_trip_notes(recording, report, in_process=in_process)],
         is_warned=is_warned(report),
         curves="" if evidence is not None else _bare_curves(recording, *others),
     )
+
+
+def _trip_notes(recording: Recording, report: AuditReport, *, in_process: bool) -> Iterator[str]:
+    cause = pump_behind_trip(recording, report, in_process=in_process)
+    if cause is not None:
+        yield f"Likely cause: {cause.kind}. {cause.evidence}. What to change: {cause.remedy}."
 
 
 def _bare_curves(*hands: Recording) -> str:
