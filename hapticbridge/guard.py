@@ -348,6 +348,15 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0) -> str:
     return ""
 
 
+def may_be_pumped(reason: str) -> bool:
+    """Returns True for a trip that a part of the scene can cause by pushing what moves.
+
+    ``reason`` is as for ``trip_remedy``.
+    """
+    reasons = _DIVERGED, *(_REASONS[code] for code in (STRETCHED, TWISTED, GAVE_ENERGY))
+    return reason.endswith(reasons)
+
+
 CONTROLLERS = {"damper": DAMPER, "environment": ENVIRONMENT, "off": OFF}
 """Passivity controllers by name."""
 

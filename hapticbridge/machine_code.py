@@ -259,15 +259,18 @@ class _Definition(ctypes.Structure):
     )
 
 
-_new_function = ctypes.PYFUNCTYPE(ctypes.py_object, *3 * (ctypes.c_void_p,))(
-    ("PyCFunction_NewEx", ctypes.pythonapi)
-)
+_new_function = ctypes.PYFUNCTYPE(
+    ctypes.py_object, ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p
+)(("PyCFunction_NewEx", ctypes.pythonapi))
+"""Makes a function from a definition's address, the object that the function owns, and no module.
+Python reads the definition once more when it releases the function, so the function must own it:
+at the end of a process a module's list may be released before the function."""
 
 _numbers = count()
 """Numbers of libraries, whose names must differ."""
 
 _loaded: list[object] = []
-"""All that must live as long as the functions, which is as long as the process."""
+"""Libraries, which must live as long as their functions, which is as long as the process."""
 
 
 def load(code: bytes, name: str) -> Callable[..., Any]:
@@ -277,8 +280,8 @@ def load(code: bytes, name: str) -> Callable[..., Any]:
         RuntimeError: As ``address_of``.
     """
     definition = _Definition(name.encode(), address_of(code, name), _FAST_CALL, None)
-    _loaded.append(definition)
-    function: Callable[..., Any] = _new_function(ctypes.addressof(definition), None, None)
+    address = ctypes.addressof(definition)
+    function: Callable[..., Any] = _new_function(address, definition, None)
     return function
 
 

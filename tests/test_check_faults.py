@@ -31,6 +31,7 @@ from hapticbridge.check.case import Fault, length, open_case, weight
 from hapticbridge.check.contact_faults import shape_faults
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
+from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.physics import depth_under
 from hapticbridge.check.run_faults import find_faults
@@ -41,7 +42,7 @@ from hapticbridge.cli.main import USAGE_ERROR
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
-from hapticbridge.scene import read_scene, scene_names, scene_path
+from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
 """Faults in the motion to which a planted one may lead."""
@@ -551,3 +552,41 @@ def test_wrong_units_come_alone_because_all_else_follows_from_them(tmp_path: Pat
     )
     assert fault.kind == "units"
     assert "more findings wait until this is mended" in fault.sentence
+
+
+DRIVEN = """<mujoco><option timestep="0.001"/><worldbody>
+<body><joint name="x" type="slide" axis="1 0 0" damping="{damping}"/>
+<joint name="y" type="slide" axis="0 1 0" damping="2"/>
+<geom size="0.02" mass="0.5"/><site name="grip"/></body></worldbody>
+<tendon><fixed name="cable" damping="1"><joint joint="x" coef="2"/></fixed></tendon>
+<actuator><general name="motor" {attributes} biastype="{biastype}" biasprm="0 0 {bias}"/></actuator>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("driven", "limit"),
+    [
+        ('joint="x"', 8.0),
+        ('joint="x" gear="2"', 2.0),
+        ('tendon="cable"', 1.0 + 8.0 / 2**2),
+        ('site="grip" gear="1 0 0 0 0 0"', 8.0),
+        ('site="grip" gear="1 1 0 0 0 0"', 1 / (1 / 8.0 + 1 / 2.0)),
+        ('joint="x" damping="3"', 8.0 + 3.0),
+    ],
+)
+def test_a_motor_that_pushes_with_its_own_velocity_is_a_pump(
+    tmp_path: Path, driven: str, limit: float
+) -> None:
+    def found(name: str, **numbers: object) -> list[Fault]:
+        settings = {"damping": 8, "biastype": "affine", **numbers}
+        scene = tmp_path / f"{name}.xml"
+        scene.write_text(DRIVEN.format(attributes=driven, **settings))
+        source = read_scene(scene)
+        return [f for f in worst_faults(source, compile_scene(source)) if f.kind == "pump"]
+
+    assert not found("borne", bias=0.99 * limit)
+    (fault,) = found("faster", bias=1.01 * limit)
+    assert fault.place.element == "actuator 'motor'"
+    assert fault.place.line == 6
+    assert "pushes" in fault.sentence and "harder the faster it moves" in fault.sentence
+    assert not found("unused", bias=1.01 * limit, biastype="none")

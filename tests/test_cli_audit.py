@@ -262,3 +262,39 @@ def test_a_tripped_run_is_not_called_passive_alone(call: Called, tmp_path: Path)
     assert "likely cause" not in out
     assert "what to change: check the motion's unit (m) and speed" in out
     assert out.splitlines()[-1] == "next: hapticbridge guide faults"
+
+
+RUNAWAY = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
+<body><freejoint/><geom size="0.02" mass="0.2"/><site name="grip"/></body>
+<body pos="0 0 0.3"><joint name="spin"/><geom type="capsule" size="0.01 0.1" euler="0 90 0"/></body>
+</worldbody><actuator><general name="fan" {driven} biastype="affine" biasprm="0 0 {bias}"/>
+</actuator><keyframe><key name="home" qpos="0 0 0 1 0 0 0 0" qvel="0 0 0 0 0 0 0.1"/></keyframe>
+</mujoco>"""
+"""A tool beside a fan, and a motor that drives one of them."""
+
+
+@pytest.mark.parametrize(
+    ("driven", "bias", "reason"),
+    [
+        ('joint="spin"', 0.5, "the simulation is no longer finite"),
+        ('site="grip" gear="1 0 0 0 0 0"', 50, "more energy beyond what the hand put in"),
+    ],
+)
+def test_a_motor_that_runs_away_is_named_as_the_cause_of_a_trip(
+    call: Called, tmp_path: Path, driven: str, bias: float, reason: str
+) -> None:
+    scene, path, page = (tmp_path / name for name in ("fan.xml", "trip.mcap", "trip.html"))
+    scene.write_text(RUNAWAY.format(driven=driven, bias=bias))
+    assert call("run", scene, "--fast", "--duration", 5, "--record", path)[0] == 3
+    code, out, _ = call("audit", path, "--report", page)
+    assert code == 1
+    assert reason in out
+    cause = "pump. actuator 'fan' pushes "
+    assert f"likely cause: {cause}" in out
+    assert "harder the faster it moves (velocity bias " in out
+    assert "J of work until the trip" in out
+    assert "what to change: write a third number of at most 0 in its biasprm" in out
+    assert "Likely cause: pump. actuator &#39;fan&#39;" in page.read_text(encoding="utf-8")
+    # the sign of the velocity bias alone is at fault
+    scene.write_text(RUNAWAY.format(driven=driven, bias=-bias))
+    assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0

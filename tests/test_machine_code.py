@@ -340,3 +340,17 @@ def test_a_run_with_commands_needs_no_numba_once_its_code_is_on_disk() -> None:
             [sys.executable, "-c", RUN], capture_output=True, text=True, check=True
         )
     assert process.stdout == "False\n"
+
+
+END = """
+import hapticbridge as hb
+with hb.Bridge("point_mass", "simulated", clock=hb.SimulatedClock()) as bridge:
+    bridge.run(0.02)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc overwrites what is released")
+def test_functions_read_no_released_memory_when_the_process_ends() -> None:
+    overwriting = {"PYTHONMALLOC": "malloc", "MALLOC_PERTURB_": "255"}
+    process = subprocess.run([sys.executable, "-c", END], env=os.environ | overwriting, check=False)
+    assert process.returncode == 0

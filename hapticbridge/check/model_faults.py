@@ -31,6 +31,7 @@ from hapticbridge.check.physics import (
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.kernel.rigid_contact import LAST_RIGID
 from hapticbridge.scene import Scene, SceneSource
+from hapticbridge.scene.checks import OF_A_JOINT, pumps
 from hapticbridge.scene.contacts import (
     REFERENCE_STEPS,
     ROUNDING,
@@ -298,32 +299,10 @@ def _units(case: CompiledScene) -> Iterator[Fault]:
 
 def _pumps(case: CompiledScene) -> Iterator[Fault]:
     """Finds joints and motors that push what moves already: energy without end."""
-    model = case.model
-    for joint in range(model.njnt):
-        damping = float(model.dof_damping[model.jnt_dofadr[joint]])
-        place = case.places.joint(joint)
-        if damping < 0.0:
-            yield Fault(
-                "pump",
-                place,
-                f"{place.element} has a damping of {number(damping)}: it pushes what moves already",
-                'damping="0" or more',
-            )
-        for motor in range(model.nu):
-            is_there = int(model.actuator_trntype[motor]) in _OF_A_JOINT
-            if not is_there or model.actuator_trnid[motor, 0] != joint:
-                continue
-            gear = float(model.actuator_gear[motor, 0])
-            gain = gear * gear * float(model.actuator_biasprm[motor, 2])
-            if gain > max(damping, 0.0):
-                yield Fault(
-                    "pump",
-                    place,
-                    f"actuator '{model.actuator(motor).name}' pushes {place.element} harder the "
-                    f"faster it moves (velocity bias {number(gain)}, damping of the joint "
-                    f"{number(damping)})",
-                    "a third number of at most 0 in its biasprm",
-                )
+    case.scene.reset()
+    for pump in pumps(case.model, case.scene.data):
+        place = case.places.joint if pump.kind == "joint" else case.places.actuator
+        yield Fault("pump", place(pump.number), pump.words, pump.change)
 
 
 MOTOR_FORCE = 0.1
@@ -336,7 +315,7 @@ def _motors(case: CompiledScene) -> Iterator[Fault]:
     case.scene.reset()
     for motor in range(model.nu):
         force = float(data.actuator_force[motor]) * float(model.actuator_gear[motor, 0])
-        is_there = int(model.actuator_trntype[motor]) in _OF_A_JOINT
+        is_there = int(model.actuator_trntype[motor]) in OF_A_JOINT
         if not is_there or model.actuator_biasprm[motor, 1] != 0.0 or abs(force) < MOTOR_FORCE:
             continue
         joint = int(model.actuator_trnid[motor, 0])
@@ -351,10 +330,6 @@ def _motors(case: CompiledScene) -> Iterator[Fault]:
             "ctrl=\"0\" in keyframe 'home', or a smaller forcerange",
             is_note=True,
         )
-
-
-_OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-"""Transmissions of an actuator that acts on a joint."""
 
 
 def _angles(case: CompiledScene) -> Iterator[Fault]:

@@ -15,6 +15,18 @@ _TAGS = {
     "joint": ("joint", "freejoint"),
     "equality": ("connect", "weld", "joint", "tendon", "flex", "flexvert", "flexstrain"),
     "tendon": ("spatial", "fixed"),
+    "actuator": (
+        "general",
+        "motor",
+        "position",
+        "velocity",
+        "intvelocity",
+        "damper",
+        "cylinder",
+        "muscle",
+        "adhesion",
+        "plugin",
+    ),
 }
 """Tags of a kind of element where they differ from its name."""
 
@@ -85,6 +97,10 @@ class Places:
     def tendon(self, tendon_id: int) -> Place:
         """Returns the place of a tendon."""
         return self._find("tendon", tendon_id)
+
+    def actuator(self, actuator_id: int) -> Place:
+        """Returns the place of an actuator."""
+        return self._find("actuator", actuator_id)
 
     def pair(self, pair_id: int) -> Place:
         """Returns the place of an explicit pair of geoms."""

@@ -32,7 +32,7 @@ from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.reader import CUT, read_hands
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
-from hapticbridge.report.cause import excess_of
+from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.units import energy_rows, format_energy
@@ -227,7 +227,7 @@ class Audit:
         """Prints the largest excess of an active run, or a trip, and what to change."""
         if report.verdict != "active":
             if "trip" in report.events:
-                _print_trip(report)
+                self._print_trip(report)
             return
         evidence = Evidence.of(read_recording(report.path, 0))
         excess = evidence and excess_of(evidence, report, in_process=self.in_process)
@@ -239,6 +239,20 @@ class Audit:
             out.print(f"likely cause: {plain(f'{excess.cause.kind}. {excess.cause.evidence}')}")
             out.print(f"what to change: {plain(excess.cause.remedy)}")
         out.print("next: hapticbridge guide active-verdict")
+
+    def _print_trip(self, report: AuditReport) -> None:
+        """Prints what to change after a trip of a run that was passive until then."""
+        recording = read_recording(report.path, 0)
+        cause = pump_behind_trip(recording, report, in_process=self.in_process)
+        if cause is not None:
+            out.print(f"likely cause: {plain(f'{cause.kind}. {cause.evidence}')}")
+            remedy = cause.remedy
+        else:
+            names = "actuator_work", "environment_energy"
+            remedy = trip_remedy(report.reason, *(report.energies.get(name, 0.0) for name in names))
+        if remedy:
+            out.print(f"what to change: {plain(remedy)}")
+        out.print("next: hapticbridge guide faults")
 
     def _audit_many(self, files: list[Path]) -> int:
         if self.plot or self.report or self.what_if:
@@ -385,14 +399,6 @@ def _print_report(report: AuditReport) -> None:
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
     if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
         out.print(f"  {', '.join(energies)}")
-
-
-def _print_trip(report: AuditReport) -> None:
-    """Prints what to change after a trip of a run that was passive until then."""
-    energies = (report.energies.get(name, 0.0) for name in ("actuator_work", "environment_energy"))
-    if remedy := trip_remedy(report.reason, *energies):
-        out.print(f"what to change: {plain(remedy)}")
-    out.print("next: hapticbridge guide faults")
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,12 +26,16 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.confinement import Worker, in_bounds
 from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.guard import may_be_pumped
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded
+from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.scene.checks import Pump, pumps
 from hapticbridge.scene.contacts import check_contacts, geom_name
+from hapticbridge.units import format_energy
 
 Kind = Literal[
     "method",
@@ -368,8 +372,10 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
-    if pump := _pumping_joint(evidence.model):
-        return Cause("pump", f"{pump}; {where}", "a damping of 0 or more there")
+    pump = _first_pump(evidence.model)
+    # a motor's work is no creation, until its motion is beyond all measure
+    if pump is not None and (pump.kind == "joint" or "trip" in report.events):
+        return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
@@ -381,13 +387,13 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
 
 
-def _pumping_joint(model: mujoco.MjModel | None) -> str:
-    """Returns a clause on the first joint that pushes what moves already; empty without one."""
-    if model is None or not np.any(model.dof_damping < 0.0):
-        return ""
-    dof = int(np.argmax(model.dof_damping < 0.0))
-    name, damping = model.joint(int(model.dof_jntid[dof])).name, float(model.dof_damping[dof])
-    return f"joint '{name}' has a damping of {damping:g}, and pushes what moves already"
+def _first_pump(model: mujoco.MjModel | None) -> Pump | None:
+    """Returns the first joint or actuator that pushes what moves already; None without one."""
+    if model is None:
+        return None
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return next(iter(pumps(model, data)), None)
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
@@ -516,16 +522,59 @@ def likely_cause(
         return None
     if report.port == "device":
         return cause_at_device(evidence, window)
-    recording, parameters = evidence.recording, evidence.parameters
+    try:
+        return _cause_in_scene(
+            evidence.recording,
+            lambda model: cause_in_environment(replace(evidence, model=model), report, window),
+            in_process,
+        )
+    except HapticBridgeError:
+        return cause_in_environment(evidence, report, window)
+
+
+def pump_behind_trip(
+    recording: Recording, report: AuditReport, *, in_process: bool = False
+) -> Cause | None:
+    """Returns a part of the scene that pumps as the likely cause of a trip; None without one.
+
+    An active run has a cause of its own (``likely_cause``). A run of several hands has none, nor a
+    trip for a fault of the device. ``in_process`` is as for ``likely_cause``.
+    """
+    has_tripped = "trip" in report.events and report.verdict != "active"
+    if not has_tripped or not may_be_pumped(report.reason) or recording.hands > 1:
+        return None
+    work = format_energy(report.energies.get("actuator_work", 0.0))
+
+    def found(model: mujoco.MjModel) -> Cause | None:
+        pump = _first_pump(model)
+        if pump is None:
+            return None
+        words = f"; the scene's motors did {work} of work until the trip"
+        evidence = pump.words + (words if pump.kind == "actuator" else "")
+        return Cause("pump", evidence, f"write {pump.change}")
+
+    try:
+        return _cause_in_scene(recording, found, in_process)
+    except HapticBridgeError:
+        return None
+
+
+def _cause_in_scene(
+    recording: Recording, found: Callable[[mujoco.MjModel], Cause | None], in_process: bool
+) -> Cause | None:
+    """Returns the cause that a function finds in the recorded scene, in a child process.
+
+    Raises:
+        HapticBridgeError: The scene cannot be compiled, or not within its limits.
+    """
+    parameters = AuditedRun.of(recording).parameters
 
     def work(worker: Worker) -> object:
         model = compile_recorded(recording, parameters).model
         worker.allow_run()
-        return asdict(cause_in_environment(replace(evidence, model=model), report, window))
+        cause = found(model)
+        return cause and asdict(cause)
 
     what = f"the scene of '{recording.path}'"
-    try:
-        found = in_bounds(work, what, trusted=in_process, **bounds_for(recording, parameters))
-    except HapticBridgeError:
-        return cause_in_environment(evidence, report, window)
-    return Cause(**found)
+    told = in_bounds(work, what, trusted=in_process, **bounds_for(recording, parameters))
+    return Cause(**told) if told else None

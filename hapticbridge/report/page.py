@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from hapticbridge.guard import CONTROLLERS
 from hapticbridge.plotting import inline_svg
 from hapticbridge.record import TickFlag, due_times
 from hapticbridge.recording import Recording
-from hapticbridge.report.cause import excess_of
+from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.plots import (
     activities,
@@ -432,10 +432,16 @@ def write_report(
         run=run,
         moment=moment,
         lead=lead_sentence(report, None if moment is None else moment["excess"].worst),
-        notes=notes(report),
+        notes=[*notes(report), *_trip_notes(recording, report, in_process=in_process)],
         is_warned=is_warned(report),
         curves="" if evidence is not None else _bare_curves(recording, *others),
     )
+
+
+def _trip_notes(recording: Recording, report: AuditReport, *, in_process: bool) -> Iterator[str]:
+    cause = pump_behind_trip(recording, report, in_process=in_process)
+    if cause is not None:
+        yield f"Likely cause: {cause.kind}. {cause.evidence}. What to change: {cause.remedy}."
 
 
 def _bare_curves(*hands: Recording) -> str:

@@ -93,6 +93,107 @@ def _depends_on_velocity(model: mujoco.MjModel, actuator_id: int) -> bool:
     return not (is_plain and is_unbiased)
 
 
+# Parts that push with their own velocity
+
+
+@dataclass(frozen=True, slots=True)
+class Pump:
+    """Joint or actuator that pushes harder the faster it moves.
+
+    Attributes:
+        kind: ``joint`` or ``actuator``.
+        number: Its id.
+        words: Description with its numbers.
+        change: Text to write in the MJCF.
+    """
+
+    kind: str
+    number: int
+    words: str
+    change: str
+
+
+def pumps(model: mujoco.MjModel, data: mujoco.MjData) -> list[Pump]:
+    """Returns the joints and actuators that put energy into what moves already.
+
+    An actuator with the velocity bias g pushes with the power g (m·v)², joints with the damping d
+    take Σ d_i v_i². At some velocity v the first is larger exactly if
+
+        g > d_a + d_t/m_t² + 1/Σ (m_i²/d_i)
+
+    with the actuator's own damping d_a and moment arms m, and of its tendon the damping d_t and arm
+    m_t. A negative damping counts as none.
+
+    Args:
+        model: Compiled scene.
+        data: The scene after ``mj_forward``: moment arms are those of its positions.
+    """
+    found = []
+    for joint in range(model.njnt):
+        damping = float(model.dof_damping[model.jnt_dofadr[joint]])
+        if damping < 0.0:
+            name = _joint_name(model, joint)
+            words = f"{name} has a damping of {damping:.3g}: it pushes what moves already"
+            found.append(Pump("joint", joint, words, 'damping="0" or more'))
+    for actuator in np.flatnonzero(
+        (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
+        & (model.actuator_biasprm[:, 2] > 0.0)
+    ).tolist():
+        bias, offset = (
+            float(model.actuator_biasprm[actuator, 2]),
+            _offset_bias(model, data, actuator),
+        )
+        if bias > offset:
+            words = (
+                f"actuator '{model.actuator(actuator).name or actuator}' pushes "
+                f"{_driven_name(model, actuator)} harder the faster it moves (velocity bias "
+                f"{bias:.3g}; damping there offsets {offset:.3g})"
+            )
+            change = "a third number of at most 0 in its biasprm"
+            found.append(Pump("actuator", actuator, words, change))
+    return found
+
+
+MIN_ARM = 1e-9
+"""Moment arm relative to an actuator's largest below which it is rounding, without unit."""
+
+
+def _offset_bias(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> float:
+    """Returns the largest velocity bias at which damping takes all that an actuator gives."""
+    first = int(data.moment_rowadr[actuator])
+    row = slice(first, first + int(data.moment_rownnz[actuator]))
+    arms, dofs = data.actuator_moment.ravel()[row], data.moment_colind.ravel()[row]
+    acts = np.abs(arms) > MIN_ARM * np.abs(arms).max(initial=0.0)
+    if not acts.any():
+        return math.inf
+    damping = np.maximum(model.dof_damping[dofs[acts]], 0.0)
+    offset = 0.0 if np.any(damping == 0.0) else 1.0 / float(np.sum(arms[acts] ** 2 / damping))
+    if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_TENDON:
+        of_tendon = float(model.tendon_damping[model.actuator_trnid[actuator, 0]])
+        offset += max(of_tendon, 0.0) / float(model.actuator_gear[actuator, 0]) ** 2
+    return offset + max(float(model.actuator_damping[actuator]), 0.0)
+
+
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    name = model.joint(joint).name
+    return f"joint '{name}'" if name else f"joint {joint}"
+
+
+def _driven_name(model: mujoco.MjModel, actuator: int) -> str:
+    kind, driven = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind in OF_A_JOINT:
+        return _joint_name(model, driven)
+    if kind == mujoco.mjtTrn.mjTRN_TENDON:
+        return f"tendon '{model.tendon(driven).name or driven}'"
+    if kind == mujoco.mjtTrn.mjTRN_SITE:
+        return f"site '{model.site(driven).name or driven}'"
+    return "what it drives"
+
+
+OF_A_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+"""Transmissions of an actuator that acts on a joint."""
+
+
 MAXIMUM_START_PENETRATION = 1e-4
 """Largest penetration of the tool at the start, in m, for contacts of the scene. Their penetration
 releases energy that no port meters: 26 mJ within 15 ms were measured. A larger value allows a
