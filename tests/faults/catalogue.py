@@ -20,7 +20,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from faults.rig import CAUSE, PERIOD, PRESS, STALE, Outcome, Rig
+from faults.rig import CAUSE, PERIOD, PRESS, STALE, FaultyDevice, Outcome, Rig
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.simulated.dynamics import DEFAULT_HAND, Hand
@@ -72,12 +72,17 @@ class Fault:
     within: int = 2
     energy: float = 0.05
 
-    def run(self, folder: Path, *, is_guarded: bool = True) -> Outcome:
+    def run(self, folder: Path) -> Outcome:
         rig = Rig(folder)
         self.do(rig)
-        if not is_guarded:
-            rig.guard |= self.without or {}
         return rig.run(self.cause)
+
+    def unguarded(self, folder: Path) -> FaultyDevice:
+        """Returns the device after the same without its part of the guard, unrecorded."""
+        rig = Rig(folder)
+        self.do(rig)
+        rig.guard |= self.without or {}
+        return rig.run_unrecorded()
 
 
 def corrupting(change: Callable[[int, NDArray[np.void]], int | None]) -> Callable[[Rig], None]:

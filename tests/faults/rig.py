@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,11 +50,16 @@ def motion_of(points: tuple[tuple[float, float], ...], *, turns: bool = False) -
     return Motion(times, [(x, 0.0, 0.0) for x in along])
 
 
-def turn_between(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_between(before: Sequence[float], after: Sequence[float]) -> tuple[float, float, float]:
     """Returns the small turn from one unit quaternion to another as a vector in rad."""
-    w, v = before[0], -before[1:]
-    turn = after[0] * v + w * after[1:] + np.cross(after[1:], v)
-    return np.asarray(2.0 * turn * np.sign(w * after[0] - after[1:] @ v))
+    w, x, y, z = before[0], -before[1], -before[2], -before[3]
+    a, b, c, d = after
+    twice = math.copysign(2.0, w * a - b * x - c * y - d * z)
+    return (
+        twice * (a * x + w * b + c * z - d * y),
+        twice * (a * y + w * c + d * x - b * z),
+        twice * (a * z + w * d + b * y - c * x),
+    )
 
 
 class FaultClock(SimulatedClock):
@@ -109,10 +115,10 @@ class FaultyDevice:
 
     def move_on(self) -> None:
         """Lets one period of the device's own time pass."""
-        before = self.true[0].copy()
+        place, pose = self.true["position"][0].copy(), self.true["quaternion"][0].tolist()
         self.inner.read(self.true)
-        moved = self.true["position"][0] - before["position"]
-        turned = turn_between(before["quaternion"], self.true["quaternion"][0])
+        moved = self.true["position"][0] - place
+        turned = np.array(turn_between(pose, self.true["quaternion"][0].tolist()))
         burnt = (self.info.damping or 0.0) / PERIOD * float(moved @ moved)
         burnt += (self.info.rotational_damping or 0.0) / PERIOD * float(turned @ turned)
         work = float(self._held[:3] @ moved + self._held[3:] @ turned)
@@ -133,6 +139,16 @@ class FaultyDevice:
         wrench = wrench.copy()
         self.refuse(self.tick, wrench)
         self.hold(wrench)
+
+    @property
+    def wrenches(self) -> NDArray[np.float64]:
+        """Every wrench that arrived, shape (n, 6)."""
+        return np.array([wrench for _, wrench in self.writes])
+
+    @property
+    def energy(self) -> float:
+        """Largest energy given to the hand beyond what it had put in, in J."""
+        return max(self.to_the_hand)
 
     def hold(self, wrench: NDArray[np.float64]) -> None:
         """Lets the motors hold a wrench."""
@@ -187,36 +203,47 @@ class Rig:
         return self._device
 
     def run(self, cause: int) -> Outcome:
-        """Runs it and reports."""
-        path, error = self.recording or self.folder / "run.mcap", ""
-        ticks_done = 0
+        """Runs it into a recording, and reports."""
+        path = self.recording or self.folder / "run.mcap"
         with ExitStack() as stack:
-            if self.around is not None:
-                self.around(stack)
-            options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
-            try:
-                bridge = Bridge(
-                    self.scene,
-                    self.device,
-                    self.coupling,
-                    recording=path,
-                    clock=self.clock,
-                    **options,
-                )
-                guard = replace(bridge.setup.guard, **self.guard)
-                bridge.setup = replace(bridge.setup, guard=guard)
-                with bridge:
-                    try:
-                        act = self.on_tick or (lambda _bridge, _tick: None)
-                        bridge.run(self.duration, lambda tick: act(bridge, tick))
-                    finally:
-                        ticks_done = bridge.session.tick
-            except (HapticBridgeError, ZeroDivisionError) as raised:
-                error = f"{type(raised).__name__}: {raised}"
+            error, ticks_done = self._go(stack, path)
             waited = time.monotonic() - self.device.closed_at
             if self.after is not None:
                 self.after()
             return Outcome.of(self, path, cause, error, ticks_done, waited)
+
+    def run_unrecorded(self) -> FaultyDevice:
+        """Runs it without a recording; returns the device, which knows what it was sent."""
+        with ExitStack() as stack:
+            self._go(stack, None)
+        return self.device
+
+    def _go(self, stack: ExitStack, path: Path | None) -> tuple[str, int]:
+        """Runs it; returns what was raised, and the number of ticks done."""
+        error, ticks_done = "", 0
+        if self.around is not None:
+            self.around(stack)
+        options = {"limits": Limits(force=10.0, torque=0.5, ramp=0.2)} | self.options
+        try:
+            bridge = Bridge(
+                self.scene,
+                self.device,
+                self.coupling,
+                recording=path,
+                clock=self.clock,
+                **options,
+            )
+            guard = replace(bridge.setup.guard, **self.guard)
+            bridge.setup = replace(bridge.setup, guard=guard)
+            with bridge:
+                try:
+                    act = self.on_tick or (lambda _bridge, _tick: None)
+                    bridge.run(self.duration, lambda tick: act(bridge, tick))
+                finally:
+                    ticks_done = bridge.session.tick
+        except (HapticBridgeError, ZeroDivisionError) as raised:
+            error = f"{type(raised).__name__}: {raised}"
+        return error, ticks_done
 
 
 @dataclass
@@ -261,7 +288,7 @@ class Outcome:
     def of(cls, rig: Rig, path: Path, cause: int, error: str, ticks: int, waited: float) -> Outcome:
         device = rig.device
         ticks_of = np.array([tick for tick, _ in device.writes])
-        wrenches = np.array([wrench for _, wrench in device.writes])
+        wrenches = device.wrenches
         forces = np.linalg.norm(wrenches[:, :3], axis=1)
         zero = ticks_of[(ticks_of >= cause - 1) & (wrenches == 0).all(axis=1)]
         given = np.array(device.to_the_hand)
@@ -272,7 +299,7 @@ class Outcome:
         return cls(
             largest_force=float(np.max(forces)),
             is_finite=bool(np.isfinite(wrenches).all()),
-            energy=float(given.max()),
+            energy=device.energy,
             zero_after=max(int(zero[0]) - cause, 0) if zero.size else None,
             found_after=max(int(found[0]) - int(felt[0]), 0) if found.size else None,
             last_is_zero=not wrenches[-1].any(),
