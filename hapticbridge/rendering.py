@@ -498,8 +498,8 @@ def prepare(
             not suit the method.
     """
     checked_substeps(substeps, SceneError)
-    for item in fields(Coupling):
-        _ARGUMENTS.number(f"coupling {item.name.replace('_', ' ')}", getattr(coupling, item.name))
+    for gain in fields(Coupling):
+        _ARGUMENTS.number(f"coupling {gain.name.replace('_', ' ')}", getattr(coupling, gain.name))
     check_scene(scene.model, scene.grip, method)
     scene.set_weld(coupling if method.is_weld else None)
     scene.set_timestep(period, substeps)
@@ -607,10 +607,10 @@ def check_prepared(model: mujoco.MjModel, parameters: RunParameters, method: Met
             parameters.effective or coupling,
             measured_weld(model, parameters.grip),
         )
-        for item in fields(Coupling):
-            claimed, true = getattr(effective, item.name), getattr(measured, item.name)
+        for gain in fields(Coupling):
+            claimed, true = getattr(effective, gain.name), getattr(measured, gain.name)
             if not math.isclose(claimed, true, rel_tol=MEASURED_AGAIN):
                 raise SceneError(
-                    f"{item.name.replace('_', ' ')} of the weld is {true:.6g} in SI units, the "
+                    f"{gain.name.replace('_', ' ')} of the weld is {true:.6g} in SI units, the "
                     f"metadata say {claimed:.6g}"
                 )

@@ -222,12 +222,12 @@ class Timekeeping:
     @property
     def _unproved(self) -> str:
         """Number that is missing for a verdict on the device, in a clause."""
-        felt = [each for each in self.in_time if each.is_felt]
-        if any(each.available is None for each in felt):
+        on_hand = [each for each in self.in_time if each.is_felt]
+        if any(each.available is None for each in on_hand):
             return "its damping is unknown ('hapticbridge identify' measures it)"
-        if any(each.delay is None for each in felt):
+        if any(each.delay is None for each in on_hand):
             return "its delay is unknown ('hapticbridge identify' measures it)"
-        if any(each.delay for each in felt):
+        if any(each.delay for each in on_hand):
             return "behind its delay the bound holds at walls, and none holds for every scene"
         return "nothing proves that it bears the coupling"
 

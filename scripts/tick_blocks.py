@@ -40,13 +40,13 @@ class UnpacedClock:
         return time.perf_counter_ns()
 
 
-def open_bridge(asked: dict[str, str], stack: ExitStack) -> hb.Bridge:
+def open_bridge(requested: dict[str, str], stack: ExitStack) -> hb.Bridge:
     """Closes the last bridge and opens the requested one."""
     stack.close()
     bridge = hb.Bridge(
-        asked["scene"],
+        requested["scene"],
         "simulated",
-        method=asked["method"],
+        method=requested["method"],
         clock=UnpacedClock(),
         pipelined=True,
         controller="damper",
@@ -71,10 +71,10 @@ def main() -> None:
     with ExitStack() as stack:
         bridge, in_contact = None, False
         for line in sys.stdin:
-            asked = json.loads(line)
+            requested = json.loads(line)
             answer: dict[str, float | None] = {}
-            if asked:
-                bridge, in_contact = open_bridge(asked, stack), asked["in_contact"]
+            if requested:
+                bridge, in_contact = open_bridge(requested, stack), requested["in_contact"]
             elif bridge is not None:
                 answer = run_block(bridge, in_contact=in_contact)
             print(json.dumps(answer), flush=True)

@@ -57,7 +57,7 @@ REASONS = {
     "recording/ring.py: fcntl.flock(file, fcntl.LOCK_SH)": "the user's own processes lock it "
     "exclusively for the time of one removal",
     "recording/container.py: with ThreadPoolExecutor(2)": "compression of a chunk in memory",
-    "recording/container.py: item.result()": "compression of a chunk in memory",
+    "recording/container.py: record.result()": "compression of a chunk in memory",
     "view/process.py: for line in stream": DAEMON,
     "view/process.py: stream.readline()": "the bridge's end closes it",
     "view/process.py: time.sleep(due - now)": "until the bridge closes its end, or is dead",

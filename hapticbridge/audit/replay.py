@@ -201,15 +201,15 @@ class Resimulator:
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
             state, row, part = self.binding.state, self.binding.row, slice(done, end)
-            given = samples[part], outside[part], elapsed[part]
+            inputs = samples[part], outside[part], elapsed[part]
             if self.hands is not None:
-                own = self.hands.states, *given, self.hands.rows
+                own = self.hands.states, *inputs, self.hands.rows
                 count = simulate_hands(*own, rows[part])
             elif self._slow is not None:
                 steps = np.ascontiguousarray(ticks["scene_step"][part])
-                count = self._slow.simulate(*given, steps, rows[part])
+                count = self._slow.simulate(*inputs, steps, rows[part])
             else:
-                count = simulate_recorded(state, *given, row, rows[part])
+                count = simulate_recorded(state, *inputs, row, rows[part])
             self.is_over = count < end - done
             done += count
             if self._changes and done == end < len(ticks):

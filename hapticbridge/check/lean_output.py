@@ -149,7 +149,7 @@ def trial_facts(trial: VariantVerdict) -> Row:
         "verdict": trial.verdict,
         "loses": trial.loses,
         "cost_ratio": trial.cost,
-        **{n: None if error is None else felt(error) for n, felt in _FELT.items()},
+        **{n: None if error is None else of_kind(error) for n, of_kind in _ERRORS.items()},
         "environment": trial.environment,
         "mujoco_warnings": trial.warnings,
         "needed_damping_ns_per_m": trial.needed_damping,
@@ -157,7 +157,7 @@ def trial_facts(trial: VariantVerdict) -> Row:
     }
 
 
-_FELT: dict[str, Callable[[FeltError], float]] = {
+_ERRORS: dict[str, Callable[[FeltError], float]] = {
     "felt_jnd": attrgetter("jnd"),
     "peak_jnd": attrgetter("peak"),
     "force_rms_n": attrgetter("force_rms"),

@@ -54,8 +54,8 @@ def page(topic: str) -> str:
     advice = nearest(topic, topics).rstrip()
     if not advice:
         found = [name for name in topics if topic.lower() in page(name).lower()]
-        told = "the word is in" if topic and found else "choose one of"
-        advice = f"{told} {choices(found or topics)}"
+        lead = "the word is in" if topic and found else "choose one of"
+        advice = f"{lead} {choices(found or topics)}"
     raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
 
 

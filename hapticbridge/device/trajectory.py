@@ -72,9 +72,9 @@ class Motion:
         count = np.size(np.asarray(times))
         if quaternions is None:
             quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
-        given = times, positions, quaternions
+        raw = times, positions, quaternions
         try:
-            columns = [np.asarray(values, dtype=np.float64) for values in given]
+            columns = [np.asarray(values, dtype=np.float64) for values in raw]
         except (TypeError, ValueError, OverflowError):  # text, or rows of different lengths
             raise DeviceError(
                 "a motion's times, positions and quaternions must be numbers"

@@ -206,7 +206,7 @@ class Block:
     fault: str = ""
 
 
-_Item: TypeAlias = Block | tuple[int, Fields]
+_Record: TypeAlias = Block | tuple[int, Fields]
 
 
 class Container:
@@ -265,13 +265,13 @@ class Container:
         ]
         return Block("the index at the end of the file", b"".join(pieces))
 
-    def records(self) -> Iterator[_Item]:
+    def records(self) -> Iterator[_Record]:
         """Yields blocks of messages and, as (opcode, fields), metadata and attachments, in order.
 
         Threads decompress and check chunks ahead of the one that is yielded.
         """
         with ThreadPoolExecutor(2) as pool:
-            ahead: deque[_Item | Future[Block]] = deque()
+            ahead: deque[_Record | Future[Block]] = deque()
             count, room = 0, FREE_SIZE + MAX_RATIO * len(self._data)
             for opcode, body, stop in self._data_section():
                 start, place = body - _RECORD.size, len(self._hashes)
@@ -323,12 +323,12 @@ class Container:
                 f"the attachment at byte {start} is damaged: its checksum does not match"
             )
 
-    def _finished(self, item: _Item | Future[Block]) -> _Item:
-        if isinstance(item, Future):
-            item = item.result()
-        if isinstance(item, Block) and item.fault:
-            self.problems.append(f"{item.label} is damaged: {item.fault}")
-        return item
+    def _finished(self, record: _Record | Future[Block]) -> _Record:
+        if isinstance(record, Future):
+            record = record.result()
+        if isinstance(record, Block) and record.fault:
+            self.problems.append(f"{record.label} is damaged: {record.fault}")
+        return record
 
     def _unpack(self, label: str, start: int, stop: int, place: int) -> Block:
         record = self._data[start:stop]

@@ -543,7 +543,7 @@ def _read_through(
         "meta": meta | layout.further_hands(meta)[chosen - 1] if chosen else meta,
         "hand": chosen,
         "hands": hands,
-        "attachments": {item.name: item.data for item in contents.attachments},
+        "attachments": {each.name: each.data for each in contents.attachments},
         "is_cut": container.is_cut,
         "seal": contents.seal or {},
         "computed_seal": {DIGEST: digest.hexdigest(), **container.hashes},
@@ -588,11 +588,11 @@ def _read_parts(
         container = Container(data, is_hashed=keeps_events)
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
-        for item in container.records():
-            if isinstance(item, Block):
-                contents.add_block(item)
+        for record in container.records():
+            if isinstance(record, Block):
+                contents.add_block(record)
             else:
-                _add_described(contents, *item)
+                _add_described(contents, *record)
             yield container, contents
         yield container, contents
 

@@ -173,7 +173,7 @@ class Recorder:
             "parent": os.getpid(),
             "path": None if path is None else str(Path(path).absolute()),
             "metadata": dict(metadata),
-            "attachments": [[item.name, item.media_type, len(item.data)] for item in attachments],
+            "attachments": [[each.name, each.media_type, len(each.data)] for each in attachments],
             "epoch_ns": time.time_ns() if epoch_ns is None else epoch_ns,
             "live": live,
         }
@@ -198,7 +198,7 @@ class Recorder:
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         pieces = [json.dumps(configuration).encode() + b"\n"]
-        pieces += [item.data for item in attachments]
+        pieces += [each.data for each in attachments]
         # in a separate thread, because attachments exceed a pipe's buffer
         self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
         self._sender.start()

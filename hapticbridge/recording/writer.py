@@ -295,9 +295,9 @@ class RecordingWriter:
         self._index.take_over(self._mcap)
         self._mcap.start(profile=layout.PROFILE, library="hapticbridge")
         self._mcap.add_metadata(layout.METADATA_NAME, dict(meta))
-        for item in attachments:
+        for attachment in attachments:
             self._mcap.add_attachment(
-                self._epoch, self._epoch, item.name, item.media_type, item.data
+                self._epoch, self._epoch, attachment.name, attachment.media_type, attachment.data
             )
         tick_schema = self._mcap.register_schema(
             layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema(self._record)

@@ -81,15 +81,15 @@ class Replay:
             **bounds_for(recording, self.parameters),
         )
 
-    def _add(self, told: Any) -> None:
+    def _add(self, message: Any) -> None:
         """Takes the scenery, which comes first, or an instant."""
-        if not isinstance(told, list):
-            self.scenery = Scenery.from_parts(told)
-            steps = checked([told[name] for name in ("step", "count", "on_hand", "on_tool")], 4)
+        if not isinstance(message, list):
+            self.scenery = Scenery.from_parts(message)
+            steps = checked([message[name] for name in ("step", "count", "on_hand", "on_tool")], 4)
             self.step, self._count = max(float(steps[0]), FRAME), int(steps[1])
             self.hand_reference, self.tool_reference = map(float, np.maximum(steps[2:], 1e-9))
             return
-        instant, point = told
+        instant, point = message
         scenery = self.scenery
         counts = scenery.bodies, len(scenery.widths), len(scenery.other_tools)
         sight = Sight.from_parts(instant, *counts)

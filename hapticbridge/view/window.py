@@ -182,7 +182,7 @@ class Window:
         Raises:
             HapticBridgeError: The page cannot be served, or the time is over.
         """
-        files = {item.name: item.data for item in attachments}
+        files = {each.name: each.data for each in attachments}
         job = {
             "ring": ring,
             "snapshot": snapshot,

@@ -148,8 +148,8 @@ def changed_of_hands(
     if len(hands) == 1:
         [(grip, old)] = hands.items()
         new = old.changed(changes)
-        told = [(name, UNITS.get(name, ""), old.value(name), new.value(name)) for name in changes]
-        return {grip: new}, tuple(told)
+        rows = [(name, UNITS.get(name, ""), old.value(name), new.value(name)) for name in changes]
+        return {grip: new}, tuple(rows)
     chosen: dict[str, dict[str, Value]] = {grip: {} for grip in hands}
     for name, value in sorted(changes.items(), key=lambda each: ":" in each[0]):
         grip, is_named, setting = name.rpartition(":")
@@ -162,16 +162,16 @@ def changed_of_hands(
             if is_named or name not in OF_HAND or not each.startswith(JOINT):
                 chosen[each][setting] = value
     news = {grip: old.changed(chosen[grip]) for grip, old in hands.items()}
-    told = []
+    rows = []
     for number, (grip, own) in enumerate(chosen.items()):
         old, new = hands[grip], news[grip]
         for name in own:
             unit = "" if grip.startswith(JOINT) else UNITS.get(name, "")
             if name in OF_HAND:
-                told.append((f"{name} at '{grip}'", unit, old.value(name), new.value(name)))
+                rows.append((f"{name} at '{grip}'", unit, old.value(name), new.value(name)))
             elif number == 0:
-                told.append((name, unit, old.value(name), new.value(name)))
-    return news, tuple(told)
+                rows.append((name, unit, old.value(name), new.value(name)))
+    return news, tuple(rows)
 
 
 def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:

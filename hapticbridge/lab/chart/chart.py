@@ -323,9 +323,9 @@ def convergence_orders(points: Sequence[Measurement]) -> dict[str, Order]:
     """
     series: dict[str, list[tuple[float, float]]] = {}
     for each in points:
-        felt = each.score.jnd
-        if each.is_usual and math.isfinite(felt) and felt >= RESOLVED:
-            series.setdefault(simulator_name(each.setting), []).append((each.setting.period, felt))
+        jnd = each.score.jnd
+        if each.is_usual and math.isfinite(jnd) and jnd >= RESOLVED:
+            series.setdefault(simulator_name(each.setting), []).append((each.setting.period, jnd))
     return {name: _order(sorted(values)[:3]) for name, values in series.items() if len(values) > 2}
 
 
@@ -491,7 +491,7 @@ def _baseline(settings: Sequence[Setting], failed: Set[int]) -> int:
 def _notes(apart: Mapping[str, float]) -> Iterator[str]:
     if len(apart) > 1:
         central = min(apart, key=lambda name: apart[name])
-        listed = ", ".join(f"{name} {felt:.2g}" for name, felt in apart.items() if name != central)
+        listed = ", ".join(f"{name} {jnd:.2g}" for name, jnd in apart.items() if name != central)
         yield (
             f"How far the methods' own limits lie from that of {central}, in JND: {listed}. A "
             "point that is nearer to its own limit than that limit is to this one cannot be "

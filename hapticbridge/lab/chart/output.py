@@ -334,8 +334,8 @@ def colours_of(chart: Chart) -> dict[str, Any]:
 
 def drawn_error(each: Measurement) -> float:
     """Returns the ordinate of a point in JND, clipped to the picture's edges."""
-    felt = each.score.jnd
-    return float(np.clip(felt, FLOOR, CEILING)) if np.isfinite(felt) else CEILING
+    jnd = each.score.jnd
+    return float(np.clip(jnd, FLOOR, CEILING)) if np.isfinite(jnd) else CEILING
 
 
 def drawn_cost(each: Measurement, points: Sequence[Measurement]) -> float:

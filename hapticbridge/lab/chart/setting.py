@@ -91,8 +91,8 @@ class Setting:
     def label(self) -> str:
         """Setting in words, without the usual values."""
         law = "own spring" if self.engine.endswith(SPRING) else "held force"
-        who = self.method.name if self.engine == OWN else f"{self.engine}, {law}"
-        parts = [who, f"{1e3 * self.period:g} ms"]
+        name = self.method.name if self.engine == OWN else f"{self.engine}, {law}"
+        parts = [name, f"{1e3 * self.period:g} ms"]
         if self.substeps > 1:
             parts.append(f"{self.substeps} substeps")
         if self.scene_ticks:
