@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from audit_cases import recorded, rewritten
+from audit_cases import ScriptedDevice, recorded, rewritten
 from cli_cases import Called, one_sentence
 
 from hapticbridge.audit import audit
@@ -298,3 +298,24 @@ def test_a_motor_that_runs_away_is_named_as_the_cause_of_a_trip(
     # the sign of the velocity bias alone is at fault
     scene.write_text(RUNAWAY.format(driven=driven, bias=-bias))
     assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0
+
+
+def test_a_device_without_a_condition_is_told_why(call: Called, tmp_path: Path) -> None:
+    path, motion = tmp_path / "run.mcap", tmp_path / "hand.csv"
+    motion.write_text("t,x,y,z\n0,0,0,0\n0.1,0.001,0,0\n")
+    run = ("run", "point_mass", "--fast", "--device", f"trajectory:{motion}", "--record", path)
+    assert call(*run)[0] == 0
+    out = call("audit", path)[1]
+    prescribed = "the device feels no force, as its motion is prescribed: there is nothing to cert"
+    unknown = "device not judged (b >= KT/2 + B_law): its damping b is unknown; 'hapticbridge ident"
+    assert prescribed in out and unknown not in out
+    other = tmp_path / "other.mcap"
+    device = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0), damping=None)
+    recorded(other, "point_mass", device, duration=0.02)
+    out = call("audit", other)[1]
+    assert unknown in out and prescribed not in out
+    recording = read_recording(path)
+    ticks = recording.ticks.copy()
+    ticks["kinetic"][50] += 1.0
+    out = call("audit", rewritten(recording, tmp_path / "bad.mcap", ticks=ticks))[1]
+    assert "invalid" in out and prescribed not in out and unknown not in out

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from cli_cases import Called, facts_of
+
+from hapticbridge.cli import zwidth
+from hapticbridge.device.simulated.device import SimulatedDevice
 
 
 @pytest.mark.parametrize(
@@ -69,3 +73,54 @@ def test_a_picture_is_written(tmp_path: Path, call: Called) -> None:
     code, _, err = call("bound", "--stiffness", "2000", "--damping", "1", "--plot", picture)
     assert (code, f"wrote {picture}" in err) == (0, True)
     assert picture.stat().st_size > 10_000
+
+
+BORNE = "next: hapticbridge run SCENE --stiffness 2400 --damping 1.7 --device simulated"
+
+
+@pytest.mark.parametrize(
+    ("sheet", "code", "words"),
+    [
+        ({}, 0, BORNE),
+        ({"damping": 1.0}, 1, "take a device with 1.7 N s/m"),
+        ({"damping": 0.0}, 1, "translation: device damping 0 < 1.7 N s/m"),
+        ({"damping": 9.0, "delay": 1e-3}, 0, "with a delay of 1 ms (1 tick) none suffices"),
+        ({"delay": 1e-3}, 1, "translation: device damping 2 < "),
+        ({"delay": None}, 0, "if it answers without delay, which is unknown"),
+        ({"rate": 500.0}, 1, "translation: device damping 2 < 2.9 N s/m"),
+        ({"damping": None}, 2, "its damping is unknown; 'hapticbridge identify' measures it"),
+    ],
+)
+def test_a_device_brings_its_damping_its_delay_and_its_rate(
+    sheet: dict[str, float | None],
+    code: int,
+    words: str,
+    call: Called,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened = SimulatedDevice()
+    opened.info = replace(opened.info, **sheet)  # type: ignore[arg-type] # by the test
+    monkeypatch.setattr(zwidth, "open_device", lambda _spec, notify: opened)
+    command = ("bound", "--stiffness", 2400, "--damping", 1.7, "--device", "simulated")
+    ended, out, err = call(*command)
+    assert ended == code
+    assert words in " ".join((out + err).split())
+    assert "a delay of the device is not in it" not in out
+    if code < 2:
+        ended, facts = facts_of(call, *command)
+        assert (ended, facts["holds"]) == (code, code == 0)
+        assert facts["device"]["delay"] == sheet.get("delay", 0.0)
+        assert facts["device"]["damping"] == sheet.get("damping", 2.0)
+
+
+@pytest.mark.parametrize(
+    ("device", "reason"),
+    [
+        ("mouse", "no force moves it along x, y or z, so it needs no damping"),
+        ("simulated --device-damping 2", "leave --device-damping out"),
+    ],
+)
+def test_a_device_without_a_bound_is_refused(device: str, reason: str, call: Called) -> None:
+    code, _, err = call(*f"bound --stiffness 2400 --device {device}".split())
+    assert code == 2
+    assert reason in err

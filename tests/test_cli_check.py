@@ -25,6 +25,7 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
         "pairs that can touch 1, 1 did",
         "contact rows         at most 1 in a step",
         "contact stiffness    21,200 to 21,200 kN/m at the tool",
+        "(rigid contacts; solref and solimp of the scene have no effect)",
         "only visual: geom 'bench', geom 'rail'",
         "whole tick, median",
         "highest rate:",
@@ -32,6 +33,9 @@ def test_check_tells_counts_stiffness_and_cost(tmp_path: Path, call: Called) -> 
     ):
         assert words in out
     assert picture.read_bytes().startswith(b"\x89PNG")
+    _, out, _ = call("check", "virtual_wall", "--contact", "scene")
+    assert "kN/m at the tool" in out and "21,200" not in out
+    assert "(contacts of the scene, by its solref and solimp)" in out
 
 
 def test_check_draws_a_motion_too_short_to_measure_growth(tmp_path: Path, call: Called) -> None:

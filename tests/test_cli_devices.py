@@ -109,6 +109,13 @@ def port(problem: str | None) -> FoundDevice:
     )  # fmt: skip
 
 
+def mouse(problem: str | None) -> FoundDevice:
+    return FoundDevice(
+        driver="spacemouse", name="SpaceMouse", serial="", path="/dev/hidraw1", vendor=0x256F,
+        product=0xC635, transport="hid", problem=problem,
+    )  # fmt: skip
+
+
 def test_serial_ports_and_boards_of_any_vendor_get_a_rule_each(
     bus: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,19 +154,23 @@ def test_wheels_of_any_vendor_have_a_permission(bus: Path) -> None:
 @pytest.mark.parametrize(
     ("plugged", "words"),
     [
-        ([listed(None)], "next: hapticbridge run peg_in_hole --device rawhid --force-limit 2\n"),
-        ([listed(None, "A"), listed(None, "B")], "--device rawhid:serial=A --force-limit 2\n"),
+        ([listed(None)], "  next: hapticbridge identify rawhid, and let go of it\n"),
+        (
+            [listed(None, "A"), listed(None, "B")],
+            "next: hapticbridge identify rawhid:serial=A, and",
+        ),
+        ([mouse(None)], "  next: hapticbridge run peg_in_hole --device spacemouse\n"),
         (
             [listed(permission_problem("/dev/hidraw0"))],
             "local users of the machine\n  next: hapticbridge devices",
         ),
         # no rule would help, and one of two can be used
-        ([listed("no node"), listed(None, "B")], "next: hapticbridge run peg_in_hole --device"),
+        ([listed("no node"), listed(None, "B")], "next: hapticbridge identify rawhid:serial=B"),
         ([listed("no node")], "  not usable: no node\n"),
         ([listed("no node")], "\nnext: hapticbridge run peg_in_hole --device mouse\n"),
         ([], "\nnext: hapticbridge run peg_in_hole --device mouse\n"),
-        ([port(None)], "next: hapticbridge run peg_in_hole --device serial:/dev/ttyACM0 --force"),
-        ([port(None), listed(None)], "--device rawhid --force-limit 2\n"),
+        ([port(None)], "next: hapticbridge identify serial:/dev/ttyACM0, and let go"),
+        ([port(None), listed(None)], "identify rawhid, and let go of it\n"),
     ],
 )
 def test_it_says_what_to_do_next(

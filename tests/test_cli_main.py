@@ -315,7 +315,8 @@ def test_long_work_is_named_once_where_nothing_is_animated(monkeypatch: pytest.M
     with terminal.working("drawing"):
         assert has_told.wait(60.0)
     assert lines == ["drawing …"]
-    monkeypatch.setattr(terminal, "REPRINT", 1e6)
-    with terminal.progress("judging"):
-        pass
-    assert lines == ["drawing …"]
+    with terminal.progress("judging") as show:
+        show(1, 4, "one run")
+        monkeypatch.setattr(terminal, "REPRINT", 1e6)
+        show(2, 4, "another")  # too soon for another line
+    assert lines == ["drawing …", "judging: one run  25 %"]

@@ -217,6 +217,11 @@ def test_the_step_of_a_position_is_exact_and_one_without_steps_has_none() -> Non
         (Estimate(1.98765, 0.008), "1.988 ± 0.008"),
         (Estimate(0.25, 0.0), "0.25 ± 0"),
         (Estimate(1.5, 0.01, 0.04), "1.5 +0.01 −0.05"),
+        # its interval excludes zero, also as it is told
+        (Estimate(2.4, 1.6), "2.4 ± 1.6"),
+        (Estimate(-2.4, 1.6), "-2.4 ± 1.6"),
+        (Estimate(2.4, 0.1, 2.2), "2.4 +0.1 −2"),
+        (Estimate(0.9, 1.6), "1 ± 2"),
     ],
 )
 def test_an_estimate_tells_no_digits_that_mean_nothing(estimate: Estimate, told: str) -> None:

@@ -28,6 +28,7 @@ from hapticbridge.lab.chart.chart import (
     pareto_front,
 )
 from hapticbridge.lab.chart.output import (
+    CEILING,
     DEFAULT,
     WARNING,
     draw_chart,
@@ -389,6 +390,23 @@ def test_picture_says_why_a_cheaper_method_is_passed_over(chart: Chart) -> None:
     assert "recommended for 1 kHz: implicit" in words
     assert "not explicit: it may kick on a real device" in words
     assert "not implicit" not in words
+
+
+def test_every_point_stands_at_its_cost_and_error_in_the_picture(chart: Chart) -> None:
+    panel = chart.workload.panels[0]
+    good, wild = made_up(0.02, 0.5), made_up(0.04, np.inf, period=2e-3, verdict="diverged")
+    points = tuple(replace(each, panel=panel.key) for each in (good, wild))
+    axes = draw_chart(replace(chart, measurements=points)).axes[0]
+    marks = {
+        str(line.get_marker()): (float(line.get_xdata()[0]), float(line.get_ydata()[0]))
+        for line in axes.lines
+        if np.size(line.get_xdata()) == 1
+    }
+    assert marks["o"] == marks["*"] == (0.02, 0.5)
+    cost, error = marks["v"]
+    assert (cost, error) == (0.04, CEILING)  # beyond all errors, and on the picture
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    assert left < cost < right and low < error < high
 
 
 def test_error_that_grows_at_a_smaller_step_is_called_luck() -> None:

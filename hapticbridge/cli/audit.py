@@ -30,10 +30,10 @@ from hapticbridge.film import Shot, still
 from hapticbridge.guard import trip_remedy
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.recording.reader import CUT, read_hands
+from hapticbridge.recording.reader import CUT, open_hands, read_hands
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of, pump_behind_trip
-from hapticbridge.report.evidence import Evidence
+from hapticbridge.report.evidence import Evidence, is_motion_prescribed
 from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
@@ -353,6 +353,16 @@ class Audit:
             return None
 
 
+def _without_condition(path: Path) -> str:
+    """Returns the reason why a device has no condition."""
+    if all(is_motion_prescribed(hand.meta) for hand in open_hands(path)):
+        return "the device feels no force, as its motion is prescribed: there is nothing to certify"
+    return (
+        "device not judged (b >= KT/2 + B_law): its damping b is unknown; 'hapticbridge identify' "
+        "measures it"
+    )
+
+
 def _print_report(report: AuditReport) -> None:
     colour = _VERDICT_COLOURS[report.verdict]
     judged = "environment " if report.environment and not report.port else ""
@@ -372,11 +382,8 @@ def _print_report(report: AuditReport) -> None:
     in_time = ", with every tick in time" if kept is not None and kept.fault else ""
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
-    if not report.conditions:
-        out.print(
-            "  device not judged (b >= KT/2 + B_law): its motion is prescribed, or its damping "
-            "unknown, which 'hapticbridge identify' measures"
-        )
+    if not report.conditions and report.verdict != "invalid":
+        out.print(f"  {_without_condition(report.path)}")
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified)}")
     if report.is_cut:

@@ -168,8 +168,15 @@ def print_case(case: SceneUnderCheck) -> None:
     )
 
 
-def print_inventory(inventory: Inventory) -> None:
-    """Prints what the scene models."""
+_CONTACTS = {
+    "rigid": "rigid contacts; solref and solimp of the scene have no effect",
+    "scene": "contacts of the scene, by its solref and solimp",
+}
+"""Source of a contact's stiffness, by the kind of contacts."""
+
+
+def print_inventory(inventory: Inventory, contact: str) -> None:
+    """Prints what the scene models, with the stiffness of the contacts that a run takes."""
     out.print("\n[bold]What it models[/]")
     uses = ", ".join(f"{count} {use}" for use, count in inventory.geoms.items() if count)
     lines = {
@@ -188,7 +195,8 @@ def print_inventory(inventory: Inventory) -> None:
     if inventory.stiffness is not None:
         least, most = (f"{float(f'{1e-3 * each:.3g}'):,g}" for each in inventory.stiffness)
         lines["contact stiffness"] = (
-            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)}"
+            f"{least} to {most} kN/m at the tool, which sank in by {length(inventory.deepest)} "
+            f"({_CONTACTS[contact]})"
         )
     is_met = inventory.rows is None or inventory.geoms[MEETS_TOOL] > 0
     if inventory.possible_pairs and not inventory.flexes and not is_met:
@@ -395,7 +403,7 @@ class Check:
         is_sound = all(fault.is_note for fault in faults)
         if not self.as_json:
             print_case(case)
-            print_inventory(inventory)
+            print_inventory(inventory, case.contact)
             print_cost(cost)
             print_faults(faults)
             if is_sound:

@@ -65,8 +65,8 @@ class Devices:
         return 0
 
 
-RUN = "hapticbridge run peg_in_hole --device"
-"""Command to try a device with, without the device's name."""
+IDENTIFY, RUN = "hapticbridge identify", "hapticbridge run peg_in_hole --device"
+"""Commands to measure a device that has motors, and to try one without; then the device's name."""
 
 
 _WITHOUT_HARDWARE = (
@@ -92,7 +92,8 @@ def _print_plugged(
     for sentence in () if device.problem else _standstill(driver):
         out.print(f"  {plain(sentence)}")
     if command := _next(device, plugged):
-        out.print(f"  next: {plain(command)}")
+        hands_off = ", and let go of it" if command.startswith(IDENTIFY) else ""
+        out.print(f"  next: {plain(command)}{hands_off}")
 
 
 def _print_supported(driver: Driver, plugged: list[FoundDevice], width: int) -> None:
@@ -112,7 +113,9 @@ def _print_supported(driver: Driver, plugged: list[FoundDevice], width: int) -> 
 def _next(device: FoundDevice, plugged: list[FoundDevice]) -> str:
     """Returns the command to type for a device; empty if its problem has another remedy."""
     if device.problem is None:
-        return f"{RUN} {_specification(device, plugged)} --force-limit 2"
+        driver = driver_named(device.driver)
+        is_felt = driver is None or not driver.force.startswith("none")
+        return f"{IDENTIFY if is_felt else RUN} {_specification(device, plugged)}"
     if RULES_COMMAND in device.problem:
         return (
             f"{RULES_COMMAND} | sudo tee {RULES_FILE}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,13 @@ import tyro
 from rich.table import Table
 
 from hapticbridge.arguments import Arguments
-from hapticbridge.certificate import delay_ticks, whole_ticks
+from hapticbridge.certificate import (
+    DampingCondition,
+    delay_ticks,
+    device_conditions,
+    device_period,
+    whole_ticks,
+)
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
 from hapticbridge.coupling import Coupling
@@ -260,10 +267,11 @@ class Bound:
     """Compute the device damping that a coupling needs.
 
     Alternative laws are listed beside it. K and B are the requested ones; the law of the default
-    method uses B - KT/2, at least 0. Exit code 1 if --device-damping does not suffice.
+    method uses B - KT/2, at least 0. Exit code 1 if --device or --device-damping does not suffice.
 
-    Example:
+    Examples:
         hapticbridge bound --stiffness 2000 --damping 1 --rate 1000
+        hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
     """
 
     stiffness: float
@@ -274,8 +282,11 @@ class Bound:
     """Ticks per second."""
     filter_time: float | None = None
     """Time constant in s of the low-pass among the alternatives; by default one period."""
+    device: str | None = None
+    """Device, as 'run --device' takes it: do its damping, delay and rate suffice? They come from
+    its driver or its profile ('hapticbridge identify' writes one). It is opened, and not moved."""
     device_damping: float | None = None
-    """Physical damping b of the device in N s/m: does it suffice?"""
+    """Physical damping b in N s/m of a device without delay, in place of --device."""
     plot: Path | None = None
     """Draw the damping needed over frequency into this picture (.png, .svg or .pdf)."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -284,15 +295,21 @@ class Bound:
     def execute(self) -> int:
         """Computes and prints; returns the exit code."""
         check_ending(self.plot)
-        b = self.device_damping
-        if b is not None:
-            scalar("device damping", b, "N s/m", positive=True)
+        info = self._info()
+        if self.device_damping is not None:
+            scalar("device damping", self.device_damping, "N s/m", positive=True)
         period = period_of(self.rate)
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
         filter_time = period if self.filter_time is None else self.filter_time
         ways = alternatives(coupling, period, filter_time)
-        holds = None if b is None else b >= ways[0].needed
         shown = RunCoupling.of(default_method(), period, coupling)
+        condition = None if info is None else _condition(info, coupling, period)
+        b = self.device_damping
+        if info is not None and _is_prompt(info, period):
+            b = info.damping
+        holds = None if b is None else b >= ways[0].needed
+        if condition is not None:
+            holds = condition.holds
         if self.as_json:
             print_json(
                 {
@@ -301,7 +318,8 @@ class Bound:
                     "holds": holds,
                     "method": default_method().name,
                     "coupling": asdict(shown),
-                    "largest_stiffness": self._largest_stiffness(period),
+                    "largest_stiffness": self._largest_stiffness(b, period),
+                    "device": None if info is None else _device_facts(info, condition),
                     "alternatives": [
                         {"name": way.name, "needed": way.needed, "frequency_hz": _hertz(way)}
                         for way in ways
@@ -309,21 +327,44 @@ class Bound:
                 }
             )
         else:
-            self._print(ways, shown, period)
+            self._print(ways, shown, period, b)
+            if condition is not None and b is None:
+                out.print(plain(condition.sentence()))
         if self.plot is not None:
             title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {self.rate:g} Hz"
             write_figure(draw_alternatives(ways, title, b), self.plot)
         return 1 if holds is False else 0
 
-    def _largest_stiffness(self, period: float) -> float | None:
+    def _info(self) -> DeviceInfo | None:
+        """Returns the data sheet of --device, with its profile; None without that option."""
+        if self.device is None:
+            return None
+        if self.device_damping is not None:
+            raise HapticBridgeError("--device has a damping of its own: leave --device-damping out")
+        device = open_device(self.device, notify=notify)
+        checked_close(device)()
+        info = device.info
+        if info.is_prescribed or not info.moves:
+            raise HapticBridgeError(
+                f"--device {self.device}: no force moves it along x, y or z, so it needs no damping"
+            )
+        if info.damping is None:
+            raise HapticBridgeError(
+                f"--device {self.device}: its damping is unknown; 'hapticbridge identify' measures "
+                "it, or give --device-damping"
+            )
+        return info
+
+    def _largest_stiffness(self, b: float | None, period: float) -> float | None:
         """Returns the largest K that the device bears; None without a device, 0 if none."""
-        b = self.device_damping
         if b is None:
             return None
         return 2 * b / period if self.damping <= b else 0.0
 
-    def _print(self, ways: tuple[Alternative, ...], shown: RunCoupling, period: float) -> None:
-        b, method = self.device_damping, default_method()
+    def _print(
+        self, ways: tuple[Alternative, ...], shown: RunCoupling, period: float, b: float | None
+    ) -> None:
+        method = default_method()
         (sentence,) = shown.sentences()
         out.print(f"{sentence}; the device needs b >= KT/2 + B_law")
         table = Table("", "damping needed", "most at", box=None, pad_edge=False)
@@ -335,7 +376,11 @@ class Bound:
             table.add_row(way.name, amount, _where(way), *verdict)
         out.print(table)
         least = method.compensated_share * self.stiffness * period
-        out.print("a delay of the device is not in it: 'zwidth --delay' has the limit at a wall")
+        if self.device is None:
+            out.print(
+                "a delay of the device is not in it: --device counts it, and 'zwidth --delay' has "
+                "the limit at a wall"
+            )
         if self.damping < least:
             out.print(
                 f"method {method.name} cannot show less than B = {least:.4g} N s/m at this "
@@ -348,6 +393,8 @@ class Bound:
             out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
             out.print(f"it bears any K up to {2 * b / period:.4g} N/m with any B up to {b:g} N s/m")
             command = next_command(self.stiffness, max(self.damping, least), self.rate)
+            if self.device is not None:
+                command += f" --device {shlex.quote(self.device)}"
             out.print(f"next: {plain(command)}")
             return
         out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
@@ -368,6 +415,27 @@ class Bound:
             for change in changes:
                 out.print(f"  {change}, or")
         out.print(f"  take a device with {needed:.4g} N s/m")
+
+
+def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCondition:
+    """Returns the condition for translation that a run with scale 1 would print."""
+    method = default_method()
+    law = method.law_coupling(coupling, period)
+    found = device_conditions(info, law, period, 1.0, 1.0, method=method)
+    return next(condition for condition in found if condition.axis == "translation")
+
+
+def _is_prompt(info: DeviceInfo, period: float) -> bool:
+    """Returns True if neither a delay nor a rate of its own makes a device need more damping."""
+    return bool(
+        info.damping and delay_ticks(info, period) == 0 and device_period(info, period) == period
+    )
+
+
+def _device_facts(info: DeviceInfo, condition: DampingCondition | None) -> dict[str, object]:
+    needed = None if condition is None else condition.needed
+    numbers = {name: getattr(info, name) for name in ("damping", "mass", "delay", "rate")}
+    return {"name": info.name, **numbers, "needed": needed}
 
 
 def _hertz(way: Alternative) -> float | None:

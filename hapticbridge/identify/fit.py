@@ -54,12 +54,21 @@ class Estimate:
         return self.least > 0.0 or self.most < 0.0
 
     def as_text(self) -> str:
-        """Returns the value and its interval as text, rounded to the significant digits."""
-        value = self.value
-        if self.half_width > 0.0:
-            value = round(value, -math.floor(math.log10(self.half_width))) + 0.0  # no −0
-        up, down = f"{self.half_width:.1g}", f"{self.half_width + self.below:.1g}"
-        return f"{value:.4g} ± {up}" if up == down else f"{value:.4g} +{up} −{down}"
+        """Returns the value and its interval as text, rounded to the significant digits.
+
+        A significant value has a digit more where its rounded interval would reach zero.
+        """
+        value, up, down = self.value, self.half_width, self.half_width + self.below
+        for digits in (1, 2, 3):
+            rounded = value
+            if up > 0.0:
+                rounded = round(value, digits - 1 - math.floor(math.log10(up))) + 0.0  # no −0
+            ends = f"{up:.{digits}g}", f"{down:.{digits}g}"
+            if not self.is_seen or float(ends[value > 0.0]) < abs(rounded):
+                break
+        return (
+            f"{rounded:.4g} ± {ends[0]}" if up == down else f"{rounded:.4g} +{ends[0]} −{ends[1]}"
+        )
 
 
 def solved(columns: Array, right: Array) -> Array:
