@@ -56,7 +56,7 @@ def test_rewriting_alone_changes_no_verdict(tap: Recording, held: Recording, fol
 
 
 @settings(
-    max_examples=120, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     is_held=st.booleans(),
