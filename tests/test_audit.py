@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from audit_cases import ScriptedDevice, balance_of, recorded
-from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from report_runs import LOOSE, circling
 from scipy.spatial.transform import Rotation
@@ -45,26 +44,6 @@ def energy_by_hand(recording: Recording) -> tuple[NDArray[Any], NDArray[Any]]:
     angular = float(meta["rotational_stiffness"]) + float(meta["rotational_damping"]) / period
     slack = np.cumsum(linear * (moved**2).sum(1) / 2 + angular * (turn**2).sum(1) / 2)
     return stored - work - ticks["actuator_work"] - ticks["external_work"], slack
-
-
-@pytest.mark.parametrize("scene", LOOP_SCENES)
-def test_shipped_scenes_are_passive_on_the_simulated_device(scene: str, tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    motion = scene_path(scene).with_suffix(".csv")
-    summary = recorded(path, scene, f"simulated:path={motion}", duration=8.0)
-    report = audit(path)
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    assert report.environment in (
-        ("strict",) if scene == "point_mass" else ("strict", "within slack")
-    )
-    # pliers without a grip axis stay open
-    touches = scene not in ("point_mass", "pliers")
-    assert read_recording(path).ticks["contacts"].any() == touches
-    assert (report.certified, report.exit_code, report.ticks) == (True, 0, 8000)
-    assert report.duration == pytest.approx(8.0)
-    assert (report.verdict, report.environment) == (summary.verdict, summary.environment)
-    assert report.certified == summary.is_certified
-    assert report.slack_share == pytest.approx(summary.slack_share, rel=1e-6)
 
 
 def test_balance_agrees_with_the_kernel_and_with_a_sum_by_hand(held: Recording) -> None:

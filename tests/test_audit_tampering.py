@@ -56,7 +56,7 @@ def test_rewriting_alone_changes_no_verdict(tap: Recording, held: Recording, fol
 
 
 @settings(
-    max_examples=120, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     is_held=st.booleans(),
@@ -91,7 +91,7 @@ def test_no_changed_number_is_missed(
 
 
 @pytest.mark.parametrize("name", ["flags", "contacts", "solver_iterations"])
-@pytest.mark.parametrize("bit", [0, 1, 2, 4, 6, 9])
+@pytest.mark.parametrize("bit", [0, 2, 9])
 def test_no_changed_count_or_flag_is_missed(
     tap: Recording, folder: Path, name: str, bit: int
 ) -> None:
@@ -101,7 +101,7 @@ def test_no_changed_count_or_flag_is_missed(
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-@pytest.mark.parametrize("factor", [1 + 1e-12, 11.0, -1.0, 1e300])
+@pytest.mark.parametrize("factor", [1 + 1e-12, -1.0, 1e300])
 def test_no_changed_parameter_is_missed(
     held: Recording, folder: Path, name: str, factor: float
 ) -> None:

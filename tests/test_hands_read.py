@@ -27,7 +27,7 @@ def bar(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bar") / "run.mcap"
     hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3")]
     with hb.Bridge(two_handed(BAR), hands, clock=hb.SimulatedClock(), recording=path) as bridge:
-        bridge.run(0.6)
+        bridge.run(0.3)
     return path
 
 
@@ -37,7 +37,7 @@ def tongs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     grasp = hb.Grasp("left", grip_axis=hb.GripAxis("hinge", 10.0))
     scene = two_handed(TONGS, ("left", "joint:hinge"))
     with hb.Bridge(scene, [grasp], clock=hb.SimulatedClock(), recording=path) as bridge:
-        bridge.run(0.6)
+        bridge.run(0.3)
     return path
 
 
@@ -122,7 +122,7 @@ def test_records_of_a_recorder_that_died_are_added_for_both_hands(
     cut.write_bytes(data[: int(0.7 * len(data))])
     whole = read_hands(bar)
     rows = np.stack([hand.ticks for hand in whole], axis=1).ravel()
-    assert "all 1200 records are there" in salvage(cut, rows[1:], whole[0].events)
+    assert "all 600 records are there" in salvage(cut, rows[1:], whole[0].events)
     for mended, original in zip(read_hands(cut), whole, strict=True):
         assert mended.ticks.tobytes() == original.ticks.tobytes()
 
@@ -198,7 +198,7 @@ def test_the_trip_of_a_hand_is_repeated(tmp_path: Path) -> None:
         pytest.raises(hb.SafetyTrip, match="hand at 'right'"),
         hb.Bridge(two_handed(BAR), hands, clock=hb.SimulatedClock(), recording=path) as bridge,
     ):
-        bridge.run(0.6)
+        bridge.run(0.3)
     recorded, again, _ = what_if(path, {}, in_process=True).runs
     assert "hand at 'right': the tool is farther" in recorded.trip
     assert again.trip == recorded.trip
@@ -209,7 +209,7 @@ def test_runs_of_several_hands_are_compared_hand_by_hand(bar: Path, tmp_path: Pa
     other = tmp_path / "other.mcap"
     hands = [hb.Grasp("left"), hb.Grasp("right", "simulated:damping=3,hand_mass=3")]
     with hb.Bridge(two_handed(BAR), hands, clock=hb.SimulatedClock(), recording=other) as bridge:
-        bridge.run(0.6)
+        bridge.run(0.3)
     found = compare(bar, other)
     assert found.first is not None
     assert found.first.column.endswith("of 'right'")  # the other hand feels it one tick later

@@ -125,13 +125,14 @@ def test_odd_run_is_told(tmp_path: Path, late: int, status: int, told: str) -> N
 
 def test_snapshot_holds_what_is_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = tmp_path / "cache" / "0123"
-    for name in ("kernel/step.nbi", "kernel/step.1.nbc", "kernel/step.nbi.tmp.77", "../4567/x.nbi"):
+    mine = ["kernel/step.1.nbc", "kernel/step.nbi", "tick-0123.o"]
+    for name in (*mine, "kernel/step.nbi.tmp.77", "tmp0a1b", "../4567/x.nbi"):
         (cache / name).parent.mkdir(parents=True, exist_ok=True)
         (cache / name).write_text(name)
     monkeypatch.setattr("emulated.compile_ahead.cache_folder", lambda: cache)
     folder = snapshot_of_compiled_code(tmp_path / "mine")
     found = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
-    assert found == ["0123/kernel/step.1.nbc", "0123/kernel/step.nbi"]
+    assert found == [f"0123/{name}" for name in mine]
 
 
 @pytest.mark.skipif(kernel() is None, reason=NO_KERNEL)

@@ -22,6 +22,9 @@ from hapticbridge.hands import Grasp
 from hapticbridge.jit import cache_folder
 from hapticbridge.scene import own_grips, read_scene
 
+KEPT = {".nbi", ".nbc", ".o"}
+"""Endings of files with compiled functions: numba's index and code, and our object code."""
+
 _LONG_ENOUGH = 0.01
 """Simulated time in s: ten ticks call everything that there is to compile."""
 
@@ -57,7 +60,9 @@ def snapshot_of_compiled_code(folder: Path) -> Path:
     assert source is not None, "this machine keeps no compiled functions"
     folder.mkdir(parents=True)
     (folder / source.name).mkdir(mode=0o700)  # else the guest would not trust it
-    for path in source.rglob("*.nb[ci]"):
+    for path in source.rglob("*.*"):
+        if path.suffix not in KEPT:
+            continue
         place = folder / source.name / path.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -136,7 +136,7 @@ def tried(parse: Callable[[bytes, Path], object], data: bytes, folder: Path) -> 
 
 @pytest.mark.parametrize("name", PARSERS)
 @settings(
-    max_examples=250,
+    max_examples=125,
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -160,7 +160,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @settings(
-    max_examples=150,
+    max_examples=75,
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
