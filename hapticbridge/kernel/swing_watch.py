@@ -40,11 +40,11 @@ the findings above need no probe and wait for nothing.
 
 A handle on its mechanical stop cannot answer: a reversed motor presses it there and nothing swings.
 One that stands for 1 s against 1.5 N (0.075 N m) and 15 % of the limit is probed, too. It stands if
-all samples are equal but for one step of an encoder to and fro. If it then moves against the force, a hand pushed it, and
-the motor of the axis with the most force is right, for the rest of the run. A soft stop moves it
-along the force, by less than 2 mm. If it does not move against the force in the probe, r stays at
-the quarter until the handle is 2 mm away, and the flag ``UNANSWERED`` stays. On a soft stop the
-step of such a probe rings, so that c_s does not count until 0.3 s after it.
+all samples are equal but for one step of an encoder to and fro. If it then moves against the force,
+a hand pushed it, and the motor of the axis with the most force is right, for the rest of the run. A
+soft stop moves it along the force, by less than 2 mm. If it does not move against the force in the
+probe, r stays at the quarter until the handle is 2 mm away, and the flag ``UNANSWERED`` stays. On a
+soft stop the step of such a probe rings, so that c_s does not count until 0.3 s after it.
 
 The margins, in 856 runs of honest hands of 0.05 to 2 kg and up to 3000 N/m that tap, hammer and
 shake at up to 8 Hz and 30 mm, with limits of 2, 5 and 10 N: p >= −0.07 where E_s >= E/4; on a
@@ -152,9 +152,9 @@ ROUNDING = 1e-6
 """Share of an encoder's step within which two places are equal; no unit."""
 
 PUSH, PUSH_SHARE = (1.5, 0.075), 0.15
-"""Least force in N and torque in N m under which a handle that stands is suspicious, and least share
-of the limit. A probe takes three quarters of it away, more than twice the friction of a desktop
-device. A strong device, as a wheel of 2 N m, has more friction."""
+"""Least force in N and torque in N m under which a handle that stands is suspicious, and least
+share of the limit. A probe takes three quarters of it away, more than twice the friction of a
+desktop device. A strong device, as a wheel of 2 N m, has more friction."""
 
 RING = 16
 """Blocks that are kept for late work."""
