@@ -36,8 +36,8 @@ class TickFlag(IntFlag):
         RUNS_AWAY: The device did not move as its force pushed, as with a reversed axis; the force
             was taken away before this tick.
         PROBED: The force is lowered for a moment to see whether the device follows it, or returns.
-        UNANSWERED: The device stood against its force and did not move when that was lowered, so it
-            is not known whether its motors push the right way.
+        UNANSWERED: The device stood against its force and did not come against it when that was
+            lowered, so it is not known whether its motors push the right way.
     """
 
     OVERRUN = 1

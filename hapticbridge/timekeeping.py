@@ -122,8 +122,8 @@ def watch_sentence(flags: int) -> str:
         force, torque = (format_si(*pair) for pair in zip(PUSH, ("N", "N m"), strict=True))
         return (
             f"the device was pushed with {force} ({torque}) or more for {format_si(STAND, 's')} "
-            f"and did not move, also when the force was lowered: {UNKNOWN}; move the handle away "
-            "from its stop and start again"
+            f"and stood, and did not come against the force when that was lowered: {UNKNOWN}; move "
+            "the handle away from its stop and start again"
         )
     return ""
 

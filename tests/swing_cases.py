@@ -29,6 +29,10 @@ LIFTED = {
 """By how much a hand goes up in m before it is random: into the hole, onto the screw."""
 
 
+ALARM = int(TickFlag.SWINGING | TickFlag.RUNS_AWAY | TickFlag.UNANSWERED)
+"""Flags of what the watch finds."""
+
+
 def taps(frequency: float, amplitude: float, duration: float = 3.0) -> Motion:
     """Returns a hand that taps on the face of ``virtual_wall``, in Hz and m."""
     times = np.arange(0.0, duration + 0.005, 0.002)
@@ -65,7 +69,7 @@ def shakes(name: str, frequency: float, amplitude: float, duration: float = 3.0)
 
 def alarms(name: str, motion: Motion | None, grip: Hand | None) -> int:
     """Runs a hand on a scene; returns the alarms of the watch as flags, 0 for none."""
-    return watch_flags(name, motion, grip) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
+    return watch_flags(name, motion, grip) & ALARM
 
 
 def watch_flags(name: str, motion: Motion | None, grip: Hand | None) -> int:
@@ -145,8 +149,7 @@ def bunched(
     with hb.Bridge(name, late, clock=hb.SimulatedClock()) as bridge:
         summary = bridge.run(motion.duration)
         flags = bridge.latest_records(summary.ticks)["flags"]
-    found = int(np.bitwise_or.reduce(flags)) & int(TickFlag.SWINGING | TickFlag.RUNS_AWAY)
-    return found, late.max_net_energy()
+    return int(np.bitwise_or.reduce(flags)) & ALARM, late.max_net_energy()
 
 
 class OnItsStop:
@@ -157,17 +160,30 @@ class OnItsStop:
         sign: 1 for a motor that pushes as it is told, −1 for one that is reversed.
         push: Force of the hand in N.
         leaves: Time in s at which it pulls the handle back with 2 N.
+        stiffness: Stiffness of the stop in N/m.
+        step: Step of the encoder in m, whose last digit is not steady; 0 for a perfect one.
     """
 
     info = hb.DeviceInfo(
         name="rail", axes=("x",), force_limit=10.0, damping=2.0, delay=0.0, is_real=False
     )
 
-    def __init__(self, end: float, sign: float, push: float, leaves: float = np.inf) -> None:
+    def __init__(
+        self,
+        end: float,
+        sign: float,
+        push: float,
+        leaves: float = np.inf,
+        *,
+        stiffness: float = np.inf,
+        step: float = 0.0,
+    ) -> None:
         self._end, self._sign, self._push, self._leaves = end, sign, push, leaves
+        self._stiffness, self._step = stiffness, step
 
     def start(self, period: float) -> NDArray[np.void]:
         self._period, self._tick = period, 0
+        self._digits = np.random.default_rng(0)
         self._place = self._speed = self._force = 0.0
         return np.array([((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)], hb.SAMPLE_DTYPE)
 
@@ -175,12 +191,18 @@ class OnItsStop:
         if self._tick > 0:
             hand = self._push if self._tick * self._period < self._leaves else -2.0
             push = hand + self._sign * self._force - 2.0 * self._speed
+            deep = self._place - self._end
+            if deep > 0.0:
+                push -= self._stiffness * deep + np.sqrt(0.6 * self._stiffness) * self._speed
             self._speed += self._period * push / 0.6
             self._place += self._period * self._speed
-            if self._place > self._end:
+            if self._place > self._end and np.isinf(self._stiffness):
                 self._place, self._speed = self._end, min(self._speed, 0.0)
         self._tick += 1
-        sample[0] = ((self._place, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+        place = self._place
+        if self._step:
+            place = self._step * (np.floor(place / self._step) + self._digits.integers(2))
+        sample[0] = ((place, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
         return 0
 
     def write(self, wrench: NDArray[np.float64]) -> None:

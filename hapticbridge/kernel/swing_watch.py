@@ -39,10 +39,12 @@ the limit. A probe is no alarm. The next one waits 0.5 s, then twice as long eac
 the findings above need no probe and wait for nothing.
 
 A handle on its mechanical stop cannot answer: a reversed motor presses it there and nothing swings.
-One that stands for 1 s, with equal samples, against 1.5 N (0.075 N m) is probed, too. If it then
-moves against the force, a hand pushed it and the motor is right, for the rest of the run. If it
-stands through the probe, r stays at the quarter until the handle is 2 mm away, and the flag
-``UNANSWERED`` stays.
+One that stands for 1 s against 1.5 N (0.075 N m) and 15 % of the limit is probed, too. It stands if
+all samples are equal but for one step of an encoder to and fro. If it then moves against the force,
+a hand pushed it, and the motor of the axis with the most force is right, for the rest of the run. A
+soft stop moves it along the force, by less than 2 mm. If it does not move against the force in the
+probe, r stays at the quarter until the handle is 2 mm away, and the flag ``UNANSWERED`` stays. On a
+soft stop the step of such a probe rings, so that c_s does not count until 0.3 s after it.
 
 The margins, in 856 runs of honest hands of 0.05 to 2 kg and up to 3000 N/m that tap, hammer and
 shake at up to 8 Hz and 30 mm, with limits of 2, 5 and 10 N: p >= −0.07 where E_s >= E/4; on a
@@ -141,14 +143,18 @@ PROBE, PROBE_SHARE, REST, LONGEST_REST = 0.15, 0.25, 0.5, 8.0
 At a quarter of the ratio a swing has a sixteenth of the stiffness and ends."""
 
 STAND, AWAY = 1.0, 2e-3
-"""Time in s for which all samples of a handle that stands are equal, and distance in m at which it
-has left. The tremor of a hand, at 8 to 12 Hz, leaves a step of most encoders within
-1 s. Friction may hide it, and the answer to the probe is larger. Angles are ``USUAL_ARM`` times
-as many rad."""
+"""Time in s for which a handle stands until it is probed, and distance in m at which it has left; a
+soft stop gives way by less. The tremor of a hand, at 8 to 12 Hz, leaves a step of most encoders
+within 1 s. Friction may hide it, and the answer to the probe is larger. Angles are ``USUAL_ARM``
+times as many rad."""
 
-PUSH = 1.5, 0.075
-"""Least force in N and torque in N m under which a handle that stands is suspicious. A probe takes
-three quarters of it away, more than twice the friction of a desktop device."""
+ROUNDING = 1e-6
+"""Share of an encoder's step within which two places are equal; no unit."""
+
+PUSH, PUSH_SHARE = (1.5, 0.075), 0.15
+"""Least force in N and torque in N m under which a handle that stands is suspicious, and least
+share of the limit. A probe takes three quarters of it away, more than twice the friction of a
+desktop device. A strong device, as a wheel of 2 N m, has more friction."""
 
 RING = 16
 """Blocks that are kept for late work."""
@@ -166,7 +172,9 @@ WATCH_DTYPE = np.dtype(
         ("gain", "<f8", 2),
         ("probe_blocks", "<i8"),
         ("longest_rest", "<i8"),
-        ("stand_blocks", "<i8"),
+        ("stand_ticks", "<i8"),
+        ("ring_blocks", "<i8"),
+        ("push", "<f8", 2),
         ("flags", "<i8"),
         ("max_share", "<f8"),
         ("cap", "<f8"),
@@ -203,15 +211,17 @@ WATCH_DTYPE = np.dtype(
         ("steps", "<f8", 2),
         ("counts", "<i8", 8),
         ("stray", "<f8", 6),
+        ("step", "<f8", 6),
         ("stood", "<i8", 2),
-        ("is_right", "<i8", 2),
+        ("is_right", "<i8", 6),
         ("is_held", "<i8", 2),
+        ("rings_end", "<i8", 2),
     ]
 )
 """Sub-record ``watch``, written by this module alone. ``block_ticks`` is 0 without a watch; pairs
 are translation and rotation.
 
-The first twelve are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
+The first fourteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
 slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
 N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_share`` the one
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
@@ -220,8 +230,9 @@ W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed``
 ``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and Σ
 W². ``still`` counts the equal samples before this one, and ``steps`` the coarse steps of late;
 ``counts`` are blocks in a row of late, reversed, exchanged and answered late. ``stray`` is the way
-from where the handle stands, ``stood`` the blocks since; ``is_right`` is 1 once it moved as a motor
-that is right lets it, ``is_held`` while r waits for it to leave."""
+from where the handle stands, ``step`` the one step that it may make, ``stood`` the ticks since;
+``is_right`` is 1 for an axis once it moved as a motor that is right lets it, ``is_held`` while r
+waits for it to leave; c_s does not count before the block ``rings_end``."""
 
 
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
@@ -242,9 +253,11 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
     watch["late_energy"] = [limits.swing_energy * part for part in level]
     speed = limits.runaway_speed
     watch["gain"] = speed * level[0], USUAL_ARM * speed * level[1]
-    watch["probe_blocks"], watch["rest"], watch["longest_rest"], watch["stand_blocks"] = (
-        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST, STAND)
+    watch["probe_blocks"], watch["rest"], watch["longest_rest"], watch["ring_blocks"] = (
+        max(round(time / block), 1) for time in (PROBE, REST, LONGEST_REST, WORK_MEMORY)
     )
+    watch["stand_ticks"] = round(STAND / period)
+    watch["push"] = np.maximum(PUSH, PUSH_SHARE * watch["limits"])
 
 
 def _butterworth(corner: float) -> list[float]:
@@ -349,31 +362,63 @@ def _close_block(s: State) -> None:
 @compiled
 def _stands(s: State, kind: int) -> bool:
     """Returns True if the handle stands against the force; judges its answer to a probe."""
-    watch, stray, first = s.watch, s.watch.stray, 3 * kind
-    if s.loop.external_flags & STALE_SAMPLE:
-        return False
-    way = along = square = 0.0
+    watch, first = s.watch, 3 * kind
+    square, axis = 0.0, first
     for i in range(first, first + 3):
-        stray[i] += watch.motion[i]
-        way += stray[i] * stray[i]
-        along += stray[i] * watch.wrench[i]
+        watch.stray[i] += watch.motion[i]
         square += watch.wrench[i] * watch.wrench[i]
-    way = math.sqrt(way) / (1.0 if kind == 0 else USUAL_ARM)
-    if way > (AWAY if watch.is_held[kind] else 0.0):
-        is_probed = watch.blocks < watch.probe_end
-        if is_probed and watch.stood[kind] >= watch.stand_blocks and along < 0.0:
-            watch.is_right[kind] = 1
+        if abs(watch.wrench[i]) > abs(watch.wrench[axis]):
+            axis = i
+    is_judged = watch.blocks < watch.probe_end and watch.stood[kind] >= watch.stand_ticks
+    is_pushed = is_judged or math.sqrt(square) >= watch.push[kind] * watch.ticks
+    if is_judged:
+        watch.rings_end[kind] = watch.probe_end + watch.ring_blocks
+    if _has_left(watch, kind, axis, is_judged) or not (is_pushed or watch.is_held[kind]):
         watch.is_held[kind] = watch.stood[kind] = 0
         for i in range(first, first + 3):
-            stray[i] = 0.0
-    elif watch.stood[kind] > 0 or math.sqrt(square) >= PUSH[kind] * watch.ticks:
-        watch.stood[kind] += 1
-    if watch.stood[kind] < watch.stand_blocks or watch.is_right[kind] or watch.is_held[kind]:
+            watch.stray[i] = watch.step[i] = 0.0
+    elif is_pushed:
+        watch.stood[kind] += watch.ticks
+    is_known = watch.is_right[axis] or watch.is_held[kind] or s.loop.external_flags & STALE_SAMPLE
+    if watch.stood[kind] < watch.stand_ticks or is_known:
         return False
-    if watch.blocks == watch.probe_end - 1:
+    until = watch.stand_ticks + watch.probe_blocks * watch.block_ticks
+    if watch.blocks == watch.probe_end - 1 and watch.stood[kind] >= until:
         watch.is_held[kind] = 1
         watch.flags |= UNANSWERED
     return True
+
+
+@compiled
+def _has_left(watch: Part, kind: int, axis: int, is_judged: bool) -> bool:
+    """Returns True if the handle no longer stands; notes the first step of its encoder.
+
+    Args:
+        watch: The watch.
+        kind: 0 for translation, 1 for rotation.
+        axis: Index of the largest part of the wrench; its motor is right if that is the answer.
+        is_judged: True while the handle answers to a probe.
+    """
+    first, along = 3 * kind, 0.0
+    for i in range(first, first + 3):
+        along += watch.stray[i] * watch.wrench[i]
+    x, y, z = watch.stray[first], watch.stray[first + 1], watch.stray[first + 2]
+    u, v, w = watch.step[first], watch.step[first + 1], watch.step[first + 2]
+    way, step = norm((x, y, z)), norm((u, v, w))
+    is_away = way > AWAY * (1.0 if kind == 0 else USUAL_ARM)
+    if watch.is_held[kind]:
+        return is_away
+    if min(way, norm((x - u, y - v, z - w))) <= ROUNDING * step:
+        return False
+    if is_judged:
+        if along < 0.0:
+            watch.is_right[axis] = 1
+        return is_away or along < 0.0
+    if step > 0.0 or watch.stood[kind] == 0:
+        return True
+    for i in range(first, first + 3):
+        watch.step[i] = watch.stray[i]
+    return False
 
 
 @compiled
@@ -521,6 +566,7 @@ def _verdict(s: State, kind: int) -> int:
     counts[at + 2] = counts[at + 2] + 1 if is_exchanged else 0
     is_answered = along <= 0.0 and power < FOLLOWED
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
+    is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY

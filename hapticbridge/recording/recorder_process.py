@@ -52,9 +52,11 @@ is gone; a slow device has a sample within it."""
 LOWERED = {
     int(TickFlag.RUNS_AWAY): "FORCE TAKEN AWAY: the device does not move as it is pushed",
     int(TickFlag.SWINGING): "FORCE LOWERED: the device answers late, or an axis is reversed",
-    int(TickFlag.UNANSWERED): "FORCE LOWERED: the device does not move; move it off its stop",
 }
 """Words on a force that the watch lowered, by its flag; the first that was seen is shown."""
+
+UNANSWERED = "FORCE LOWERED: the device does not move; move it off its stop"
+"""Words that are shown while the force is lowered for this."""
 
 
 class RunState:
@@ -115,7 +117,10 @@ class RunState:
             f"device {' | '.join(joules)}",
             f"{self._overruns} overruns",
         ]
-        parts += [words for flag, words in LOWERED.items() if self._flags & flag][:1]
+        lowered = [words for flag, words in LOWERED.items() if self._flags & flag]
+        is_low = (self._last["flags"] & TickFlag.PROBED) != 0
+        is_held = is_low & (self._last["flags"] & TickFlag.UNANSWERED != 0)
+        parts += (lowered or ([UNANSWERED] if is_held.any() else []))[:1]
         if self._silence >= SILENCE:
             parts.append(f"NO NEW SAMPLE for {self._silence:.1f} s")
         elif self._longest_silence >= SILENCE:
