@@ -398,7 +398,7 @@ def test_every_point_stands_at_its_cost_and_error_in_the_picture(chart: Chart) -
     points = tuple(replace(each, panel=panel.key) for each in (good, wild))
     axes = draw_chart(replace(chart, measurements=points)).axes[0]
     marks = {
-        str(line.get_marker()): (float(line.get_xdata()[0]), float(line.get_ydata()[0]))
+        str(line.get_marker()): tuple(np.ravel(line.get_xydata()).tolist())
         for line in axes.lines
         if np.size(line.get_xdata()) == 1
     }
