@@ -31,8 +31,9 @@ from hapticbridge.view.replay import Replay, Theatre  # noqa: E402
 WIDTH = 800
 """Size of a picture in pixels. Pages are drawn larger and then reduced, so that all of it fits."""
 
-SETTLED = 15.0
-"""Time in s until a page without a graphics card has drawn its content."""
+SETTLED = 60.0
+"""Time in s until a page without a graphics card has drawn its content. On a busy machine its
+colours are pale after 15 s."""
 
 
 def save(tab: Tab, target: Path) -> None:

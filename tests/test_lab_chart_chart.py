@@ -78,7 +78,7 @@ class FakeRun:
         """Returns no choice."""
         return {}
 
-    def run(self) -> float:
+    def go(self) -> float:
         """Returns the next of its times."""
         self.calls += 1
         return self._times[(self.calls - 1) % len(self._times)]
@@ -398,9 +398,9 @@ def test_every_point_stands_at_its_cost_and_error_in_the_picture(chart: Chart) -
     points = tuple(replace(each, panel=panel.key) for each in (good, wild))
     axes = draw_chart(replace(chart, measurements=points)).axes[0]
     marks = {
-        str(line.get_marker()): tuple(np.ravel(line.get_data()).tolist())
+        str(line.get_marker()): tuple(np.ravel(line.get_xydata()).tolist())
         for line in axes.lines
-        if np.size(line.get_data()) == 2
+        if np.size(line.get_xdata()) == 1
     }
     assert marks["o"] == marks["*"] == (0.02, 0.5)
     cost, error = marks["v"]
