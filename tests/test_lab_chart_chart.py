@@ -78,7 +78,7 @@ class FakeRun:
         """Returns no choice."""
         return {}
 
-    def go(self) -> float:
+    def run(self) -> float:
         """Returns the next of its times."""
         self.calls += 1
         return self._times[(self.calls - 1) % len(self._times)]
