@@ -15,6 +15,7 @@ from hapticbridge.lab.chart.peg import HOLD, RAMP, led, score_at_rest
 from hapticbridge.lab.chart.scene_run import Stage, Staged, Stages
 from hapticbridge.lab.chart.workload import Panel, PeerWork, Score, Take, diverged, score_of
 from hapticbridge.lab.maps.base import scene_of
+from hapticbridge.options import Workspace
 from hapticbridge.pose import quaternion_exp
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.scene import Scene
@@ -49,6 +50,10 @@ STACK_PANEL = Panel(
 )
 
 _SOFT = 'solref="0.002 1" solimp="0.9 0.95 0.001 0.5 2"'
+
+
+TOP = (2 * BOXES - 1) * HALF_HEIGHT
+"""Height of the top box's centre in m. At the start the boxes touch without a gap."""
 
 
 def _box(number: int) -> str:
@@ -93,33 +98,47 @@ def _leaning(
 
 
 def leaned(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the path of the handle: down, and then to one side and back."""
+    """Returns the path of the handle from its start: down, and then to one side and back."""
     quaternions = np.zeros((times.size, 4))
     quaternions[:, 0] = 1.0
     return _leaning(times)[0], quaternions
 
 
+def leaned_in_scene(
+    times: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the path of the handle in the scene, from the grip's place at the start."""
+    places, quaternions = leaned(times)
+    places[:, 2] += TOP
+    return places, quaternions
+
+
+def borne(down: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the force sideways in N up to which the stack rests under a force downwards in N.
+
+    At each joint, with the weight W of the boxes above and the hand's height H above it, the force
+    F sideways and N downwards obey F <= μ (N + W) and F H <= (N + W) HALF_WIDTH.
+    """
+    joints = np.arange(BOXES)
+    load = down[..., None] + (joints + 1) * BOX_MASS * GRAVITY
+    share = np.minimum(BOX_FRICTION, HALF_WIDTH / ((2 * joints + 1) * HALF_HEIGHT))
+    return np.asarray((load * share).min(axis=-1))
+
+
 def leaning_force(coupling: Coupling, times: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the force of the coupling on the top box in N, K h + B h', while the stack rests.
 
-    The stack rests while every box below the force (F, 0, −N) holds: with the weight W of the boxes
-    above a joint, and the force's height H above it, F <= μ (N + W) and F H <= (N + W) HALF_WIDTH.
-
     Raises:
-        StudyError: The stack would break away or tip, or come within 1 − ``SAFETY`` of that.
+        StudyError: The force sideways exceeds ``SAFETY`` of what the stack bears.
     """
     way, velocity = _leaning(times)
     force = coupling.stiffness * way + coupling.damping * velocity
-    side, down = np.abs(force[:, 0]), -force[:, 2]
-    for number in range(BOXES):
-        load = down + (number + 1) * BOX_MASS * GRAVITY
-        height = (2 * number + 1) * HALF_HEIGHT
-        bearing = load * min(BOX_FRICTION, HALF_WIDTH / height)
-        if np.any(side > SAFETY * bearing):
-            raise StudyError(
-                f"with K = {coupling.stiffness:g} N/m the hand leans with {side.max():.3g} N on "
-                f"the stack, which bears {bearing.min():.3g} N: it would not rest"
-            )
+    side, most = np.abs(force[:, 0]), borne(-force[:, 2])
+    if np.any(side > SAFETY * most):
+        raise StudyError(
+            f"with K = {coupling.stiffness:g} N/m the hand leans with {side.max():.3g} N on a "
+            f"stack that bears {most[np.argmax(side)]:.3g} N: it would not rest"
+        )
     return force
 
 
@@ -145,21 +164,24 @@ class Stack(Staged):
         self._grid, self._finest = grid, finest
         count = round(STACK_DURATION / grid)
         self._reference = np.zeros(count, TICK_DTYPE)
-        self._reference["tool_position"][:, 2] = (2 * BOXES - 1) * HALF_HEIGHT
+        self._reference["tool_position"][:, 2] = TOP
         self._reference["tool_quaternion"][:, 0] = 1.0
         self._reference["wrench_on_tool"][:, :3] = leaning_force(
             coupling, grid * np.arange(1.0, count + 1)
         )
-        super().__init__(
-            coupling, Stages(lambda: Stage(stack_scene(), leaned, grid * count, coupling))
-        )
+
+        def stage() -> Stage:
+            path, duration = leaned_in_scene, grid * count
+            return Stage(
+                stack_scene(), path, duration, coupling, workspace=Workspace(absolute=True)
+            )
+
+        super().__init__(coupling, Stages(stage))
 
     def peer_work(self) -> PeerWork:
         """Describes the stack to other engines."""
         duration = self._grid * self._reference.size
-        return work_of(
-            stack_scene(), leaned, duration, self._finest, self.coupling, self._judge
-        )
+        return work_of(stack_scene(), leaned, duration, self._finest, self.coupling, self._judge)
 
     def _judge(self, takes: Sequence[Take]) -> Mapping[str, Score]:
         (take,) = takes

@@ -429,6 +429,8 @@ _PACKAGE = "hapticbridge.lab.engines"
 ENGINES = {
     "mujoco": "mujoco",
     "mujoco_warp": "mujoco_warp",
+    "newton_xpbd": "newton",
+    "newton_steel": "newton",
     "ode": "ode",
     "ode_spring": "ode",
     "physx": "physx",

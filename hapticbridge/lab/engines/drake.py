@@ -39,8 +39,8 @@ POINT_STIFFNESS = 1e7
 boxes. 1e6 is worse by a fifth, 1e8 no better."""
 
 MODULUS = 1e9
-"""Hydroelastic modulus of the free bodies in Pa, that of a hard plastic. A settled peg is wrong by 0.06 to
-27 µm. At 1e10 the error is smaller, but with friction the peg flew out of the hole."""
+"""Hydroelastic modulus of the free bodies in Pa, that of a hard plastic. A settled peg is wrong by
+0.06 to 27 µm. At 1e10 the error is smaller, but with friction the peg flew out of the hole."""
 
 RESOLUTION = 0.1
 """Edge of the tessellation of round shapes as a share of their radius, without unit."""
@@ -127,7 +127,9 @@ class DrakeSimulation(HeldSimulation):
         self._velocities = [body.floating_velocities_start_in_v() for body in bodies]
         velocity = task.start_velocity
         plant.SetFreeBodySpatialVelocity(
-            context, bodies[0], SpatialVelocity(np.array(velocity.angular), np.array(velocity.linear))
+            context,
+            bodies[0],
+            SpatialVelocity(np.array(velocity.angular), np.array(velocity.linear)),
         )
         self._simulator.Initialize()
         self._steps = 0

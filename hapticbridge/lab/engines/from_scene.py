@@ -166,8 +166,7 @@ def _touching(scene: Scene) -> list[tuple[int, int]]:
     apart = [
         (a, b)
         for a, b in combinations(range(model.ngeom), 2)
-        if bodies[a] != bodies[b]
-        and (_is_free(model, bodies[a]) or _is_free(model, bodies[b]))
+        if bodies[a] != bodies[b] and (_is_free(model, bodies[a]) or _is_free(model, bodies[b]))
     ]
     pairs = [(a, b) for a, b in apart if own[a] & affinity[b] or own[b] & affinity[a]]
     touching = {geom for pair in pairs for geom in pair}
