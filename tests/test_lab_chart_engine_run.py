@@ -15,13 +15,23 @@ from hapticbridge.errors import StudyError
 from hapticbridge.lab.chart import chart as chart_module
 from hapticbridge.lab.chart import contact_bodies
 from hapticbridge.lab.chart.chart import Chart, Extent, measure_chart, open_workload
-from hapticbridge.lab.chart.engine_run import EngineRun, peer_settings
+from hapticbridge.lab.chart.engine_run import EngineRun, Meter, peer_settings
 from hapticbridge.lab.chart.output import summary_of
 from hapticbridge.lab.chart.peg import JammedPeg
 from hapticbridge.lab.chart.setting import OWN, Setting
 from hapticbridge.lab.chart.workload import PeerWork, Workload
 from hapticbridge.lab.engines import mujoco as mujoco_engine
-from hapticbridge.lab.engines.base import ENGINES, Engine, Simulation, Task, composed, open_engine
+from hapticbridge.lab.engines.base import (
+    ENGINES,
+    Body,
+    Engine,
+    FreeBody,
+    Pose,
+    Simulation,
+    Task,
+    composed,
+    open_engine,
+)
 from hapticbridge.lab.engines.base import Setting as EngineSetting
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.pose import Vector
@@ -115,8 +125,10 @@ def test_peg_that_leans_and_rod_that_taps_touch_and_rest_in_every_engine(name: s
     settled = run.scores()["settled"]
     # a verdict on its energy: it touches at the end of every hold
     assert settled.verdict in ("strict", "within slack", "active")
-    # 31 µm where PhysX keeps the contacts of the upright peg; Drake's compliant ones give way
-    assert settled.position_peak < (20e-6 if name.startswith("drake") else 5e-6)
+    # 31 µm where PhysX keeps the contacts of the upright peg; Drake's compliant ones give way, and
+    # those of MuJoCo Warp come and go
+    apart = {"mujoco_warp": 30e-6, "drake_point": 20e-6, "drake_hydroelastic": 20e-6}
+    assert settled.position_peak < apart.get(name, 5e-6)
     rod = EngineRun(engine, workload("rod_impact").peer_work(), Setting(METHODS["explicit"], FINE))
     assert rod.scores()["impact"].verdict in ("strict", "within slack", "active")
 
@@ -136,6 +148,20 @@ def test_meter_of_a_peer_reads_as_the_ledger_of_the_bridge(
     assert (own.environment, peer.environment) == ("within slack", "within slack")
     # the contacts create nothing here: it is the held force that does
     assert peer.engine.verdict == "strict"
+
+
+def test_meter_of_a_peer_counts_the_energy_of_every_body() -> None:
+    period, steps, gravity = 1e-3, 100, 9.81
+    other = FreeBody(Body(0.5, (1e-3,) * 3), Pose((1.0, 0.0, 0.0)))
+    task = Task("fall", Body(0.3, (1e-3,) * 3), gravity=(0.0, 0.0, -gravity), others=(other,))
+    simulation = open_engine("mujoco").open(task, period)
+    meter = Meter(simulation, task, period, simulation.wrench)
+    for _ in range(steps):
+        simulation.advance((0.0,) * 3, (0.0,) * 3)
+        meter.close_step()
+    # the new velocity moves a body by g T²/2 too far in each step
+    lost = -0.5 * (0.3 + 0.5) * gravity**2 * period**2 * steps
+    assert meter.energy == pytest.approx(lost, rel=1e-9)
 
 
 def test_spinning_body_spins_in_another_engine_too() -> None:

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import nnls
+from scipy.optimize import linprog, minimize, nnls
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import StudyError
-from hapticbridge.lab.chart import contact_bodies, free_bodies, peg
+from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, resting_bodies
 from hapticbridge.lab.chart.chart import Extent, measure_chart, open_workload
 from hapticbridge.lab.chart.scene_run import COUPLING, OwnReferences, SceneRates
 from hapticbridge.lab.chart.setting import Setting, rate_settings
@@ -210,6 +210,133 @@ def test_block_that_would_break_away_too_early_or_never_is_refused() -> None:
     for stiffness in (1e5, 10.0):
         with pytest.raises(StudyError, match="the block breaks away at"):
             contact_bodies.SlidingBlock(Coupling(stiffness, 1.0, 0.0, 0.0), GRID, GRID)
+
+
+def can_rest(side: float, down: float) -> bool:
+    """Finds forces at both edges of every joint of the stack that balance each box, by a program.
+
+    The unknowns of a joint are the normal and tangential forces at its left and right edge.
+    """
+    boxes, wide, high = resting_bodies.BOXES, resting_bodies.HALF_WIDTH, resting_bodies.HALF_HEIGHT
+    balance, sums = np.zeros((3 * boxes, 4 * boxes)), np.zeros(3 * boxes)
+    for box in range(boxes):
+        for joint, sign, lever in ((box, 1.0, -high), (box + 1, -1.0, high)):
+            if joint == boxes:
+                continue
+            for edge, place in enumerate((-wide, wide)):
+                column = 4 * joint + 2 * edge
+                balance[3 * box + 1, column] = sign
+                balance[3 * box + 2, column] = -sign * place
+                balance[3 * box, column + 1] = sign
+                balance[3 * box + 2, column + 1] = sign * lever
+        sums[3 * box + 1] = resting_bodies.BOX_MASS * resting_bodies.GRAVITY
+    sums[3 * (boxes - 1)] -= side
+    sums[3 * (boxes - 1) + 1] += down
+    cone = np.zeros((4 * boxes, 4 * boxes))
+    for edge in range(2 * boxes):
+        for row, sign in enumerate((1.0, -1.0)):
+            cone[2 * edge + row, 2 * edge] = -resting_bodies.BOX_FRICTION
+            cone[2 * edge + row, 2 * edge + 1] = sign
+    bounds = [(0, None), (None, None)] * (2 * boxes)
+    nothing = np.zeros(4 * boxes)
+    return bool(linprog(nothing, cone, nothing, balance, sums, bounds).success)
+
+
+def test_stack_rests_up_to_the_force_at_which_edges_and_friction_can_bear_it() -> None:
+    for down in (0.0, 1.0, 5.0, 20.0):
+        most = float(resting_bodies.borne(np.array(down)))
+        assert can_rest(0.99 * most, down)
+        assert not can_rest(1.01 * most, down)
+    times = 4e-3 * np.arange(1.0, 301.0)
+    force = resting_bodies.leaning_force(free_bodies.COUPLING, times)
+    assert all(can_rest(-x, -z) for x, _, z in force[::25])
+    # a spring against a box that rests
+    ways = resting_bodies.leaned(times)[0]
+    rates = np.gradient(ways, times, axis=0, edge_order=2)
+    law = free_bodies.COUPLING.stiffness * ways + free_bodies.COUPLING.damping * rates
+    np.testing.assert_allclose(force, law, atol=2e-4)
+    assert np.abs(force).max(axis=0) == pytest.approx([1.5, 0.0, 5.0], rel=0.01)
+    with pytest.raises(StudyError, match="it would not rest"):
+        resting_bodies.Stack(Coupling(1e5, 1.0, 0.0, 0.0), GRID, GRID)
+
+
+def test_leaning_on_a_stack_is_judged_by_the_ways_of_its_top(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held = open_workload("stack", Extent(GRID, 1e-3))
+    rigid, soft = (
+        held.run(Setting(METHODS["lossless"].with_contact(contact), 1e-3)).scores()["leaning"]
+        for contact in ("rigid", "scene")
+    )
+    assert rigid.verdict == "strict"
+    assert rigid.position_peak < 5e-6
+    assert rigid.jnd < 0.05
+    assert soft.jnd > 10 * rigid.jnd  # MuJoCo's friction creeps
+    with pytest.raises(Exception, match="leans by no spring"):
+        held.run(Setting(METHODS["weld"], 1e-3))
+    # 1.5 N on boxes that hold each other with 0.1 (5 N + 1 N)
+    sliding = open_workload("stack", Extent(GRID, 1e-3))
+    monkeypatch.setattr(resting_bodies, "BOX_FRICTION", 0.1)
+    assert score(sliding, "lossless", 1e-3).jnd > 1.0
+
+
+def corners_in_socket(place: np.ndarray) -> np.ndarray:
+    """Returns the gaps of six corners to six walls in mm, at x and y in mm and an angle."""
+    apothem = 1e3 * resting_bodies.APOTHEM
+    sixths = np.pi / 3 * np.arange(6)
+    corner = np.pi / 6 + sixths + place[2]
+    radius = 2 * apothem / np.sqrt(3)
+    points = place[:2] + radius * np.column_stack([np.cos(corner), np.sin(corner)])
+    normals = np.column_stack([np.cos(sixths), np.sin(sixths)])
+    return np.asarray(apothem + 1e3 * resting_bodies.CLEARANCE - points @ normals.T).ravel()
+
+
+def test_key_rests_where_the_energy_of_the_coupling_is_least() -> None:
+    coupling = resting_bodies.KEY_COUPLING
+    for (turn, *across), row in zip(
+        resting_bodies.TURNS, resting_bodies.turned_key(coupling), strict=True
+    ):
+
+        def energy(
+            place: np.ndarray, turn: float = turn, across: tuple[float, ...] = tuple(across)
+        ) -> float:
+            stretch = np.array(across) - 1e-3 * place[:2]
+            twist = turn - place[2]
+            spring = coupling.stiffness * stretch @ stretch
+            return float(1e3 * (spring + coupling.rotational_stiffness * twist**2))
+
+        found = minimize(
+            energy,
+            [0.01, -0.01, 0.0],
+            method="SLSQP",
+            constraints={"type": "ineq", "fun": corners_in_socket},
+            options={"ftol": 1e-14},
+        )
+        assert found.x == pytest.approx([0.0, 0.0, np.sign(turn) * resting_bodies.play()], abs=1e-6)
+        force = coupling.stiffness * (np.array(across) - 1e-3 * found.x[:2])
+        assert row["wrench_on_tool"][:2] == pytest.approx(force, abs=1e-5)
+        torque = coupling.rotational_stiffness * (turn - found.x[2])
+        assert row["wrench_on_tool"][5] == pytest.approx(torque, abs=1e-6)
+        turned = Rotation.from_quat(row["tool_quaternion"], scalar_first=True).as_rotvec()
+        assert turned == pytest.approx([0.0, 0.0, found.x[2]], abs=1e-6)
+
+
+def test_key_that_turns_freely_or_leaves_the_middle_is_refused() -> None:
+    with pytest.raises(StudyError, match="turns freely"):
+        resting_bodies.play(5e-3, 0.8e-3)
+    for weak in (Coupling(1000.0, 1.0, 1e-3, 0.0), Coupling(1e6, 1.0, 1.0, 0.0)):
+        with pytest.raises(StudyError, match="does not keep the key in the middle"):
+            resting_bodies.HexSocket(weak, GRID, GRID)
+
+
+def test_turned_key_is_judged_by_its_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    rigid = score(open_workload("hex_socket", Extent(GRID, 1e-3)), "lossless", 1e-3)
+    assert rigid.verdict == "strict"
+    assert rigid.angle_peak < 1e-4
+    assert rigid.jnd < 0.01
+    wider = open_workload("hex_socket", Extent(GRID, 1e-3))
+    monkeypatch.setattr(resting_bodies, "CLEARANCE", 0.1e-3)
+    assert score(wider, "lossless", 1e-3).jnd > 0.5
 
 
 FINE = (5e-4, 2.5e-4, 1.25e-4)

@@ -30,6 +30,7 @@ from hapticbridge.lab.engines.base import (
     Body,
     Contacts,
     Engine,
+    FreeBody,
     Pose,
     Shape,
     Simulation,
@@ -210,6 +211,47 @@ def test_a_shape_rests_on_the_floor(engine: Engine, kind: str) -> None:
         assert simulation.pose().position[2] == pytest.approx(height, abs=1e-4)
     assert contacts.points >= 1
     assert 0 <= contacts.depth < 1e-4
+
+
+def test_a_box_rests_on_another_body_and_on_the_floor_beside_it(engine: Engine) -> None:
+    def box(mass: float) -> Body:
+        frame = Pose((0.0, 0.0, 0.002), quaternion_exp((0.0, 0.0, 0.4)))
+        shapes = (Shape("box", (0.03, 0.025, EDGE)),)
+        return Body(mass, (2e-5, 2.5e-5, 3e-5), frame, shapes, friction=0.5)
+
+    below, beside = Pose((0.0, 0.0, EDGE)), Pose((0.1, 0.0, EDGE), quaternion_exp((0.0, 0.0, 0.3)))
+    start = Pose((0.005, 0.0, 3 * EDGE))
+    others = (FreeBody(box(0.3), below), FreeBody(box(0.1), beside))
+    task = Task("pile", box(0.1), (FLOOR,), (0.0, 0.0, -GRAVITY), start=start, others=others)
+    with opened(engine, task, 1e-3) as simulation:
+        for number, pose in enumerate((start, below, beside)):
+            assert simulation.pose(number).position == pytest.approx(pose.position, abs=1e-7)
+        coast(simulation, 200)
+        is_rocking = engine.name == "drake_point"  # on its one point under a box
+        assert is_rocking or simulation.contacts().points >= 3
+        for number, pose in enumerate((start, below, beside)):
+            if is_rocking and number == 0:
+                continue
+            found = simulation.pose(number)
+            assert found.position == pytest.approx(pose.position, abs=3e-4)
+            assert abs(np.dot(found.quaternion, pose.quaternion)) == pytest.approx(1, abs=1e-4)
+            assert simulation.velocity(number).linear == pytest.approx(NOTHING, abs=5e-3)
+
+
+def test_other_bodies_fall_beside_the_tool(engine: Engine) -> None:
+    other = FreeBody(Body(0.5, (1e-3, 2e-3, 2.5e-3), FRAME), START)
+    gravity = (0.0, 0.0, -GRAVITY)
+    task = Task("fall", Body(0.3, (1e-3, 2e-3, 2.5e-3)), gravity=gravity, others=(other,))
+    push = (0.3 * 5.0, 0.0, 0.0)
+    with opened(engine, task, 1e-3) as simulation:
+        assert simulation.pose(1).quaternion == pytest.approx(START.quaternion, abs=1e-6)
+        for _ in range(100):
+            simulation.advance(push, NOTHING)
+        assert simulation.velocity().linear == pytest.approx((0.5, 0, -0.1 * GRAVITY), rel=1e-4)
+        # the push is the tool's alone
+        assert simulation.velocity(1).linear == pytest.approx((0, 0, -0.1 * GRAVITY), rel=1e-4)
+        fallen = START.position[2] - simulation.pose(1).position[2]
+        assert fallen == pytest.approx(-simulation.pose().position[2], abs=1e-5)
 
 
 def test_a_block_slides_beyond_its_friction_and_not_below(engine: Engine) -> None:

@@ -21,6 +21,7 @@ from hapticbridge.lab.engines import base
 from hapticbridge.lab.engines.base import (
     ENGINES,
     Body,
+    FreeBody,
     Pose,
     Shape,
     Task,
@@ -137,6 +138,33 @@ def test_a_scenes_shapes_are_where_mujoco_has_them(scene: Scene) -> None:
     assert task.body.friction == 0.2
 
 
+def test_other_free_bodies_of_a_scene_are_others_of_the_task(tmp_path: Path) -> None:
+    weight = """<body name="weight" pos="0.3 0 0.1" euler="0 0 0.2"><freejoint/>
+      <inertial pos="0 0 0.01" mass="0.4" diaginertia="1e-4 1e-4 1e-4"/>
+      <geom name="brick" type="box" size="0.01 0.02 0.03" pos="0 0.01 0"/></body>"""
+    qpos = "0.1 0.2 0.3 0.9 0.1 0.3 -0.2"
+    two = SCENE.replace(qpos, f"{qpos} 0.4 0 0.2 1 0 0 0")
+
+    def load(speed: float) -> Scene:
+        text = two.replace("3 1 2", f"3 1 2 0 0 {speed} 0 0 0")
+        path = tmp_path / "two.xml"
+        path.write_text(text.format(**PARTS | {"world": weight}))
+        return load_scene(path)
+
+    scene = load(0.0)
+    task = task_from_scene(scene)
+    (other,) = task.others
+    assert task.body.mass == 0.2
+    assert other.body.mass == 0.4
+    assert other.start.position == pytest.approx((0.4, 0, 0.2))
+    assert other.principal.position == pytest.approx(scene.data.body("weight").xipos)
+    assert other.body.shapes[0].position == pytest.approx((0, 0.01, 0))
+    assert other.body.friction == task.body.friction == 0.2
+    assert [shape.kind for shape in task.fixed] == ["box", "capsule", "sphere"]
+    with pytest.raises(StudyError, match="that is not the tool moves at the start"):
+        task_from_scene(load(0.1))
+
+
 def test_mujoco_as_a_peer_moves_a_scene_as_mujoco_does(scene: Scene, tmp_path: Path) -> None:
     task = task_from_scene(scene)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
@@ -219,6 +247,7 @@ TASK = Task("task", BODY)
         (TASK, {"gravity": (0.0, np.inf, 0.0)}, "gravity"),
         (TASK, {"grip": Pose(quaternion=(2.0, 0.0, 0.0, 0.0))}, "grip quaternion"),
         (TASK, {"start": Pose((np.nan, 0.0, 0.0))}, "start position"),
+        (TASK, {"others": (FreeBody(replace(BODY, friction=0.1)),)}, "differ in friction"),
         (TASK, {"start_velocity": Velocity(angular=(0.0, 0.0, np.nan))}, "start angular velocity"),
     ],
 )

@@ -43,11 +43,11 @@ QUICK_SIZE = 30
 class Chart:
     """Chart the cost of ways to simulate a scene against their error.
 
-    The scene is point_mass, spinning_body, spring_arm, tap, rod_impact, sliding_block, jam or
-    peg_in_hole, which have references of their own, or any scene with a hand path beside it, which
-    is compared with finer steps. slow_scene is 'beads' with --scene-rates. 'work' in place of a
-    scene charts what a tick costs as a scene grows. Writes SCENE.png, .svg, .csv and .json into the
-    folder.
+    The scene is point_mass, spinning_body, spring_arm, tap, rod_impact, sliding_block, stack, jam,
+    hex_socket or peg_in_hole, which have references of their own, or any scene with a hand path
+    beside it, which is compared with finer steps. slow_scene is 'beads' with --scene-rates. 'work'
+    in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png, .svg, .csv and
+    .json into the folder.
 
     Example:
         hapticbridge chart peg_in_hole --out charts

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hapticbridge.check.observe import quiet
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
-from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, scene_run
+from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, resting_bodies, scene_run
 from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name
 from hapticbridge.lab.chart.workload import PASSIVE, Panel, PeerWork, Run, Score, Workload
@@ -47,8 +47,10 @@ def open_workload(name: str, extent: Extent) -> Workload:
     """
     grid, finest = extent.grid, extent.finest
     known: dict[str, Callable[[], Workload]] = {
+        "hex_socket": lambda: resting_bodies.HexSocket(resting_bodies.KEY_COUPLING, grid, finest),
         "jam": lambda: peg.Jam(grid),
         "spring_arm": lambda: free_bodies.SpringArm(free_bodies.COUPLING, grid),
+        "stack": lambda: resting_bodies.Stack(free_bodies.COUPLING, grid, finest),
         "tap": lambda: contact_bodies.Tap(free_bodies.COUPLING, grid, finest),
         "point_mass": lambda: free_bodies.DrivenMass(scene_run.COUPLING, grid, finest),
         "peg_in_hole": lambda: peg.PegInHole(peg.COUPLING, grid, finest),

@@ -47,7 +47,7 @@ def work_of(
     """Describes a scene that is led along a path to other engines.
 
     Args:
-        scene: One free tool among fixed shapes.
+        scene: A free tool among other free bodies and fixed shapes.
         path: Path of the handle.
         duration: Duration in s.
         finest: Shortest period in s; the handle is exact at its multiples.
@@ -214,10 +214,11 @@ class Meter:
         Σ E_k = S_k − S_0 − Σ (f·δx + τ·δφ),    S = ½ m ‖v‖² + ½ ω·I ω − m g·x
 
     f and τ are a wrench on the tool in N and N m, δx and δφ the grip's motion in a step in m and
-    rad, v and ω the tool's velocities, x its centre of mass and g the gravity. This is the balance
-    of ``kernel.ledger``, for one free body among fixed shapes, with its tolerance and the slack of
-    the bridge's own coupling, Σ ½ (K + B/T) ‖δx‖² and its rotational counterpart. Energy that
-    contacts store counts as dissipated until they return it.
+    rad, v and ω a body's velocities, x its centre of mass and g the gravity. S is summed over the
+    tool and all other free bodies. This is the balance of ``kernel.ledger``, for free bodies among
+    fixed shapes, with its tolerance and the slack of the bridge's own coupling, Σ ½ (K + B/T) ‖δx‖²
+    and its rotational counterpart. Energy that contacts store counts as dissipated until they
+    return it.
 
     Args:
         simulation: Simulation at its start.
@@ -234,6 +235,7 @@ class Meter:
         self, simulation: Simulation, task: Task, period: float, wrench: Callable[[], Wrench]
     ) -> None:
         self._simulation, self._task, self._wrench = simulation, task, wrench
+        self._bodies = [free.body for free in task.bodies]
         k = task.coupling or Coupling(1e-30, 0.0, 0.0, 0.0)
         self._gains = (
             0.5 * (k.stiffness + k.damping / period),
@@ -253,12 +255,15 @@ class Meter:
         return Reading(verdict if self._share > 0.0 else "strict", self._created, self._share)
 
     def _stored(self) -> float:
-        body, velocity = self._task.body, self._simulation.velocity()
-        centre = composed(self._simulation.pose(), body.inertia_frame)
-        spin = rotated(conjugate(centre.quaternion), velocity.angular)
-        kinetic = body.mass * dot(velocity.linear, velocity.linear)
-        kinetic += sum(i * w * w for i, w in zip(body.inertia, spin, strict=True))
-        return 0.5 * kinetic - body.mass * dot(self._task.gravity, centre.position)
+        stored = 0.0
+        for number, body in enumerate(self._bodies):
+            velocity = self._simulation.velocity(number)
+            centre = composed(self._simulation.pose(number), body.inertia_frame)
+            spin = rotated(conjugate(centre.quaternion), velocity.angular)
+            kinetic = body.mass * dot(velocity.linear, velocity.linear)
+            kinetic += sum(i * w * w for i, w in zip(body.inertia, spin, strict=True))
+            stored += 0.5 * kinetic - body.mass * dot(self._task.gravity, centre.position)
+        return stored
 
     def close_step(self) -> None:
         """Closes the balance of the step that just ended."""

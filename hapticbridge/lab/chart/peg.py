@@ -63,13 +63,25 @@ JUDGED = tuple(range(1, len(POSES)))
 
 def peg_path(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns positions and quaternions of the handle relative to ``HOME``."""
-    stops = np.array([(*HOME, 0.0, 0.0, 0.0), *((*place, *turn) for place, turn in POSES)])
-    stage = np.minimum((times / (RAMP + HOLD)).astype(int), len(POSES) - 1)
+    stops = [(*HOME, 0.0, 0.0, 0.0), *((*place, *turn) for place, turn in POSES)]
+    return led(np.array(stops), times)
+
+
+def led(
+    stops: NDArray[np.float64], times: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Leads a handle from pose to pose; returns its places from the first, and quaternions.
+
+    Args:
+        stops: Positions in m and rotation vectors in rad, shape (n, 6). The first is the start.
+        times: Times in s.
+    """
+    stage = np.minimum((times / (RAMP + HOLD)).astype(int), len(stops) - 2)
     share = np.clip((times - stage * (RAMP + HOLD)) / RAMP, 0.0, 1.0)
     smooth = share**3 * (10 - 15 * share + 6 * share**2)
     poses = stops[stage] + smooth[:, None] * (stops[stage + 1] - stops[stage])
     turns = Rotation.from_rotvec(poses[:, 3:]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
-    return poses[:, :3] - HOME, turns
+    return poses[:, :3] - stops[0, :3], turns
 
 
 def end_of_hold(index: int) -> float:
@@ -264,22 +276,32 @@ class PegInHole(Staged):
 
     def settled(self, take: Take) -> Score:
         """Compares the peg's pose at the end of each hold with the rigid optimum."""
-        if take.has_diverged:
-            return diverged(take.created, take.ended)
-        ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in JUDGED]
-        records = take.records[np.minimum(ends, take.records.size - 1)]
-        force, exact = (
-            np.linalg.norm(each["wrench_on_tool"][:, :3], axis=1)
-            for each in (records, self._reference)
-        )
-        is_touching = bool(np.all(records["contacts"] > 0))
-        return score_of(
-            self._reference,
-            records,
-            stiffness=float(np.max(np.abs(force / exact - 1))),
-            created=take.created,
-            verdict=take.environment if is_touching else "lost contact",
-        )
+        return score_at_rest(self._reference, JUDGED, take)
+
+
+def score_at_rest(reference: NDArray[np.void], holds: Sequence[int], take: Take) -> Score:
+    """Compares a take at the end of its holds with poses at rest under a force.
+
+    Args:
+        reference: ``TICK_DTYPE``, one row per judged hold.
+        holds: Numbers of the judged holds.
+        take: The run.
+    """
+    if take.has_diverged:
+        return diverged(take.created, take.ended)
+    ends = [round(end_of_hold(index) / take.setting.period) - 1 for index in holds]
+    records = take.records[np.minimum(ends, take.records.size - 1)]
+    force, exact = (
+        np.linalg.norm(each["wrench_on_tool"][:, :3], axis=1) for each in (records, reference)
+    )
+    is_touching = bool(np.all(records["contacts"] > 0))
+    return score_of(
+        reference,
+        records,
+        stiffness=float(np.max(np.abs(force / exact - 1))),
+        created=take.created,
+        verdict=take.environment if is_touching else "lost contact",
+    )
 
 
 JAM_DAMPING = 0.5

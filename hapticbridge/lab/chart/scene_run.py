@@ -43,7 +43,13 @@ from hapticbridge.lab.chart.workload import (
     score_of,
 )
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.options import PRESCRIBED_MOTION, RunSetup, steady_stiffness
+from hapticbridge.options import (
+    PRESCRIBED_MOTION,
+    SAME_FRAME,
+    RunSetup,
+    Workspace,
+    steady_stiffness,
+)
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.rendering import (
     IMPLICIT,
@@ -83,6 +89,8 @@ class Stage:
         duration: Duration in s.
         coupling: Requested K and B.
         starts: Start of each take; one take by default.
+        workspace: Map from the path to the scene. By default the path is relative to the handle's
+            start, where the bridge lets the handle carry what the tool does not rest on.
     """
 
     def __init__(
@@ -92,13 +100,14 @@ class Stage:
         duration: float,
         coupling: Coupling,
         starts: Sequence[Start | None] = (None,),
+        workspace: Workspace = SAME_FRAME,
     ) -> None:
         self._scene = scene
         self._shipped = ShippedOptions.from_model(scene.model)
         self._path = path
         self.duration = duration
         self.coupling = coupling
-        self._starts = starts
+        self._starts, self._workspace = starts, workspace
         self._samples: dict[float, NDArray[np.void]] = {}
         # a thousand runs share the memory of the longest
         self._rows = np.zeros(0, TICK_DTYPE)
@@ -192,8 +201,6 @@ class Stage:
         scene.reset()
         if start is not None:
             start(scene)
-        first = np.zeros(1, SAMPLE_DTYPE)
-        first["quaternion"][0, 0] = 1.0
         setup = RunSetup(
             scene=scene,
             coupling=self.coupling,
@@ -202,8 +209,9 @@ class Stage:
             substeps=setting.substeps,
             scene_ticks=setting.scene_ticks,
             contact_stiffness=resolve_contact_stiffness(method, self.coupling, None),
+            workspace=self._workspace,
         )
-        return setup.parameters(first, effective)
+        return setup.parameters(self.samples_at(np.zeros(1)), effective)
 
     def _take(
         self, setting: Setting, binding: BoundKernel, rows: NDArray[np.void], ticks: int

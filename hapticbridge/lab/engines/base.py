@@ -100,7 +100,7 @@ class Pose(NamedTuple):
 
 
 class Velocity(NamedTuple):
-    """Velocity of the tool's centre of mass in m/s and angular velocity in rad/s, world frame."""
+    """Velocity of a centre of mass in m/s and angular velocity in rad/s, world frame."""
 
     linear: Vector = (0.0, 0.0, 0.0)
     angular: Vector = (0.0, 0.0, 0.0)
@@ -193,7 +193,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """The tool: one rigid body, free in space.
+    """A rigid body, free in space: the tool, or what it meets.
 
     Attributes:
         mass: Mass in kg, > 0.
@@ -226,8 +226,38 @@ class Body:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class FreeBody:
+    """A rigid body at its start.
+
+    Attributes:
+        body: Mass, inertia and shapes.
+        start: Pose of the body's frame at the start.
+
+    Raises:
+        StudyError: The pose is not finite or not of unit norm.
+    """
+
+    body: Body
+    start: Pose = ORIGIN
+
+    def __post_init__(self) -> None:
+        check_pose("start", self.start)
+
+    @property
+    def principal(self) -> Pose:
+        """Pose of the principal axes of inertia at the centre of mass, at the start."""
+        return composed(self.start, self.body.inertia_frame)
+
+    @property
+    def shapes(self) -> list[tuple[Shape, Pose]]:
+        """Shapes with their poses in the frame of the principal axes."""
+        frame = inverted(self.body.inertia_frame)
+        return [(shape, composed(frame, shape.pose)) for shape in self.body.shapes]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """A task for an engine: a free tool among fixed shapes, moved by the coupling.
+    """A task for an engine: a free tool among other bodies and fixed shapes, moved by the coupling.
 
     Attributes:
         name: Name in tables and messages.
@@ -240,9 +270,10 @@ class Task:
         start_velocity: Velocity of its centre of mass and angular velocity at the start.
         handle: Poses of the handle in the world frame over time. None keeps it at the grip's pose
             at the start.
+        others: Other free bodies, at rest at the start, with the friction of the tool.
 
     Raises:
-        StudyError: A value is not finite or mis-shaped.
+        StudyError: A value is not finite or mis-shaped, or the friction differs.
     """
 
     name: str
@@ -254,13 +285,21 @@ class Task:
     start: Pose = ORIGIN
     start_velocity: Velocity = AT_REST
     handle: Motion | None = None
+    others: tuple[FreeBody, ...] = ()
 
     def __post_init__(self) -> None:
         _vector("gravity", self.gravity, "m/s²")
+        if any(other.body.friction != self.body.friction for other in self.others):
+            raise StudyError("the bodies of a task differ in friction, and a task has one")
         check_pose("grip", self.grip)
         check_pose("start", self.start)
         _vector("start velocity", self.start_velocity.linear, "m/s")
         _vector("start angular velocity", self.start_velocity.angular, "rad/s")
+
+    @property
+    def bodies(self) -> tuple[FreeBody, ...]:
+        """Free bodies at their start, the tool first."""
+        return FreeBody(self.body, self.start), *self.others
 
     def handle_poses(self, timestep: float, steps: int) -> list[Pose]:
         """Returns the handle's poses h_0 … h_N at the times 0, T, … N T.
@@ -325,7 +364,10 @@ class Setting(NamedTuple):
 
 
 class Simulation(Protocol):
-    """A task in an engine, at some step. Step 0 is the start."""
+    """A task in an engine, at some step. Step 0 is the start.
+
+    Body 0 is the tool; the others follow in the task's order.
+    """
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
         """Advances from step k − 1 to step k, at whose end the handle is at h_k.
@@ -336,11 +378,11 @@ class Simulation(Protocol):
     def advance(self, force: Vector, torque: Vector) -> None:
         """Sets a force in N and a torque in N m at the centre of mass and steps; this is timed."""
 
-    def pose(self) -> Pose:
-        """Returns the pose of the body's frame."""
+    def pose(self, body: int = 0) -> Pose:
+        """Returns the pose of a body's frame."""
 
-    def velocity(self) -> Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
+    def velocity(self, body: int = 0) -> Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
 
     def wrench(self) -> Wrench:
         """Returns the coupling's wrench f_k on the tool, about the grip."""
@@ -387,6 +429,8 @@ _PACKAGE = "hapticbridge.lab.engines"
 ENGINES = {
     "mujoco": "mujoco",
     "mujoco_warp": "mujoco_warp",
+    "newton_xpbd": "newton",
+    "newton_steel": "newton",
     "ode": "ode",
     "ode_spring": "ode",
     "physx": "physx",

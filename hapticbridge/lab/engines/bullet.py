@@ -85,11 +85,13 @@ class PybulletSimulation(HeldSimulation):
 
     def __init__(self, task: base.Task, timestep: float, parameters: Mapping[str, float]) -> None:
         super().__init__(task, timestep)
-        kinds = [shape.kind for shape in task.body.shapes]
-        if "mesh" in kinds and len(kinds) > 1:
-            raise StudyError(
-                f"task '{task.name}' has a tool of a mesh and more, which is not given to PyBullet"
-            )
+        for free in task.bodies:
+            kinds = [shape.kind for shape in free.body.shapes]
+            if "mesh" in kinds and len(kinds) > 1:
+                raise StudyError(
+                    f"task '{task.name}' has a body of a mesh and more, which is not given to "
+                    "PyBullet"
+                )
         self._client = client = pybullet.connect(pybullet.DIRECT)
         pybullet.setGravity(*task.gravity, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
@@ -99,16 +101,8 @@ class PybulletSimulation(HeldSimulation):
             **parameters,
             physicsClientId=client,
         )
-        start = self._principal(task.start)
-        placed = [(shape, self._shape_pose(shape)) for shape in task.body.shapes]
-        self._body = pybullet.createMultiBody(
-            baseMass=task.body.mass,
-            baseCollisionShapeIndex=self._collision(placed),
-            basePosition=start.position,
-            baseOrientation=_xyzw(start.quaternion),
-            physicsClientId=client,
-        )
-        self._set_dynamics(self._body, task, localInertiaDiagonal=task.body.inertia)
+        self._bodies = [self._free(free, task) for free in task.bodies]
+        self._body = self._bodies[0]
         for shape in task.fixed:
             fixed = pybullet.createMultiBody(
                 baseMass=0,
@@ -124,10 +118,23 @@ class PybulletSimulation(HeldSimulation):
         )
         self._begin(task)
 
+    def _free(self, free: base.FreeBody, task: base.Task) -> int:
+        """Adds a free body and returns its number."""
+        start = free.principal
+        body: int = pybullet.createMultiBody(
+            baseMass=free.body.mass,
+            baseCollisionShapeIndex=self._collision(free.shapes),
+            basePosition=start.position,
+            baseOrientation=_xyzw(start.quaternion),
+            physicsClientId=self._client,
+        )
+        self._set_dynamics(body, task, localInertiaDiagonal=free.body.inertia)
+        return body
+
     def _set_dynamics(self, body: int, task: base.Task, **more: Any) -> None:
         """Removes Bullet's default damping of a body, and sets its friction."""
-        has_mesh = any(shape.kind == "mesh" for shape in (*task.body.shapes, *task.fixed))
-        if has_mesh:
+        shapes = [*task.fixed, *(shape for free in task.bodies for shape in free.body.shapes)]
+        if any(shape.kind == "mesh" for shape in shapes):
             more["collisionMargin"] = 0.0
         pybullet.changeDynamics(
             body,
@@ -180,21 +187,21 @@ class PybulletSimulation(HeldSimulation):
         pybullet.applyExternalTorque(body, -1, torque, world, client)
         pybullet.stepSimulation(client)
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
-        position, (x, y, z, w) = pybullet.getBasePositionAndOrientation(self._body, self._client)
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+        found = pybullet.getBasePositionAndOrientation(self._bodies[body], self._client)
+        position, (x, y, z, w) = found
         return base.Pose(position, (w, x, y, z))
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
-        return base.Velocity(*pybullet.getBaseVelocity(self._body, self._client))
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+        return base.Velocity(*pybullet.getBaseVelocity(self._bodies[body], self._client))
 
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step, as they were at its start."""
-        points = pybullet.getContactPoints(self._body, physicsClientId=self._client)
-        return base.Contacts.from_depths(
-            -point[8] for point in points
-        )  # its distance, negative where deep
+        points = pybullet.getContactPoints(physicsClientId=self._client)
+        # its distance, negative where deep
+        return base.Contacts.from_depths(-point[8] for point in points)
 
     def close(self) -> None:
         """Ends the Bullet world."""

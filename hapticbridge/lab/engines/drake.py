@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -38,8 +39,8 @@ POINT_STIFFNESS = 1e7
 boxes. 1e6 is worse by a fifth, 1e8 no better."""
 
 MODULUS = 1e9
-"""Hydroelastic modulus of the tool in Pa, that of a hard plastic. A settled peg is wrong by 0.06 to
-27 µm. At 1e10 the error is smaller, but with friction the peg flew out of the hole."""
+"""Hydroelastic modulus of the free bodies in Pa, that of a hard plastic. A settled peg is wrong by
+0.06 to 27 µm. At 1e10 the error is smaller, but with friction the peg flew out of the hole."""
 
 RESOLUTION = 0.1
 """Edge of the tessellation of round shapes as a share of their radius, without unit."""
@@ -91,33 +92,44 @@ class DrakeSimulation(HeldSimulation):
         builder = DiagramBuilder()
         plant, _ = AddMultibodyPlant(config, builder)
         plant.mutable_gravity_field().set_gravity_vector(np.array(task.gravity))
-        moments = [moment / task.body.mass for moment in task.body.inertia]
-        inertia = SpatialInertia(task.body.mass, np.zeros(3), UnitInertia(*moments))
-        tool, world = plant.AddRigidBody("tool", inertia), plant.world_body()
         is_point = contact_model == "point"
-        for i, shape in enumerate(task.body.shapes):
+
+        def register(body: Any, shape: base.Shape, pose: base.Pose, *, is_fixed: bool) -> None:
             material = _material(task, 0.0 if is_point else self._timestep)
-            if not is_point:
-                AddCompliantHydroelasticProperties(_hint(shape), MODULUS, material)
-            pose = _transform(self._shape_pose(shape))
-            plant.RegisterCollisionGeometry(tool, pose, _geometry(shape), f"tool_{i}", material)
-        for i, shape in enumerate(task.fixed):
-            material = _material(task, 0.0 if is_point else self._timestep)
-            if not is_point:
+            if is_fixed and not is_point:
                 AddRigidHydroelasticProperties(_hint(shape), material)
-            pose = _transform(shape.pose)
-            plant.RegisterCollisionGeometry(world, pose, _geometry(shape), f"fixed_{i}", material)
+            elif not is_point:
+                AddCompliantHydroelasticProperties(_hint(shape), MODULUS, material)
+            name = f"shape_{next(numbers)}"
+            place = _transform(pose)
+            plant.RegisterCollisionGeometry(body, place, _geometry(shape), name, material)
+
+        numbers, bodies = count(), []
+        for i, free in enumerate(task.bodies):
+            mass = free.body.mass
+            unit = UnitInertia(*(moment / mass for moment in free.body.inertia))
+            bodies.append(plant.AddRigidBody(f"body_{i}", SpatialInertia(mass, np.zeros(3), unit)))
+            for shape, pose in free.shapes:
+                register(bodies[-1], shape, pose, is_fixed=False)
+        for shape in task.fixed:
+            register(plant.world_body(), shape, shape.pose, is_fixed=True)
         plant.Finalize()
         self._simulator = Simulator(builder.Build())
         self._plant = plant
         root = self._simulator.get_mutable_context()
         self._context = context = plant.GetMyMutableContextFromRoot(root)
         port = plant.get_applied_generalized_force_input_port()
-        self._input = port.FixValue(context, np.zeros(6))
+        self._forces = np.zeros(plant.num_velocities())
+        self._input = port.FixValue(context, self._forces)
+        for body, free in zip(bodies, task.bodies, strict=True):
+            plant.SetFreeBodyPose(context, body, _transform(free.principal))
+        self._positions = [body.floating_positions_start() for body in bodies]
+        self._velocities = [body.floating_velocities_start_in_v() for body in bodies]
         velocity = task.start_velocity
-        plant.SetFreeBodyPose(context, tool, _transform(self._principal(task.start)))
         plant.SetFreeBodySpatialVelocity(
-            context, tool, SpatialVelocity(np.array(velocity.angular), np.array(velocity.linear))
+            context,
+            bodies[0],
+            SpatialVelocity(np.array(velocity.angular), np.array(velocity.linear)),
         )
         self._simulator.Initialize()
         self._steps = 0
@@ -128,7 +140,9 @@ class DrakeSimulation(HeldSimulation):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
         if not self._is_finite:
             return
-        self._input.GetMutableData().get_mutable_value().SetFromVector((*torque, *force))
+        start = self._velocities[0]
+        self._forces[start : start + 6] = (*torque, *force)
+        self._input.GetMutableData().get_mutable_value().SetFromVector(self._forces)
         # the plant steps at 0, T, 2T, …; a target half way between is safe from rounding
         try:
             self._simulator.AdvanceTo((self._steps + 0.5) * self._timestep)
@@ -136,18 +150,22 @@ class DrakeSimulation(HeldSimulation):
             self._is_finite = False
         self._steps += 1
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
         if not self._is_finite:
             return base.Pose((np.nan,) * 3, (np.nan,) * 4)
-        w, i, j, k, x, y, z = self._plant.GetPositions(self._context).tolist()
+        start = self._positions[body]
+        found = self._plant.GetPositions(self._context)[start : start + 7]
+        w, i, j, k, x, y, z = found.tolist()
         return base.Pose((x, y, z), (w, i, j, k))
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
         if not self._is_finite:
             return base.Velocity((np.nan,) * 3, (np.nan,) * 3)
-        a, b, c, x, y, z = self._plant.GetVelocities(self._context).tolist()
+        start = self._velocities[body]
+        found = self._plant.GetVelocities(self._context)[start : start + 6]
+        a, b, c, x, y, z = found.tolist()
         return base.Velocity((x, y, z), (a, b, c))
 
     def contacts(self) -> base.Contacts:
@@ -203,7 +221,7 @@ def engines() -> tuple[base.Engine, ...]:
         "relaxation_time": base.Setting("0", f"{_PROPERTIES}: relaxation_time"),
     }
     hydroelastic = {
-        "compliance": base.Setting("tool compliant, fixed shapes rigid", _USER_GUIDE),
+        "compliance": base.Setting("free bodies compliant, fixed shapes rigid", _USER_GUIDE),
         "hydroelastic_modulus": base.Setting(
             f"{MODULUS:g} Pa", f"{_PROPERTIES}: hydroelastic_modulus"
         ),

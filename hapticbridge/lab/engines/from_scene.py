@@ -1,8 +1,9 @@
-"""Describes a MuJoCo scene of one free tool among fixed shapes to other engines."""
+"""Describes a MuJoCo scene of free bodies among fixed shapes to other engines."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.trajectory import Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.jit import compiled
-from hapticbridge.kernel.codes import COUPLING_ACTUATORS
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, held_body
 from hapticbridge.lab.engines import base
 from hapticbridge.pose import (
     ZERO_VECTOR,
@@ -46,7 +47,7 @@ _WITHOUT = (
 def task_from_scene(
     scene: Scene, motion: Motion | None = None, coupling: Coupling | None = None
 ) -> base.Task:
-    """Returns the task that a scene of one free tool among fixed shapes sets.
+    """Returns the task that a scene of a free tool, other free bodies and fixed shapes sets.
 
     MuJoCo's contact settings are left out: each engine has its own. Friction is that of the pairs
     of geoms, as MuJoCo takes it the larger of the two.
@@ -58,58 +59,88 @@ def task_from_scene(
         coupling: Coupling between handle and grip; None leaves the tool alone.
 
     Raises:
-        StudyError: Other engines cannot represent the scene. One body moves, on a free joint
-            without damping, armature or friction, and no other body is fixed to it; the geoms that
-            touch are boxes, spheres, capsules or convex meshes, each of the tool's against each of
-            the fixed, without margin and with one friction for sliding alone; there are no
-            constraints, tendons, fluid, or actuators of the scene's own.
+        StudyError: Other engines cannot represent the scene. Bodies move on free joints without
+            damping, armature or friction, no other body is fixed to them, and all but the tool
+            start at rest; the geoms that touch are boxes, spheres, capsules or convex meshes, each
+            against each of other bodies, without margin and with one friction for sliding alone;
+            there are no constraints, tendons, fluid, or actuators of the scene's own.
     """
     scene.reset()
     model, data = scene.model, scene.data
-    if fault := _fault(model):
+    tool = held_body(model, scene.grip)
+    if fault := _fault(scene, tool):
         raise StudyError(f"scene '{scene.name}' cannot be given to other engines: {fault}")
-    body_id = int(model.jnt_bodyid[0])
-    tool_ids, fixed_ids = _touching(scene, body_id)
-    start = _pose(data.xpos[body_id], data.xquat[body_id])
+    pairs = _touching(scene)
+    touching = sorted({geom for pair in pairs for geom in pair})
+    friction = _friction(scene, pairs)
+    tool_free = _free_body(scene, tool, touching, friction)
+    start, frame = tool_free.start, tool_free.body.inertia_frame
     grip_in_world = _pose(scene.grip_pose()[:3], scene.grip_pose()[3:])
-    world_to_body = base.inverted(start)
-    inertia_frame = _pose(model.body_ipos[body_id], model.body_iquat[body_id])
-    body = base.Body(
-        mass=float(model.body_mass[body_id]),
-        inertia=_vector(model.body_inertia[body_id]),
-        inertia_frame=inertia_frame,
-        shapes=tuple(
-            _shape(model, i, _pose(model.geom_pos[i], model.geom_quat[i])) for i in tool_ids
-        ),
-        friction=_friction(scene, tool_ids, fixed_ids),
-    )
-    spin = rotated(start.quaternion, _vector(data.qvel[3:6]))
-    lever = subtract(base.composed(start, inertia_frame).position, start.position)
+    first = int(model.body_dofadr[tool])
+    spin = rotated(start.quaternion, _vector(data.qvel[first + 3 : first + 6]))
+    lever = subtract(base.composed(start, frame).position, start.position)
+    speed = add(_vector(data.qvel[first : first + 3]), cross(spin, lever))
     return base.Task(
         name=scene.name,
-        body=body,
+        body=tool_free.body,
         fixed=tuple(
             _shape(model, i, _pose(data.geom_xpos[i], _quaternion(data.geom_xmat[i])))
-            for i in fixed_ids
+            for i in touching
+            if not _is_free(model, model.geom_bodyid[i])
         ),
         gravity=_vector(model.opt.gravity),
         coupling=coupling,
-        grip=base.composed(world_to_body, grip_in_world),
+        grip=base.composed(base.inverted(start), grip_in_world),
         start=start,
-        start_velocity=base.Velocity(add(_vector(data.qvel[:3]), cross(spin, lever)), spin),
+        start_velocity=base.Velocity(speed, spin),
         handle=None if motion is None else _from(grip_in_world, motion),
+        others=tuple(
+            _free_body(scene, int(body), touching, friction)
+            for body in model.jnt_bodyid
+            if body != tool
+        ),
     )
 
 
-def _fault(model: mujoco.MjModel) -> str:
-    """Returns the reason why other engines cannot represent a model; empty where they can."""
-    free = int(mujoco.mjtJoint.mjJNT_FREE)
-    if model.njnt != 1 or model.jnt_type[0] != free:
-        return f"it has {model.njnt} joint(s), and it must have a free joint and no other"
-    body_id = int(model.jnt_bodyid[0])
+def _is_free(model: mujoco.MjModel, body: int) -> bool:
+    return bool(model.body_jntnum[body])
+
+
+def _free_body(scene: Scene, body: int, touching: list[int], friction: float) -> base.FreeBody:
+    """Returns a body with those of its geoms that touch."""
+    model, data = scene.model, scene.data
+    return base.FreeBody(
+        base.Body(
+            mass=float(model.body_mass[body]),
+            inertia=_vector(model.body_inertia[body]),
+            inertia_frame=_pose(model.body_ipos[body], model.body_iquat[body]),
+            shapes=tuple(
+                _shape(model, i, _pose(model.geom_pos[i], model.geom_quat[i]))
+                for i in touching
+                if model.geom_bodyid[i] == body
+            ),
+            friction=friction,
+        ),
+        _pose(data.xpos[body], data.xquat[body]),
+    )
+
+
+def _fault(scene: Scene, tool: int) -> str:
+    """Returns the reason why other engines cannot represent a scene; empty where they can."""
+    model = scene.model
+    if not model.njnt or np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_FREE):
+        return f"it has {model.njnt} joint(s), and it must have free joints and no others"
+    if not _is_free(model, tool):
+        return "its grip is on no free body"
     is_drag_free = model.opt.density == 0 and model.opt.viscosity == 0
+    first = int(model.body_dofadr[tool])
+    is_elsewhere = np.delete(scene.data.qvel, slice(first, first + 6)).any()
     faults = (
-        (int(np.sum(model.body_weldid == body_id)) > 1, "its tool is made of several bodies"),
+        (
+            any(np.sum(model.body_weldid == body) > 1 for body in model.jnt_bodyid),
+            "a free body is made of several bodies",
+        ),
+        (is_elsewhere, "a body that is not the tool moves at the start"),
         (model.nmocap > 1, "it has moving mocap bodies"),
         (model.neq > 0 or model.ntendon > 0, "it has constraints or tendons"),
         (model.nu != len(COUPLING_ACTUATORS), "it has actuators of its own"),
@@ -120,7 +151,7 @@ def _fault(model: mujoco.MjModel) -> str:
             or np.any(model.dof_armature)
             or np.any(model.dof_frictionloss)
             or np.any(model.jnt_stiffness),
-            "its free joint has damping, armature, friction or stiffness",
+            "a free joint has damping, armature, friction or stiffness",
         ),
         (not is_drag_free or np.any(model.opt.wind), "it has a fluid"),
         (any(model.opt.disableflags & bit for bit in _WITHOUT), "it has contact or gravity off"),
@@ -128,18 +159,21 @@ def _fault(model: mujoco.MjModel) -> str:
     return next((clause for is_so, clause in faults if is_so), "")
 
 
-def _touching(scene: Scene, body_id: int) -> tuple[list[int], list[int]]:
-    """Returns the geoms of the tool and the fixed ones that can touch each other."""
+def _touching(scene: Scene) -> list[tuple[int, int]]:
+    """Returns the pairs of geoms of different bodies, one of them free, that can touch."""
     model = scene.model
-    tool = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body_id]
-    fixed = [i for i in range(model.ngeom) if model.geom_bodyid[i] != body_id]
-    own, affinity = model.geom_contype, model.geom_conaffinity
-    pairs = {(a, b) for a in tool for b in fixed if own[a] & affinity[b] or own[b] & affinity[a]}
-    tool_ids, fixed_ids = sorted({a for a, _ in pairs}), sorted({b for _, b in pairs})
+    own, affinity, bodies = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    apart = [
+        (a, b)
+        for a, b in combinations(range(model.ngeom), 2)
+        if bodies[a] != bodies[b] and (_is_free(model, bodies[a]) or _is_free(model, bodies[b]))
+    ]
+    pairs = [(a, b) for a, b in apart if own[a] & affinity[b] or own[b] & affinity[a]]
+    touching = {geom for pair in pairs for geom in pair}
     fault = ""
-    if len(pairs) != len(tool_ids) * len(fixed_ids):
-        fault = "not every geom of the tool touches every fixed one"
-    for i in (*tool_ids, *fixed_ids):
+    if len(pairs) != sum(a in touching and b in touching for a, b in apart):
+        fault = "not every geom of a free body touches every one of other bodies"
+    for i in sorted(touching):
         kind = int(model.geom_type[i])
         if kind not in _KINDS:
             name = mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
@@ -148,24 +182,23 @@ def _touching(scene: Scene, body_id: int) -> tuple[list[int], list[int]]:
             fault = f"geom '{model.geom(i).name}' has a margin or gap"
     if fault:
         raise StudyError(f"scene '{scene.name}' cannot be given to other engines: {fault}")
-    return tool_ids, fixed_ids
+    return pairs
 
 
-def _friction(scene: Scene, tool_ids: list[int], fixed_ids: list[int]) -> float:
+def _friction(scene: Scene, pairs: list[tuple[int, int]]) -> float:
     """Returns the friction that all pairs share."""
     model, found = scene.model, set()
-    for a in tool_ids:
-        for b in fixed_ids:
-            rank = model.geom_priority[a] - model.geom_priority[b]
-            taken = (a, b) if rank == 0 else (a,) if rank > 0 else (b,)
-            dimensions = max(int(model.geom_condim[i]) for i in taken)
-            if dimensions > 3:
-                raise StudyError(
-                    f"scene '{scene.name}' cannot be given to other engines: it has torsional or "
-                    f"rolling friction (condim {dimensions}), which they do not share"
-                )
-            slides = dimensions == 3
-            found.add(max(float(model.geom_friction[i, 0]) for i in taken) if slides else 0.0)
+    for a, b in pairs:
+        rank = model.geom_priority[a] - model.geom_priority[b]
+        taken = (a, b) if rank == 0 else (a,) if rank > 0 else (b,)
+        dimensions = max(int(model.geom_condim[i]) for i in taken)
+        if dimensions > 3:
+            raise StudyError(
+                f"scene '{scene.name}' cannot be given to other engines: it has torsional or "
+                f"rolling friction (condim {dimensions}), which they do not share"
+            )
+        slides = dimensions == 3
+        found.add(max(float(model.geom_friction[i, 0]) for i in taken) if slides else 0.0)
     if len(found) > 1:
         raise StudyError(
             f"scene '{scene.name}' cannot be given to other engines: its contacts differ in "
@@ -229,8 +262,8 @@ class HeldSimulation(ABC):
     before step 0.
 
     Engines describe a body by its centre of mass. A child's body is therefore the frame of the
-    principal axes of inertia; ``_principal`` and ``_shape_pose`` convert to it. A child opens its
-    engine in ``__init__`` after that of this class, and calls ``_begin`` last.
+    principal axes of inertia; ``base.FreeBody`` converts to it. A child opens its engine in
+    ``__init__`` after that of this class, and calls ``_begin`` last.
     """
 
     def __init__(self, task: base.Task, timestep: float) -> None:
@@ -252,8 +285,8 @@ class HeldSimulation(ABC):
             )
         )
         self._grip = (task.grip.position, task.grip.quaternion)
-        self._principal_in_body = task.body.inertia_frame
-        self._body_in_principal = base.inverted(task.body.inertia_frame)
+        self._frames = [free.body.inertia_frame for free in task.bodies]
+        self._body_in_principal = [base.inverted(frame) for frame in self._frames]
         self._centre = task.body.inertia_frame.position
         self._handle: Frame = _AT_ORIGIN
         self._tool: Frame = _AT_ORIGIN
@@ -266,14 +299,6 @@ class HeldSimulation(ABC):
         grip = base.composed(self.pose(), task.grip)
         self._tool = (grip.position, grip.quaternion)
         self._measure(self._handle)
-
-    def _principal(self, body: base.Pose) -> base.Pose:
-        """Returns the pose of the principal frame for a pose of the body's frame."""
-        return base.composed(body, self._principal_in_body)
-
-    def _shape_pose(self, shape: base.Shape) -> base.Pose:
-        """Returns the pose of one of the tool's shapes in the principal frame."""
-        return base.composed(self._body_in_principal, shape.pose)
 
     def step(self, handle_position: Vector, handle_quaternion: Quaternion) -> None:
         """Advances one step under the wrench of the last step, and computes the next wrench."""
@@ -313,16 +338,16 @@ class HeldSimulation(ABC):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
 
     @abstractmethod
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
 
-    def pose(self) -> base.Pose:
-        """Returns the pose of the body's frame."""
-        return base.composed(self.principal_pose(), self._body_in_principal)
+    def pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of a body's frame."""
+        return base.composed(self.principal_pose(body), self._body_in_principal[body])
 
     @abstractmethod
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
 
     @abstractmethod
     def contacts(self) -> base.Contacts:

@@ -35,6 +35,10 @@ and 0.95 by 5 to 20 µm, with 0.99 and 0.999 by 0.5 to 2 µm. With the last pair
 two of six poses by 10 to 40 µm."""
 
 
+TOOL = 1
+"""Number of the tool in MuJoCo, whose body 0 is the world."""
+
+
 class MujocoEngine:
     """MuJoCo with ``implicitfast``, its elliptic cone and contacts as stiff as it advises."""
 
@@ -70,41 +74,39 @@ class MujocoSimulation(HeldSimulation):
         option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         option.tolerance = 1e-10
         option.enableflags |= mujoco.mjtEnableBit.mjENBL_DIAGEXACT
-        frame = self._principal_in_body
-        tool = spec.worldbody.add_body(
-            name="tool",
-            mass=task.body.mass,
-            inertia=task.body.inertia,
-            ipos=frame.position,
-            iquat=frame.quaternion,
-            explicitinertial=True,
-        )
-        tool.add_freejoint()
-        for shape in task.body.shapes:
-            self._add(tool, shape, task.body.friction, 1, 2)
+        for free in task.bodies:
+            frame = free.body.inertia_frame
+            body = spec.worldbody.add_body(
+                mass=free.body.mass,
+                inertia=free.body.inertia,
+                ipos=frame.position,
+                iquat=frame.quaternion,
+                explicitinertial=True,
+            )
+            body.add_freejoint()
+            for shape in free.body.shapes:
+                self._add(body, shape, task.body.friction)
         for shape in task.fixed:
-            self._add(spec.worldbody, shape, task.body.friction, 2, 1)
+            self._add(spec.worldbody, shape, task.body.friction)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        # views, read and written every step
-        self._body = self._model.body("tool").id
-        self._applied = self._data.xfrc_applied[self._body]
-        self._position, self._velocity = self._data.qpos, self._data.qvel
-        self._position[:3], self._position[3:] = task.start.position, task.start.quaternion
+        # views, read and written every step, with a row for each body
+        self._applied = self._data.xfrc_applied[TOOL]
+        self._position = self._data.qpos.reshape(-1, 7)
+        self._velocity = self._data.qvel.reshape(-1, 6)
+        for row, free in zip(self._position, task.bodies, strict=True):
+            row[:3], row[3:] = free.start.position, free.start.quaternion
         spin = task.start_velocity.angular
         lever = rotated(task.start.quaternion, self._centre)
-        self._velocity[:3] = subtract(task.start_velocity.linear, cross(spin, lever))
-        self._velocity[3:] = rotated(conjugate(task.start.quaternion), spin)
+        self._velocity[0, :3] = subtract(task.start_velocity.linear, cross(spin, lever))
+        self._velocity[0, 3:] = rotated(conjugate(task.start.quaternion), spin)
         self._begin(task)
 
-    def _add(
-        self, body: mujoco.MjsBody, shape: base.Shape, friction: float, own: int, other: int
-    ) -> None:
-        """Adds a geom that touches only geoms of the other side."""
+    def _add(self, body: mujoco.MjsBody, shape: base.Shape, friction: float) -> None:
+        """Adds a geom; MuJoCo lets geoms of one body, and fixed ones, never touch each other."""
         geom = body.add_geom(
             type=_TYPES[shape.kind], pos=shape.position, quat=shape.quaternion, mass=0
         )
-        geom.contype, geom.conaffinity = own, other
         geom.condim = 3 if friction > 0 else 1
         geom.friction = (friction, 0, 0)
         geom.solref = (STIFFNESS_TIME * self._timestep, 1)
@@ -120,23 +122,22 @@ class MujocoSimulation(HeldSimulation):
         self._applied[:] = (*force, *torque)
         mujoco.mj_step(self._model, self._data)
 
-    def pose(self) -> base.Pose:
-        """Returns the pose of the body's frame."""
-        x, y, z, w, i, j, k = self._position.tolist()
+    def pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of a body's frame."""
+        x, y, z, w, i, j, k = self._position[body].tolist()
         return base.Pose((x, y, z), (w, i, j, k))
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
-        return self._principal(self.pose())
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+        return base.composed(self.pose(body), self._frames[body])
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
-        quaternion = self.pose().quaternion
-        vx, vy, vz, wx, wy, wz = self._velocity.tolist()
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+        quaternion = self.pose(body).quaternion
+        vx, vy, vz, wx, wy, wz = self._velocity[body].tolist()
         spin = rotated(quaternion, (wx, wy, wz))
-        return base.Velocity(
-            add((vx, vy, vz), cross(spin, rotated(quaternion, self._centre))), spin
-        )
+        lever = rotated(quaternion, self._frames[body].position)
+        return base.Velocity(add((vx, vy, vz), cross(spin, lever)), spin)
 
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step."""

@@ -19,7 +19,7 @@ import warp
 from numpy.typing import NDArray
 
 from hapticbridge.lab.engines import base
-from hapticbridge.lab.engines.mujoco import MujocoEngine, MujocoSimulation
+from hapticbridge.lab.engines.mujoco import TOOL, MujocoEngine, MujocoSimulation
 from hapticbridge.pose import Vector
 
 MAX_CONTACTS, MAX_ROWS = 200, 1000
@@ -60,11 +60,11 @@ class MujocoWarpSimulation(MujocoSimulation):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
         state = self._state
         # on the processor these are views
-        state.xfrc_applied.numpy()[0, self._body] = (*force, *torque)
+        state.xfrc_applied.numpy()[0, TOOL] = (*force, *torque)
         with warp.ScopedDevice("cpu"):
             mujoco_warp.step(self._on_device, state)
-        self._position[:] = state.qpos.numpy()[0]
-        self._velocity[:] = state.qvel.numpy()[0]
+        self._position.flat[:] = state.qpos.numpy()[0]
+        self._velocity.flat[:] = state.qvel.numpy()[0]
 
     def contacts(self) -> base.Contacts:
         """Returns the contacts of the last step."""

@@ -10,6 +10,7 @@ import ctypes
 from collections.abc import Mapping
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int, c_uint, c_void_p
 from functools import cache
+from itertools import combinations
 from typing import Any, ClassVar
 
 import llvmlite.binding
@@ -196,7 +197,7 @@ def step(
 
     Args:
         ids: World, body and group of joints.
-        pairs: Geoms that may touch, the tool's first, shape (n, 2).
+        pairs: Geoms that may touch and their bodies, 0 for a fixed one; shape (n, 4).
         contacts: Address of an array of ``MAX_CONTACTS`` contacts with their surfaces filled in,
             size of one, offset of the geometry in it, and offset of the depth in that, in bytes.
         timestep: Timestep in s.
@@ -218,7 +219,7 @@ def step(
             contact = address + j * size
             depths[total] = floats(contact + geometry + depth, 1)[0]
             total += 1
-            _attach(_create(world, group, contact), body, 0)
+            _attach(_create(world, group, contact), pairs[i, 2], pairs[i, 3])
     _step(world, timestep)
     _empty(group)
     return total
@@ -269,20 +270,33 @@ class OdeSimulation(HeldSimulation):
     def __init__(self, task: base.Task, timestep: float) -> None:
         super().__init__(task, timestep)
         self._ode = ode = library()
-        for shape in (*task.body.shapes, *task.fixed):
-            if shape.kind == "mesh":
-                raise StudyError(f"task '{task.name}' has a mesh, which is not given to ODE")
+        shapes = [*task.fixed, *(shape for free in task.bodies for shape in free.body.shapes)]
+        if any(shape.kind == "mesh" for shape in shapes):
+            raise StudyError(f"task '{task.name}' has a mesh, which is not given to ODE")
         self._world = world = ode.dWorldCreate()
         ode.dWorldSetGravity(world, *task.gravity)
         ode.dWorldSetERP(world, 0.2)
         ode.dWorldSetCFM(world, CFM)
         ode.dWorldSetContactSurfaceLayer(world, LAYER)
-        self._body = self._tool_in(world, task)
-        tools = [self._geom(shape, self._shape_pose(shape)) for shape in task.body.shapes]
-        fixed = [self._geom(shape, shape.pose, is_fixed=True) for shape in task.fixed]
-        self._geoms = [*tools, *fixed]
+        self._bodies = [self._body_in(world, free) for free in task.bodies]
+        self._body = body = self._bodies[0]
+        ode.dBodySetLinearVel(body, *task.start_velocity.linear)
+        ode.dBodySetAngularVel(body, *task.start_velocity.angular)
+        owned = [
+            (self._geom(shape, pose, body), body)
+            for body, free in zip(self._bodies, task.bodies, strict=True)
+            for shape, pose in free.shapes
+        ]
+        owned += [(self._geom(shape, shape.pose, 0), 0) for shape in task.fixed]
+        self._geoms = [geom for geom, _ in owned]
         self._group = ode.dJointGroupCreate(0)
-        pairs = np.array([(a, b) for a in tools for b in fixed], dtype=np.intp).reshape(-1, 2)
+        # the fixed are last, so that the first of a pair is a free body's
+        rows = [
+            (a, b, first, second)
+            for (a, first), (b, second) in combinations(owned, 2)
+            if first != second
+        ]
+        pairs = np.array(rows, dtype=np.intp).reshape(-1, 4)
         self._buffer = (Contact * MAX_CONTACTS)()
         for contact in self._buffer:
             contact.surface.mode = APPROXIMATE_FRICTION
@@ -304,23 +318,22 @@ class OdeSimulation(HeldSimulation):
         self._step = direct(step, *self._fixed_arguments, nothing, nothing, self._depths)
         self._begin(task)
 
-    def _tool_in(self, world: int, task: base.Task) -> int:
-        """Adds the tool's body and returns its address."""
+    def _body_in(self, world: int, free: base.FreeBody) -> int:
+        """Adds a body and returns its address."""
         ode, mass = self._ode, Mass()
         body: int = ode.dBodyCreate(world)
-        ode.dMassSetParameters(mass, task.body.mass, 0, 0, 0, *task.body.inertia, 0, 0, 0)
+        ode.dMassSetParameters(mass, free.body.mass, 0, 0, 0, *free.body.inertia, 0, 0, 0)
         ode.dBodySetMass(body, mass)
-        start = self._principal(task.start)
+        start = free.principal
         ode.dBodySetPosition(body, *start.position)
         ode.dBodySetQuaternion(body, _array(start.quaternion))
-        ode.dBodySetLinearVel(body, *task.start_velocity.linear)
-        ode.dBodySetAngularVel(body, *task.start_velocity.angular)
         ode.dBodySetFiniteRotationMode(body, 1)
         ode.dBodySetGyroscopicMode(body, 1)
         ode.dBodySetAutoDisableFlag(body, 0)
         return body
 
-    def _geom(self, shape: base.Shape, pose: base.Pose, *, is_fixed: bool = False) -> int:
+    def _geom(self, shape: base.Shape, pose: base.Pose, body: int) -> int:
+        """Adds a shape to a body, or fixes it for body 0."""
         ode = self._ode
         geom: int
         if shape.kind == "box":
@@ -329,11 +342,11 @@ class OdeSimulation(HeldSimulation):
             geom = ode.dCreateSphere(None, *shape.size)
         else:
             geom = ode.dCreateCapsule(None, shape.size[0], 2 * shape.size[1])
-        if is_fixed:
+        if not body:
             ode.dGeomSetPosition(geom, *pose.position)
             ode.dGeomSetQuaternion(geom, _array(pose.quaternion))
         else:
-            ode.dGeomSetBody(geom, self._body)
+            ode.dGeomSetBody(geom, body)
             ode.dGeomSetOffsetPosition(geom, *pose.position)
             ode.dGeomSetOffsetQuaternion(geom, _array(pose.quaternion))
         return geom
@@ -342,14 +355,16 @@ class OdeSimulation(HeldSimulation):
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
         self._touching = self._step(*self._fixed_arguments, force, torque, self._depths)
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
-        p, q = self._ode.dBodyGetPosition(self._body), self._ode.dBodyGetQuaternion(self._body)
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+        ode, address = self._ode, self._bodies[body]
+        p, q = ode.dBodyGetPosition(address), ode.dBodyGetQuaternion(address)
         return base.Pose((p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]))
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
-        v, w = self._ode.dBodyGetLinearVel(self._body), self._ode.dBodyGetAngularVel(self._body)
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+        ode, address = self._ode, self._bodies[body]
+        v, w = ode.dBodyGetLinearVel(address), ode.dBodyGetAngularVel(address)
         return base.Velocity((v[0], v[1], v[2]), (w[0], w[1], w[2]))
 
     def contacts(self) -> base.Contacts:

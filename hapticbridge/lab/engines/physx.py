@@ -121,16 +121,22 @@ class SapienSimulation(HeldSimulation):
             for shape in task.fixed:
                 fixed.attach(_collision(shape, shape.pose, material))
             self._add(fixed, base.Pose())
-        self._body = body = physx.PhysxRigidDynamicComponent()
-        for shape in task.body.shapes:
-            body.attach(_collision(shape, self._shape_pose(shape), material))
-        body.mass, body.inertia = task.body.mass, np.array(task.body.inertia)
-        body.cmass_local_pose = sapien.Pose()
-        body.linear_damping = body.angular_damping = 0.0
-        self._add(body, self._principal(task.start))
+        self._bodies = [self._free(free, material) for free in task.bodies]
+        self._body = body = self._bodies[0]
         body.linear_velocity = np.array(task.start_velocity.linear)
         body.angular_velocity = np.array(task.start_velocity.angular)
         self._begin(task)
+
+    def _free(self, free: base.FreeBody, material: Any) -> Any:
+        """Adds a free body and returns it."""
+        body = physx.PhysxRigidDynamicComponent()
+        for shape, pose in free.shapes:
+            body.attach(_collision(shape, pose, material))
+        body.mass, body.inertia = free.body.mass, np.array(free.body.inertia)
+        body.cmass_local_pose = sapien.Pose()
+        body.linear_damping = body.angular_damping = 0.0
+        self._add(body, free.principal)
+        return body
 
     def _add(self, component: Any, pose: base.Pose) -> None:
         entity = sapien.Entity()
@@ -143,15 +149,15 @@ class SapienSimulation(HeldSimulation):
         self._body.add_force_torque(force, torque)
         self._system.step()
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
-        pose = self._body.entity_pose
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+        pose = self._bodies[body].entity_pose
         (x, y, z), (w, i, j, k) = pose.p.tolist(), pose.q.tolist()
         return base.Pose((x, y, z), (w, i, j, k))
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
-        linear, angular = self._body.linear_velocity, self._body.angular_velocity
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+        linear, angular = self._bodies[body].linear_velocity, self._bodies[body].angular_velocity
         return base.Velocity(tuple(linear.tolist()), tuple(angular.tolist()))
 
     def contacts(self) -> base.Contacts:
@@ -168,6 +174,7 @@ class SapienSimulation(HeldSimulation):
 
     def close(self) -> None:
         """Releases the scene; PhysX frees it with its last reference."""
+        self._bodies = []
         self._body = self._system = self._scene = None
 
 
@@ -201,7 +208,7 @@ class SapienSpringSimulation(SapienSimulation):
         if coupling is None:
             return
         self._drive = drive = physx.PhysxDriveComponent(self._body)
-        grip = base.composed(self._body_in_principal, task.grip)
+        grip = base.composed(self._body_in_principal[0], task.grip)
         drive.set_pose_in_child(sapien.Pose(*grip))
         for set_gains in (
             drive.set_drive_property_x,

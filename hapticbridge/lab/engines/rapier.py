@@ -85,27 +85,30 @@ class RapierSimulation(HeldSimulation):
         if STIFFNESS:
             softness = rapier3d.SpringCoefficients(STIFFNESS / self._timestep, 10.0)
             options.contact_softness = options.static_contact_softness = softness
-        body = (
-            rapier3d.RigidBody.dynamic()
-            .can_sleep(False)
-            .position(_isometry(self._principal(task.start)))
-        )
-        shapes = [_collider(s, self._shape_pose(s), task.body.friction) for s in task.body.shapes]
-        self._body = tool = world.rigid_bodies[world.add_body(body, shapes)]
-        tool.set_additional_mass_properties(
-            rapier3d.MassProperties(
-                rapier3d.Vec3(0.0, 0.0, 0.0),
-                task.body.mass,
-                rapier3d.Vec3(*task.body.inertia),
-                rapier3d.Rotation3.identity(),
-            )
-        )
-        tool.recompute_mass_properties_from_colliders(world.colliders)
+        self._bodies = [self._free(free) for free in task.bodies]
+        self._body = tool = self._bodies[0]
         for shape in task.fixed:
             world.add_collider(_collider(shape, shape.pose, task.body.friction))
         tool.linvel = rapier3d.Vec3(*task.start_velocity.linear)
         tool.angvel = rapier3d.Vec3(*task.start_velocity.angular)
         self._begin(task)
+
+    def _free(self, free: base.FreeBody) -> Any:
+        """Adds a free body and returns it."""
+        world, body = self._world, free.body
+        made = rapier3d.RigidBody.dynamic().can_sleep(False).position(_isometry(free.principal))
+        shapes = [_collider(shape, pose, body.friction) for shape, pose in free.shapes]
+        added = world.rigid_bodies[world.add_body(made, shapes)]
+        added.set_additional_mass_properties(
+            rapier3d.MassProperties(
+                rapier3d.Vec3(0.0, 0.0, 0.0),
+                body.mass,
+                rapier3d.Vec3(*body.inertia),
+                rapier3d.Rotation3.identity(),
+            )
+        )
+        added.recompute_mass_properties_from_colliders(world.colliders)
+        return added
 
     def advance(self, force: Vector, torque: Vector) -> None:
         """Sets a force in N and a torque in N m at the centre of mass, and steps."""
@@ -116,14 +119,14 @@ class RapierSimulation(HeldSimulation):
         body.add_torque(torque)
         self._world.step()
 
-    def principal_pose(self) -> base.Pose:
-        """Returns the pose of the principal axes of inertia at the centre of mass."""
-        place, turn = self._body.translation, self._body.rotation
+    def principal_pose(self, body: int = 0) -> base.Pose:
+        """Returns the pose of the principal axes of inertia at a body's centre of mass."""
+        place, turn = self._bodies[body].translation, self._bodies[body].rotation
         return base.Pose((place.x, place.y, place.z), (turn.w, turn.i, turn.j, turn.k))
 
-    def velocity(self) -> base.Velocity:
-        """Returns the velocity of the centre of mass and the angular velocity."""
-        linear, angular = self._body.linvel, self._body.angvel
+    def velocity(self, body: int = 0) -> base.Velocity:
+        """Returns the velocity of a body's centre of mass and its angular velocity."""
+        linear, angular = self._bodies[body].linvel, self._bodies[body].angvel
         return base.Velocity((linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z))
 
     def contacts(self) -> base.Contacts:
@@ -140,6 +143,7 @@ class RapierSimulation(HeldSimulation):
 
     def close(self) -> None:
         """Releases the world with its last reference."""
+        self._bodies = []
         self._body = self._world = None
 
 
