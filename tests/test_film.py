@@ -276,7 +276,9 @@ def test_a_picture_without_a_time_is_that_of_the_largest_force(
     with hb.Bridge("virtual_wall", clock=hb.SimulatedClock(), recording=path) as bridge:
         bridge.run(duration=1.5)
     shots: list[Shot] = []
-    monkeypatch.setattr("hapticbridge.cli.view.draw", lambda *words, **_: shots.append(words[2]))
+    monkeypatch.setattr(
+        "hapticbridge.cli.recordings.draw", lambda *words, **_: shots.append(words[2])
+    )
     for name in ("run.png", "run.mp4"):
         assert main(["render", str(path), str(tmp_path / name)]) == 0
     force = np.linalg.norm(read_recording(path).ticks["wrench_on_tool"][:, :3], axis=1)

@@ -58,7 +58,9 @@ _MODULES = {
     "compare": "recordings",
     "export": "recordings",
     "repair": "audit",
-    "render": "view",
+    "view": "recordings",
+    "render": "recordings",
+    "doctor": "devices",
     "bound": "zwidth",
     "stability": "chart",
 }
