@@ -59,6 +59,7 @@ _MODULES = {
     "export": "recordings",
     "repair": "audit",
     "render": "view",
+    "doctor": "devices",
     "bound": "zwidth",
     "stability": "chart",
 }
