@@ -3,12 +3,13 @@
 The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a force that acts at
 once. A run certifies its device only if it kept its time, which means two things.
 
-1. At the time between new samples that the run had on average, T/s with s the share of the
-   deadlines that it kept, or of the samples that were new if that is less, at the mean time j by
-   which a sample came later after its deadline than the one before, and at the mean time t_d from
-   sample to force, the condition still holds:
+1. The condition still holds with three measured averages: the time between new samples T/s, the
+   sample jitter j, and the delay t_d from sample to force.
 
        b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
+
+   s is the smaller of two shares: deadlines that were kept, and samples that were new. j is the
+   mean time by which a sample came later after its deadline than the one before; 0 if earlier.
 
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
    (``kernel.timing``, and again ``audit.timing``).
