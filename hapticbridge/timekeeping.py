@@ -185,8 +185,8 @@ class Timekeeping:
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
         late = tuple(_at_times(each, parameters, least, times) for each in conditions)
-        held = [each.holds for each in late if each.available is not None]
-        is_borne = bool(held) and all(each.holds is not False for each in conditions)
+        verdicts = [each.holds for each in late if each.available is not None]
+        is_borne = bool(verdicts) and all(each.holds is not False for each in conditions)
         return cls(
             rate=least / parameters.period if times.ticks else 0.0,
             share=share,
@@ -196,7 +196,7 @@ class Timekeeping:
             delay_energy=times.delay_energy,
             conditions=late,
             in_time=tuple(conditions),
-            is_kept=all(held) and times.delay_energy <= INSTANT if is_borne else None,
+            is_kept=all(verdicts) and times.delay_energy <= INSTANT if is_borne else None,
             is_realtime=times.is_realtime,
             watch=watch_sentence(times.flags),
             law_evaluations=parameters.law_evaluations,

@@ -97,8 +97,8 @@ def meter_delay(s: State, elapsed: float, interval: float) -> None:
 def meter_debt(s: State) -> None:
     """Notes the most that delays may have given, once the springs have paid for a late sample."""
     t, owed, ratio = s.timing, s.coupling.owed, s.run.force_scale / s.run.scale
-    held = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
-    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + held)
+    carried = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
+    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + carried)
 
 
 @compiled
