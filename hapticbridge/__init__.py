@@ -44,7 +44,5 @@ if TYPE_CHECKING:
     from hapticbridge.scene import load_scene as load_scene
     from hapticbridge.scene import scene_names as scene_names
     from hapticbridge.summary import Summary as Summary
-
-    passivity = theory
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

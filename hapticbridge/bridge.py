@@ -299,7 +299,7 @@ class Bridge:
     def _reason_with_hand(self, code: int, tick: int) -> str:
         """Describes why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
-        grip = self.setups[hand].scene.grip if self._others else ""
+        grip = self.setups[hand].scene.grip if self.setup.scene.has_several_hands else ""
         return trip_reason(code, tick, grip)
 
     def stop(self, by: str = "caller") -> None:
@@ -356,7 +356,7 @@ class Bridge:
         self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
 
     def _refuse_several(self) -> None:
-        if self._others:
+        if self.setup.scene.has_several_hands:
             raise CommandError("a run of several hands takes no commands but to stop")
 
     def set_input(
@@ -452,7 +452,7 @@ class Bridge:
         Those of several hands begin with the hand's grip.
         """
         return tuple(
-            f"{setup.scene.grip}: {sentence}" if self._others else sentence
+            f"{setup.scene.grip}: {sentence}" if setup.scene.has_several_hands else sentence
             for setup, own in zip(self.setups, self.session.hand_parameters, strict=True)
             for sentence in condition_sentences(setup.info, own, setup.method)
         )

@@ -1,8 +1,9 @@
-"""Device conditions and their verdict."""
+"""Device conditions, their verdict, and the default coupling that meets them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -12,7 +13,7 @@ import numpy as np
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.law import SLACK_SHARE
+from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
@@ -460,9 +461,19 @@ def is_run_certified(conditions: tuple[DampingCondition, ...], method: Method) -
 
 def is_certified(conditions: tuple[DampingCondition, ...]) -> bool | None:
     """Returns True if all conditions hold; None if one is unknown or a delay forbids a proof."""
-    held = {condition.holds for condition in conditions}
+    verdict = worst_verdict([condition.holds for condition in conditions])
     is_late = any(condition.delay != 0 for condition in conditions)
-    return False if False in held else None if None in held or not held or is_late else True
+    return None if verdict and is_late else verdict
+
+
+def worst_verdict(verdicts: Sequence[bool | None]) -> bool | None:
+    """Returns the worst of verdicts: False, then None for an unknown one, then True.
+
+    Without any verdict the result is None: nothing was proven.
+    """
+    if False in verdicts:
+        return False
+    return None if None in verdicts or not verdicts else True
 
 
 def damping_margin(conditions: tuple[DampingCondition, ...]) -> float | None:

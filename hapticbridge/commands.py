@@ -123,7 +123,7 @@ class Repeat:
     """Internal command that repeats recorded events; not accepted over the wire.
 
     Attributes:
-        events: Events of ``execution.CHANGES`` in order, all applied before one tick.
+        events: Events of ``CHANGES`` in order, all applied before one tick.
     """
 
     events: tuple[Mapping[str, Any], ...]
@@ -181,9 +181,7 @@ def command_of(line: bytes) -> Command:
         raise CommandError(f"command '{name}' takes {valid}, not {shown(values)}") from None
 
 
-# Couplings that may be selected during a run
-
-# Largest stiffness and damping that a device tolerates, for translation or rotation
+# Couplings that may be selected during a run: the largest stiffness and damping of each
 
 SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no

@@ -38,8 +38,6 @@ def lazy_exports(
                     present += [alias.name for alias in aliases if alias.asname]
                 case ast.FunctionDef(name=name):
                     present.append(name)
-                case ast.Assign(targets=[ast.Name(id=name)], value=ast.Name(id=other)):
-                    places[name] = places[other]
     names = sorted({*places, *present})
 
     def find(name: str) -> object:

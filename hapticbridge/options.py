@@ -44,6 +44,7 @@ from hapticbridge.guard import (
 )
 from hapticbridge.kernel.parameters import (
     MAX_SCENE_TICKS,
+    SAME_AXES,
     UNGUARDED,
     GuardParameters,
     RunParameters,
@@ -90,7 +91,7 @@ class Workspace:
 
     scale: float = 1.0
     force_scale: float | None = None
-    axes: ArrayLike = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    axes: ArrayLike = SAME_AXES
     absolute: bool = False
 
     def __post_init__(self) -> None:

@@ -1,4 +1,18 @@
-"""Rendering methods: description, registry, and preparation of a scene."""
+"""Rendering methods: description, registry, preparation of a scene, and the coupling's three names.
+
+To add a method of the product that uses an existing path of the wrench, add a ``Method`` here and
+to ``METHODS``. For a new path, ``Scheme.MIDPOINT`` (``kernel.lossless``) is the example:
+
+1. ``kernel.codes``: a number of ``Scheme`` with its ``SchemeProperties``; in ``kernel.parameters``,
+   ``SLOW_SCHEMES`` if its scene may step beside the loop.
+2. A module in ``kernel`` with the steps and the sub-record of the scheme; ``kernel.state`` binds
+   the sub-record and resets it.
+3. ``kernel.tick``: a branch in ``before_step`` and ``_evaluate``, and in ``close_tick`` if the
+   balance needs more. A test fails while a scheme has no branch.
+4. ``audit.motion.wrench_by_law``: its law, by which the audit computes every wrench again.
+
+``lab.methods`` has the recipe for a method that exists only to be compared.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +69,7 @@ class Method:
         integrator: MuJoCo's integrator by its MJCF name.
         discretization: Discretisation of the coupling's damper in the bounds; ``none`` without a
             law.
-        gains: Gains of the coupling's actuators.
+        gains: Gains of the coupling's actuators. The scheme ``MIDPOINT`` needs ``implicit_gains``.
         check: Refuses a scene that the method cannot render, by model and name of the grip; None if
             it renders any.
         reach: Distance in m between surfaces at which a contact exists before it acts.
@@ -81,6 +95,13 @@ class Method:
     compensated_share: float = 0.0
     added_share: float | None = None
     is_rigid: bool = False
+
+    def __post_init__(self) -> None:
+        if self.scheme == Scheme.MIDPOINT and self.gains is not implicit_gains:
+            raise HapticBridgeError(
+                f"method '{self.name}' has gains of its own; the kernel takes a lossless "
+                "coupling's from kernel.law.implicit_gains"
+            )
 
     @property
     def step(self) -> Callable[[Any, Any], None]:
@@ -473,7 +494,7 @@ def check_scene(model: mujoco.MjModel, grip: str, method: Method) -> None:
 def prepare(
     scene: Scene,
     coupling: Coupling,
-    period: float,
+    scene_period: float,
     substeps: int,
     method: Method = IMPLICIT,
     warns: bool = True,
@@ -484,8 +505,8 @@ def prepare(
         scene: Changed in place. For a weld its model and data are replaced; changes to the old
             model are carried over.
         coupling: The requested coupling.
-        period: T in s.
-        substeps: MuJoCo steps per tick.
+        scene_period: Time in s between two results of the scene: T, or n T of a slower scene.
+        substeps: MuJoCo steps in that time.
         method: The rendering method.
         warns: True to warn of contacts that may create energy at this time step.
 
@@ -502,13 +523,13 @@ def prepare(
         _ARGUMENTS.number(f"coupling {gain.name.replace('_', ' ')}", getattr(coupling, gain.name))
     check_scene(scene.model, scene.grip, method)
     scene.set_weld(coupling if method.is_weld else None)
-    scene.set_timestep(period, substeps)
+    scene.set_timestep(scene_period, substeps)
     scene.model.opt.integrator = _INTEGRATORS[method.integrator]
     scene.set_reach(method.reach)
     scene.set_contact(is_rigid=method.is_rigid)
     if warns and method.warns and not method.is_rigid:
         warn_of_contacts(scene.model, scene.grip, scene.path)
-    step = period / substeps
+    step = scene_period / substeps
     scene.set_gains(*method.gains(method.law_coupling(coupling, step), step))
     effective = measured_weld(scene.model, scene.grip) if method.is_weld else None
     scene.reset()
@@ -538,7 +559,7 @@ def prepare_hands(
         scene.of_hand(hand).set_gains(*method.gains(law, period))
 
 
-UNLIMITED = 1e30
+LARGEST_WRENCH = 1e30
 """Force in N and torque in N m of a device without limits; infinity is no limit of a run."""
 
 
@@ -565,8 +586,8 @@ def unguarded_parameters(
         period=period,
         substeps=substeps,
         coupling=method.law_coupling(coupling, period / substeps),
-        force_limit=UNLIMITED,
-        torque_limit=UNLIMITED,
+        force_limit=LARGEST_WRENCH,
+        torque_limit=LARGEST_WRENCH,
         ramp_ticks=0,
         device_origin=IDENTITY_POSE,
         handle_origin=scene.grip_pose(),

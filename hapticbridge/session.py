@@ -304,13 +304,20 @@ class Session:
         self.inputs: deque[list[Write]] = deque()
         self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
         with ExitStack() as resources:
-            resources.callback(device.close)
+            resources.callback(device.close)  # ``_open`` says why it is called twice
             self._open(resources)
             resources.callback(self.command_zero_force)
             self._resources = resources.pop_all()
         self._is_begun = self.is_open = True
 
     def _open(self, resources: ExitStack) -> None:
+        """Opens everything in order; what is registered last is closed first.
+
+        The device's ``close``, which may be called again, is registered twice. The first one, by
+        the constructor, closes a device that was never started because something else failed. The
+        second one, before the start, ends the force of a started device at once: to close the
+        scene or the recording may take long.
+        """
         setup, scene, clock = self.setup, self.setup.scene, self.clock
         scene.claim()
         resources.callback(self._release_scene)
@@ -336,7 +343,6 @@ class Session:
         if setup.is_realtime:
             self._grants = resources.enter_context(memory_at_rest())
         resources.callback(self._close_scene)
-        # first, because waiting for the recorder or the scene may take long
         resources.callback(checked_close(self.device))
         sample[:] = checked_start(self.device)(setup.period)[: sample.size]
         for each, own in zip(self._setups, self._samples(), strict=True):

@@ -18,6 +18,7 @@ from hapticbridge.certificate import (
     fresh_share,
     is_run_certified,
     run_conditions,
+    worst_verdict,
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
@@ -106,7 +107,7 @@ class Ledger:
     def from_state(cls, state: NDArray[np.void]) -> Ledger:
         """Reads the ledger from the kernel's state (``STATE_DTYPE``, one element)."""
         energy = state["energy"][0]
-        values = {name: float(energy[name]) for name in _ENERGIES}
+        values = {name: float(energy[name]) for name in (*_ENERGIES, _SHARE)}
         ticks = [int(energy[name]) for name in _TICKS]
         unstrict, active, kick = (tick if tick >= 0 else None for tick in ticks)
         return cls(**values, first_unstrict=unstrict, first_active=active, first_device_excess=kick)
@@ -127,11 +128,12 @@ class Ledger:
 
     def energies(self) -> dict[str, float]:
         """Returns the energies by name, in J."""
-        return {name: value for name, value in asdict(self).items() if name in _ENERGIES[:-1]}
+        return {name: value for name, value in asdict(self).items() if name in _ENERGIES}
 
 
-_NAMES = tuple(field.name for field in fields(Ledger))
-_ENERGIES, _TICKS = _NAMES[:9], _NAMES[9:]
+_TICKS = ("first_unstrict", "first_active", "first_device_excess")
+_SHARE = "slack_share"
+_ENERGIES = tuple(each.name for each in fields(Ledger) if each.name not in (*_TICKS, _SHARE))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -277,7 +279,7 @@ class Summary:
             hands=hands,
             fault=min(faults, default=None),
             slack_share=max(each.slack_share for each in hands),
-            is_certified=False if False in certified else None if None in certified else True,
+            is_certified=worst_verdict(certified),
         )
 
     def to_dict(self) -> dict[str, Any]:

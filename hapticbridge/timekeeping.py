@@ -3,12 +3,13 @@
 The device condition b >= N, N = K T/2 + B', is computed for ticks each T and a force that acts at
 once. A run certifies its device only if it kept its time, which means two things.
 
-1. At the time between new samples that the run had on average, T/s with s the share of the
-   deadlines that it kept, or of the samples that were new if that is less, at the mean time j by
-   which a sample came later after its deadline than the one before, and at the mean time t_d from
-   sample to force, the condition still holds:
+1. The condition still holds with three measured averages: the time between new samples T/s, the
+   sample jitter j, and the delay t_d from sample to force.
 
        b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
+
+   s is the smaller of two shares: deadlines that were kept, and samples that were new. j is the
+   mean time by which a sample came later after its deadline than the one before; 0 if earlier.
 
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
    (``kernel.timing``, and again ``audit.timing``).
@@ -184,8 +185,8 @@ class Timekeeping:
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
         late = tuple(_at_times(each, parameters, least, times) for each in conditions)
-        held = [each.holds for each in late if each.available is not None]
-        is_borne = bool(held) and all(each.holds is not False for each in conditions)
+        verdicts = [each.holds for each in late if each.available is not None]
+        is_borne = bool(verdicts) and all(each.holds is not False for each in conditions)
         return cls(
             rate=least / parameters.period if times.ticks else 0.0,
             share=share,
@@ -195,7 +196,7 @@ class Timekeeping:
             delay_energy=times.delay_energy,
             conditions=late,
             in_time=tuple(conditions),
-            is_kept=all(held) and times.delay_energy <= INSTANT if is_borne else None,
+            is_kept=all(verdicts) and times.delay_energy <= INSTANT if is_borne else None,
             is_realtime=times.is_realtime,
             watch=watch_sentence(times.flags),
             law_evaluations=parameters.law_evaluations,

@@ -16,6 +16,7 @@ from hapticbridge.certificate import (
     device_conditions,
     device_period,
     is_certified,
+    worst_verdict,
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
@@ -28,6 +29,16 @@ SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
 def info(**changes: Any) -> DeviceInfo:
     real = {"axes": ("x", "y", "z"), "is_real": True, "rate": 1000.0, "delay": 0.0}
     return dataclasses.replace(SimulatedDevice(damping=2.0).info, **{**real, **changes})
+
+
+def test_one_false_or_unknown_verdict_decides_over_all() -> None:
+    table: dict[tuple[bool | None, ...], bool | None] = {
+        (): None,
+        (True,): True,
+        (True, None): None,
+        (None, True, False): False,
+    }
+    assert {verdicts: worst_verdict(verdicts) for verdicts in table} == table
 
 
 @pytest.mark.parametrize(

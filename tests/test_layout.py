@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from hapticbridge.kernel.codes import Scheme
+
 TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "hapticbridge"
 
@@ -278,6 +280,34 @@ def test_each_part_of_the_kernels_state_has_one_writer() -> None:
         for part in written_parts(path.read_text(encoding="utf-8")):
             writers.setdefault(part, set()).add(path.stem)
     assert writers == {part: {module} for part, module in WRITERS.items()}
+
+
+BRANCHES = (
+    {"tick": "before_step", "compared_methods": "drive_compared"},
+    {"tick": "_evaluate", "compared_methods": "compared_wrench"},
+)
+"""Functions of the kernel that together have a branch for each scheme, by module."""
+
+
+def named_schemes(source: str, function: str) -> set[str]:
+    """Returns the schemes that a function compares with ``==``."""
+    tree = ast.parse(source)
+    body = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
+    compared = [n.comparators[0] for n in ast.walk(body) if isinstance(n, ast.Compare)]
+    return {
+        n.attr
+        for n in compared
+        if isinstance(n, ast.Attribute) and ast.unparse(n.value) == "Scheme"
+    }
+
+
+@pytest.mark.parametrize("functions", BRANCHES, ids=lambda functions: functions["tick"])
+def test_each_scheme_has_a_branch_before_and_after_the_step(functions: dict[str, str]) -> None:
+    found: set[str] = set()
+    for module, function in functions.items():
+        source = (PACKAGE / "kernel" / f"{module}.py").read_text(encoding="utf-8")
+        found |= named_schemes(source, function)
+    assert found == set(Scheme.__members__)
 
 
 @pytest.mark.parametrize(

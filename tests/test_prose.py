@@ -60,12 +60,13 @@ POINTER = re.compile(r"``([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?``")
 
 NOT_OURS = {
     "mujoco.introspect",
+    "mujoco.set_mjcb_time",
     "hapticbridge.meta",
     "hapticbridge.events",
     "hapticbridge.flags",
     "hapticbridge.digest",
 }
-"""Dotted names that begin like a module here: a module of MuJoCo, and names in a recording."""
+"""Dotted names that begin like a module here: names of MuJoCo, and names in a recording."""
 
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,11 @@ UNPREPARED = [
     ("implicitfast", MOVED_BY.format('<velocity name="v" joint="arm" kv="1"/>', gravcomp=0), "'v'"),
     ("weld", MOVED_BY.format('<position name="p" joint="arm" kv="1"/>', gravcomp=0), "'p'"),
 ]
+
+
+def test_gains_of_a_lossless_method_that_the_kernel_would_not_take_are_refused() -> None:
+    with pytest.raises(HapticBridgeError, match="'lossless' has gains of its own"):
+        dataclasses.replace(METHODS["lossless"], gains=METHODS["explicit"].gains)
 
 
 @pytest.mark.parametrize(("method", "scene", "message"), UNPREPARED)

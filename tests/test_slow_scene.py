@@ -516,6 +516,16 @@ def test_the_command_line_names_the_rate(call: Called, tmp_path: Path) -> None:
     assert "the scene at 100 Hz and 100 % of its speed" in out
 
 
+def test_the_command_line_warns_above_twice_the_steady_stiffness(call: Called) -> None:
+    setup = fast("peg_in_hole", ScriptedDevice(still), scene_rate=100.0).setup
+    limit = 2.0 * steady_stiffness(setup.scene, setup.info, 0.01, 1.0, 1.0)
+    run = ("run", "peg_in_hole", "--fast", "--duration", 0.1, "--scene-rate", 100)
+    for share, warns in ((0.98, False), (1.02, True)):
+        code, _, err = call(*run, "--stiffness", share * limit)
+        assert code == 0
+        assert (f"may shake above about {limit:.2g} N/m" in " ".join(err.split())) == warns
+
+
 def test_the_command_line_warns_of_a_stiffness_that_lets_the_tool_shake_in_turns(
     call: Called,
 ) -> None:

@@ -36,6 +36,7 @@ from hapticbridge.certificate import (
     fresh_share,
     is_run_certified,
     run_conditions,
+    worst_verdict,
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -454,7 +455,7 @@ def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFi
             for sentence in own[name]
         )
     certified = [own["certified"] for own in of_hands]
-    found["certified"] = False if False in certified else None if None in certified else True
+    found["certified"] = worst_verdict(certified)
     margins = [own["damping_margin"] for own in of_hands if own["damping_margin"] is not None]
     found["damping_margin"] = min(margins, default=None)
     worst = certified.index(found["certified"])

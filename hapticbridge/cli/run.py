@@ -138,7 +138,7 @@ def _announce_slow(setup: RunSetup) -> None:
     if setup.coupling.stiffness > 2.0 * most:
         err.print(
             "[yellow]warning:[/yellow] at this scene rate the tool may shake above about "
-            f"{most:.2g} N/m: lower --stiffness, or raise --scene-rate"
+            f"{2.0 * most:.2g} N/m: lower --stiffness, or raise --scene-rate"
         )
     most = steady_rotational_stiffness(setup.info, setup.scene_period, *scales)
     if setup.coupling.rotational_stiffness > 2.0 * most:

@@ -1,10 +1,10 @@
 """Haptic devices: real, simulated and replayed, behind one protocol.
 
-Read ``base`` first: four calls and a data sheet. ``simulated`` and ``trajectory`` need no
-hardware; ``rawhid`` is the plainest real driver. Real drivers use ``transport`` for their bytes.
-``registry`` opens a device by its name and options, with the numbers of a ``profile``. ``driver``
-describes a driver, ``discovery`` lists the devices that are plugged in. ``watchdog`` ends the
-force if device or program stops answering.
+Read ``base`` first: four calls and a data sheet. ``simulated`` and ``trajectory`` need no hardware;
+``spacemouse`` is the shortest driver of real hardware. Real drivers use ``transport`` for their
+bytes. ``registry`` opens a device by its name and options, with the numbers of a ``profile``.
+``driver`` describes a driver, ``discovery`` lists the devices that are plugged in. ``watchdog``
+ends the force if device or program stops answering.
 """
 
 from hapticbridge.device.base import AXES as AXES

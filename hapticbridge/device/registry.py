@@ -1,4 +1,16 @@
-"""Devices by name, for the command line and scripts."""
+"""Devices by name, for the command line and scripts.
+
+To add a driver to this tree (``hapticbridge guide device-package`` adds one from outside):
+
+1. A module of ``device`` with a class of the protocol ``base.Device`` and a ``driver.Driver`` as
+   ``DRIVER``: name, USB ids, options, the function that opens it. ``spacemouse`` is the shortest
+   example; ``transport`` moves its bytes.
+2. A row in ``DRIVERS``: its name and its module.
+3. A profile in ``device/profiles`` for each model with measured or stated numbers.
+4. A row in README's table of devices, and a section in ``guide/devices.md``.
+5. Tests: an emulated unit in ``tests/emulated``, the contract suite
+   (``tests/test_device_contract.py``), and ``tests/test_device_NAME.py`` for its own protocol.
+"""
 
 from __future__ import annotations
 

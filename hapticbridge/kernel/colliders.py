@@ -1,8 +1,8 @@
 """Functions of the bridge in MuJoCo's table of collision functions.
 
-A contact law that acts on velocities needs gaps that change continuously with the pose and normals
-that are the gaps' gradients. MuJoCo's own functions keep this for spheres, planes, and capsules on
-boxes. These pairs are replaced here:
+A contact law at the level of velocities needs two things: gaps that change continuously with the
+pose, and normals that are the gradients of these gaps. MuJoCo's own functions give both for
+spheres, planes, and capsules on boxes. These pairs are replaced here:
 
 - Two boxes: MuJoCo drops points from step to step (``box_contact``).
 - A capsule on a mesh, a cylinder on a box or a mesh: normal and face are right, but the lowest

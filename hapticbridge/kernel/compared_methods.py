@@ -61,13 +61,15 @@ def drive_compared(s: State, orientation: Quaternion) -> None:
         place_tool(s)
     elif s.run.scheme == Scheme.ZERO_ORDER_HOLD:
         hold_wrench(s, orientation)
-    else:
+    elif s.run.scheme == Scheme.WELD:
         command_handle_velocity(s, orientation)
 
 
 @compiled
 def compared_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
     """Returns force, torque, and the tool's motion and rotation vector since the last call.
+
+    A scheme without a branch here has a wrench that is not finite, so its first tick is refused.
 
     Args:
         s: The bound state after a step of MuJoCo.
@@ -78,9 +80,12 @@ def compared_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Ve
     if s.run.scheme == Scheme.WELD:
         wrench = weld_wrench(s)  # before the kinematics are refreshed
         position, orientation, moved, turned = tool_after_step(s)
-    else:
+    elif s.run.scheme == Scheme.MASSLESS:
         wrench = balance_contacts(s)
         position, orientation, moved, turned = tool_motion(s)
+    else:
+        unknown = (np.nan, np.nan, np.nan)
+        return unknown, unknown, unknown, unknown
     note_tool(s.pose, position, orientation)
     return wrench[0], wrench[1], moved, turned
 

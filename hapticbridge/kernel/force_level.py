@@ -10,9 +10,10 @@ a monotone damper. Its slopes are at most K and B', so the device condition b >=
 it is. A limit on the device alone breaks the guarantee: a hand that stretches the coupling far
 beyond the limit and then yields receives energy that it never supplied.
 
-MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c belongs to the end
-of the step, c = F/‖u‖, so a step is repeated with other gains until it does: positions, contacts
-and velocities at the start of the step stay valid, only the forces are solved again. Within a step
+MuJoCo solves the coupling implicitly, with the gains c K and c B'. The share c = F/‖u‖ depends on
+u at the end of the step, which is not known before. So the step is repeated with other gains until
+they fit. Positions, contacts and velocities at its start stay valid; only the forces are solved
+again. Within a step
 u answers to the force nearly as ‖u‖ = A/(1 + c σ); σ is learnt from the last two solutions, and c
 for the next tick is extrapolated, so most saturated ticks need one repetition. The share is 1 and
 nothing is repeated while the coupling is below its level.

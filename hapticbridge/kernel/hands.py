@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.codes import BAD_RESULT, HAND_CODES, OK, RING_FULL
+from hapticbridge.kernel.explicit_bias import take_back
 from hapticbridge.kernel.force_level import (
     keep_state,
     settle_levels,
@@ -39,7 +40,6 @@ from hapticbridge.kernel.ledger import (
     judge_balance,
     meter_ports,
     refresh_energies,
-    take_back,
 )
 from hapticbridge.kernel.rigid_contact import fill_tank, finish_contacts, follow_speed
 from hapticbridge.kernel.tick import (

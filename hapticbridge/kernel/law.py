@@ -9,13 +9,14 @@ tool in m, δ their steps within the time T in s. The six actuators of the scene
 inside MuJoCo's step; ``law_wrench`` evaluates it afterwards, at the poses that resulted. The two
 agree because the actuators are implicit: MuJoCo solves them at the end of the step.
 
-A change of the gains during a run, and an axis without motor, move the handle's end of the spring
-without the device: it slips. With gains that change from tick to tick, the identity behind Brown &
-Colgate's (6) has the term −Σ W_k with W_k = V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the
-energy of the spring. A raised gain would hand W_k to the device, so the handle slips toward the
-tool until V_k(p'_k) = V_{k−1}(p_k); a lowered gain loses energy. The gains move in a straight line
-over ``tuning_ticks`` ticks; the damping that a device needs is convex in K and B, so no coupling on
-the line needs more than the larger end.
+In four cases the handle's end of the spring moves without the device: it slips. These are changed
+gains, a late sample, an axis without motor, and a hand that is let go (``slip``). With gains that
+change from tick to tick, the identity behind Brown & Colgate's (6) has the term −Σ W_k with W_k =
+V_k(p_k) − V_{k−1}(p_k), p_k = h_k − x_{k−1} and V the energy of the spring. A raised gain would
+hand W_k to the device, so the handle slips toward the tool until V_k(p'_k) = V_{k−1}(p_k); a
+lowered gain loses energy. The gains move in a straight line over ``tuning_ticks`` ticks; the
+damping that a device needs is convex in K and B, so no coupling on the line needs more than the
+larger end.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from hapticbridge.kernel.handle import (
     scene_from_device,
     slip_handle,
 )
-from hapticbridge.kernel.ledger import moment_dot
+from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
 from hapticbridge.pose import (
@@ -63,26 +64,18 @@ GainRule: TypeAlias = Callable[[Coupling, float], tuple[Gains, Gains]]
 """Gains of the coupling's actuators, for forces and for torques, by the law's coupling and MuJoCo's
 time step in s."""
 
-SLACK_SHARE = 0.5
-"""Share of ½ (K + nB'/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick;
-no unit. With substeps only half of the slack may be used, because the whole would require infinite
-device damping at B' = 0. With a smaller share an environment counts as active sooner."""
-
-TUNED = (
-    "stiffness",
-    "damping",
-    "rotational_stiffness",
-    "rotational_damping",
-    "slack_stiffness",
-    "slack_rotational_stiffness",
-)
+_LAW = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+_SLACK = ("slack_stiffness", "slack_rotational_stiffness")
+TUNED = (*_LAW, *_SLACK)
 """Numbers of the state that depend on the coupling, besides the gains of its actuators."""
+
+_TUNED_DTYPE = np.dtype([*((name, "<f8") for name in TUNED), ("gains", "<f8", 6)])
 
 COUPLING_DTYPE = np.dtype(
     [
         *((name, "<f8") for name in TUNED),
         ("gains", "<f8", 6),  # of the actuators: three for forces, three for torques
-        ("tuning_goal", "<f8", 12),  # TUNED, then gains
+        ("tuning_goal", _TUNED_DTYPE),
         ("tuning_ticks", "<i8"),  # ticks left until the goal is reached
         ("lacks_motors", "<i8"),
         ("lacks_motor", "<f8", 6),  # 1 for an axis of the device without motor
@@ -140,7 +133,7 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
 def tuned_values(parameters: RunParameters) -> tuple[float, ...]:
     """Returns the numbers of ``TUNED`` for a coupling; all are linear in it."""
     coupling = parameters.coupling
-    law = (getattr(coupling, name) for name in TUNED[:4])
+    law = (getattr(coupling, name) for name in _LAW)
     return (*law, *slack_gains(parameters))
 
 
@@ -160,7 +153,7 @@ def set_tuning_goal(
     coupling: Part, parameters: RunParameters, gains: tuple[Gains, Gains], ticks: int
 ) -> None:
     """Sets the coupling of ``parameters`` as the goal of the next ``ticks`` ticks."""
-    coupling["tuning_goal"] = (*tuned_values(parameters), *gains[0], *gains[1])
+    coupling["tuning_goal"] = (*tuned_values(parameters), (*gains[0], *gains[1]))
     coupling["tuning_ticks"] = ticks
 
 
@@ -432,20 +425,24 @@ def retune(s: State) -> tuple[float, float]:
     energy_r = spring_energy(k.rotational_stiffness, norm(twist), s.level.level[1])
     stiffness, rotational = k.stiffness, k.rotational_stiffness
     share = 1.0 / left
-    k.stiffness += share * (goal[0] - k.stiffness)
-    k.damping += share * (goal[1] - k.damping)
-    k.rotational_stiffness += share * (goal[2] - k.rotational_stiffness)
-    k.rotational_damping += share * (goal[3] - k.rotational_damping)
-    k.slack_stiffness += share * (goal[4] - k.slack_stiffness)
-    k.slack_rotational_stiffness += share * (goal[5] - k.slack_rotational_stiffness)
+    k.stiffness += share * (goal.stiffness - k.stiffness)
+    k.damping += share * (goal.damping - k.damping)
+    k.rotational_stiffness += share * (goal.rotational_stiffness - k.rotational_stiffness)
+    k.rotational_damping += share * (goal.rotational_damping - k.rotational_damping)
+    k.slack_stiffness += share * (goal.slack_stiffness - k.slack_stiffness)
+    k.slack_rotational_stiffness += share * (
+        goal.slack_rotational_stiffness - k.slack_rotational_stiffness
+    )
     for i in range(6):
-        k.gains[i] += share * (goal[6 + i] - k.gains[i])
+        k.gains[i] += share * (goal.gains[i] - k.gains[i])
     if left == 1:  # without the error of rounding
-        k.stiffness, k.damping = goal[0], goal[1]
-        k.rotational_stiffness, k.rotational_damping = goal[2], goal[3]
-        k.slack_stiffness, k.slack_rotational_stiffness = goal[4], goal[5]
+        k.stiffness, k.damping = goal.stiffness, goal.damping
+        k.rotational_stiffness = goal.rotational_stiffness
+        k.rotational_damping = goal.rotational_damping
+        k.slack_stiffness = goal.slack_stiffness
+        k.slack_rotational_stiffness = goal.slack_rotational_stiffness
         for i in range(6):
-            k.gains[i] = goal[6 + i]
+            k.gains[i] = goal.gains[i]
     k.tuning_ticks = left - 1
     if s.run.scheme != Scheme.SHOWN:  # then the scene's own loop does it, in its own time
         set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)

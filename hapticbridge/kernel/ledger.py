@@ -6,7 +6,7 @@ S is the energy that the scene stores, f and τ the coupling's wrench on the too
 tool's motion in tick k; energies and works in J, wrenches in N and N m, motions in m and rad.
 Σ E_k <= 0 means that the simulation created no energy. It is eq. (14) of Brown & Colgate (1997),
 in short (14). What MuJoCo's explicit Coriolis and gyroscopic forces would create is taken back from
-the motion before a tick is metered; the module's last section derives it.
+the motion before a tick is metered (``explicit_bias``).
 
 The accounts of energy, all in J; q = force_scale / scale:
 
@@ -48,16 +48,11 @@ from hapticbridge.kernel.mujoco_c import (
     ints,
     mj_apply_ft,
     mj_com_pos,
-    mj_com_vel,
     mj_energy_pos,
     mj_energy_vel,
-    mj_factor_m,
     mj_fwd_kinematics,
     mj_make_constraint,
     mj_make_m,
-    mj_mul_m,
-    mj_rne,
-    mj_solve_m,
     pointer_at,
 )
 from hapticbridge.pose import (
@@ -100,11 +95,11 @@ ENERGY_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``energy``, written by this module alone. Energies and works in J, since the start;
-``first_*`` are the ticks at which a condition first failed, -1 before; ``step_*`` are works of the
-newest step; two fields hold what a moved mocap body leaves until the step is done. ``others_*``
-are the sums over the other hands of the scene, 0 with one hand. ``has_excess`` is 1 if energy was
-to be taken back in the last tick, ``is_constrained`` if a constraint of the scene's own acted in
-this one."""
+``first_*`` are the ticks at which a condition first failed, -1 before; ``step_*`` are works of
+the newest step. ``mocap_has_moved`` and ``equality_rows``, the number of residuals kept from
+before a move, hold until the step that follows the move is metered. ``others_*`` are the sums
+over the other hands of the scene, 0 with one hand. ``has_excess`` is 1 if energy was to be taken
+back in the last tick, ``is_constrained`` if a constraint of the scene's own acted in this one."""
 
 
 def start_energies(energy: Part) -> None:
@@ -447,11 +442,16 @@ def _is_constrained(s: State) -> bool:
 
 @compiled
 def end_mocap_moves(s: State) -> None:
-    """Notes that the step that follows a move of mocap bodies is metered."""
+    """Clears the flag set by a move of mocap bodies, once the step that follows is metered."""
     s.energy.mocap_has_moved = 0
 
 
 # Storage, the ports of coupling and device, and the verdict
+
+SLACK_SHARE = 0.5
+"""Share of ½ (K + nB'/T) ‖δx_i‖² that counts as slack with n > 1 evaluations of the law per tick;
+no unit. With substeps only half of the slack may be used, because the whole would require infinite
+device damping at B' = 0. With a smaller share an environment counts as active sooner."""
 
 ENERGY_TOLERANCE = 1e-9
 """Energy in J, and share of Σ|f·δx|, that an environment may create and still count as strict. It
@@ -460,7 +460,7 @@ smaller one reports rounding."""
 
 
 @compiled
-def _refresh_inertia(s: State) -> None:
+def refresh_inertia(s: State) -> None:
     """Computes the inertia matrix for the state after the step."""
     mj = s.mj
     if mj.has_tendons_or_flexes:
@@ -479,7 +479,7 @@ def refresh_energies(s: State) -> None:
     """
     mj = s.mj
     if not s.loop.has_positions:
-        _refresh_inertia(s)
+        refresh_inertia(s)
     mj_energy_pos(mj.model, mj.data)
     mj_energy_vel(mj.model, mj.data)
     energy = floats(mj.energy, 2)
@@ -520,6 +520,12 @@ def add_up_hands(states: NDArray[np.void]) -> None:
 def set_kinetic_energy(energy: Part, kinetic: float) -> None:
     """Replaces the kinetic energy by that of the velocity which a method balances."""
     energy.kinetic = kinetic
+
+
+@compiled
+def note_excess(energy: Part, has_excess: bool) -> None:
+    """Notes whether the tick has created energy that is to be taken back."""
+    energy.has_excess = has_excess
 
 
 @compiled
@@ -601,15 +607,15 @@ def _slack(
     moved, u = vector_of(motion), vector_of(wrench)
     square = dot(moved, moved)
     change = gain * math.sqrt(square)
-    if s.run.law_evaluations > 1:  # ``gain`` is half of that of one evaluation
-        change *= 2.0
+    if s.run.law_evaluations > 1:  # ``gain`` is this share of that of one evaluation
+        change *= 1.0 / SLACK_SHARE
     if math.sqrt(dot(u, u)) + change > s.level.level[kind]:
         return 0.0
     return float(0.5 * gain * square)
 
 
 @compiled
-def _created(energy: Part) -> float:
+def created_energy(energy: Part) -> float:
     """Returns Σ E_k in J, by the storage and the works so far."""
     stored = (energy.kinetic + energy.potential) - energy.start_energy
     created = stored - energy.coupling_work - energy.actuator_work - energy.external_work
@@ -617,7 +623,7 @@ def _created(energy: Part) -> float:
 
 
 @compiled
-def _tolerance(energy: Part) -> float:
+def allowed_energy(energy: Part) -> float:
     """Returns the Σ E_k in J up to which an environment is strict."""
     return float(ENERGY_TOLERANCE * (1.0 + energy.throughput + energy.others_throughput))
 
@@ -632,12 +638,12 @@ def judge_balance(s: State) -> bool:
     """
     energy = s.energy
     stored = (energy.kinetic + energy.potential) - energy.start_energy
-    created = _created(energy)
+    created = created_energy(energy)
     if s.run.scheme == Scheme.SHOWN:  # work that the hand still owes is not created
         created -= max(s.shown.scene_work - energy.coupling_work, 0.0)
     energy.environment_energy = created
     energy.is_constrained = 0
-    allowed = _tolerance(energy)
+    allowed = allowed_energy(energy)
     if s.run.watches_device:
         _judge_device(s, stored, allowed)
     _judge_environment(s, created, allowed)
@@ -670,198 +676,3 @@ def _judge_device(s: State, stored: float, allowed: float) -> None:
     excess = energy.device_energy - energy.device_dissipation + gained
     if energy.first_device_excess < 0 and excess > allowed:
         energy.first_device_excess = s.loop.tick
-
-
-# Energy that the explicit bias creates, taken back
-#
-# MuJoCo takes the bias c (Coriolis and gyroscopic forces in N, N m) at the positions q and the
-# velocity u of the step's start. With v⁺, q⁺, M⁺ = M(q⁺) at its end and h its time step,
-#
-#     E_k = [½ v⁺ᵀ (M⁺ − M) v⁺ − h v⁺ᵀc(q, u)] − ½ ‖v⁺ − u‖²_M + C + r
-#
-# C is what contacts give (``kernel.rigid_contact``), r that of positions which change in the step.
-# The true bias does no work, vᵀ(Ṁv/2 − c) = 0, but the bracket is of the order h² v⁴. A free body
-# has v⁺ = u − h M⁻¹c and uᵀc = 0, so that E_k = ½ h² cᵀM⁻¹c > 0 in each step. If Σ E_k exceeds half
-# of the verdict's tolerance, the velocity is corrected before the storage is metered:
-#
-# 1. The bias acts at the mean of both velocities in each tree on which no constraint acts,
-#
-#        v = v⁺ + (h/2) M⁺⁻¹ [c(q⁺, u) − c(q⁺, v⁺)]
-#
-#    which makes a free turn of second order. With substeps, a tick that needed it lets the next one
-#    do so in every substep.
-# 2. What is still too much is taken from the motion relative to the centre of mass of a tree that
-#    begins with a free joint, v ← v̄ + s (v − v̄), and from the whole motion of any other, v ← s v.
-#    The linear momentum of a free tree stays. Trees share the loss by the weight
-#    (kinetic energy)·(sum of joint speeds)², in proportion to h² v⁴.
-#
-# The second alone would keep the energy and falsify the turn: 0.37 of the angular velocity after
-# 0.3 s at 50 rad/s, which errs by 0.10 without a correction and by 0.001 with both. A run that
-# creates nothing stays as it is to the bit.
-#
-# References: Simo & Wong 1991 (midpoint rule for rotations).
-
-LARGEST_SHARE = 0.99
-"""Largest share of a tree's kinetic energy that one tick takes, without unit. The rest waits for
-the next tick. With 0.5, an arm that flails at 1000 rad/s gains more than it loses."""
-
-
-@compiled
-def write_bias(s: State, velocity: int, result: int) -> None:
-    """Writes c(q_k, v) for a velocity at an address; MuJoCo's own velocity is left unchanged."""
-    mj = s.mj
-    qvel, other, saved = (
-        floats(mj.qvel, mj.nv),
-        floats(velocity, mj.nv),
-        floats(mj.scratch, mj.nv),
-    )
-    for i in range(mj.nv):
-        saved[i] = qvel[i]
-        qvel[i] = other[i]
-    mj_com_vel(mj.model, mj.data)
-    mj_rne(mj.model, mj.data, np.int32(0), result)
-    for i in range(mj.nv):
-        qvel[i] = saved[i]
-
-
-@compiled
-def _excess(s: State, pending: float) -> float:
-    """Returns the energy in J to be taken back; a contact of the scene's own is left alone.
-
-    Such a contact stores energy that MuJoCo does not report, and may create some. Beside it, only
-    energy of this tick is taken back, and none while it acts.
-    """
-    energy = s.energy
-    created = _created(energy) - pending
-    excess = created - 0.5 * _tolerance(energy)
-    if energy.is_constrained:
-        return 0.0
-    if not s.contact.is_rigid:
-        excess = min(excess, created - energy.environment_energy)
-    return float(excess)
-
-
-@compiled
-def take_back(s: State, velocity: int, pending: float) -> bool:
-    """Takes back the energy that the step which just ended created without a contact.
-
-    Needs inertia matrix and energies of the end of the step.
-
-    Args:
-        s: The bound state.
-        velocity: Address of the velocity of the kinetic energy. MuJoCo's own changes by as much.
-        pending: The coupling's work in this step in J, if it is not in its sum yet.
-
-    Returns:
-        True if the velocity was changed.
-    """
-    mj = s.mj
-    if not mj.is_discrete:
-        return False
-    excess = _excess(s, pending)
-    s.energy.has_excess = excess > 0.0
-    if not excess > 0.0:
-        return False
-    if velocity == mj.qvel:
-        _take_mean_bias(s)
-        s.energy.kinetic = _kinetic(s)
-        excess = _excess(s, pending)
-        if not excess > 0.0:
-            return True
-    _slow_down(s, velocity, excess)
-    return True
-
-
-@compiled
-def _take_mean_bias(s: State) -> None:
-    """Lets the bias act at its mean over the step, in trees on which no constraint acts."""
-    mj, nv = s.mj, s.mj.nv
-    if not s.loop.has_positions:
-        mj_factor_m(mj.model, mj.data)
-    start = mj.scratch + 8 * nv
-    at_start, at_end = start + 8 * nv, start + 16 * nv
-    velocities, accelerations = floats(mj.qvel, nv), floats(mj.qacc, nv)
-    before = floats(start, nv)
-    for i in range(nv):
-        before[i] = velocities[i] - s.run.timestep * accelerations[i]
-    write_bias(s, start, at_start)
-    write_bias(s, mj.qvel, at_end)
-    early, late = floats(at_start, nv), floats(at_end, nv)
-    for i in range(nv):
-        early[i] -= late[i]
-    mj_solve_m(mj.model, mj.data, start, at_start, np.int32(1))
-    change, constraint = floats(start, nv), floats(mj.qfrc_constraint, nv)
-    firsts, counts = ints(mj.tree_dofadr, mj.ntree), ints(mj.tree_dofnum, mj.ntree)
-    for tree in range(mj.ntree):
-        end, is_held = firsts[tree] + counts[tree], False
-        for i in range(firsts[tree], end):
-            is_held = is_held or constraint[i] != 0.0
-        if not is_held:
-            for i in range(firsts[tree], end):
-                velocities[i] += 0.5 * s.run.timestep * change[i]
-
-
-@compiled
-def _kinetic(s: State) -> float:
-    mj, total = s.mj, 0.0
-    mj_mul_m(mj.model, mj.data, mj.scratch, mj.qvel)
-    velocities, momentum = floats(mj.qvel, mj.nv), floats(mj.scratch, mj.nv)
-    for i in range(mj.nv):
-        total += 0.5 * velocities[i] * momentum[i]
-    return float(total)
-
-
-@compiled
-def take_mean_bias_in_substep(s: State) -> None:
-    """Does the first correction after a substep, if the last tick needed one."""
-    if s.energy.has_excess:
-        _refresh_inertia(s)
-        _take_mean_bias(s)
-
-
-@compiled
-def _energy_of_turning(s: State, tree: int, speeds: NDArray[np.float64]) -> tuple[float, float]:
-    """Returns a tree's kinetic energy in J that may be taken, and the sum of its joint speeds.
-
-    Needs the momentum in the scratch.
-    """
-    mj = s.mj
-    momentum, turns = floats(mj.scratch, mj.nv), ints(mj.dof_turns, mj.nv)
-    first = ints(mj.tree_dofadr, mj.ntree)[tree]
-    kinetic, turning = 0.0, 0.0
-    for i in range(first, first + ints(mj.tree_dofnum, mj.ntree)[tree]):
-        kinetic += 0.5 * momentum[i] * speeds[i]
-        turning += abs(speeds[i]) * turns[i]
-    mass = floats(mj.tree_mass, mj.ntree)[tree]
-    if mass > 0.0:
-        linear = vector_of(momentum[first : first + 3])
-        kinetic -= 0.5 * dot(linear, linear) / mass
-    return max(kinetic, 0.0), turning
-
-
-@compiled
-def _slow_down(s: State, velocity: int, excess: float) -> None:
-    """Takes energy in J from the trees, and notes what could be taken."""
-    mj, nv = s.mj, s.mj.nv
-    mj_mul_m(mj.model, mj.data, mj.scratch, velocity)
-    speeds, own, momentum = floats(velocity, nv), floats(mj.qvel, nv), floats(mj.scratch, nv)
-    masses, firsts = floats(mj.tree_mass, mj.ntree), ints(mj.tree_dofadr, mj.ntree)
-    total = 0.0
-    for tree in range(mj.ntree):
-        kinetic, turning = _energy_of_turning(s, tree, speeds)
-        total += kinetic * turning * turning
-    for tree in range(mj.ntree):
-        kinetic, turning = _energy_of_turning(s, tree, speeds)
-        weight = kinetic * turning * turning
-        if not weight > 0.0:
-            continue
-        taken = min(excess * weight / total, LARGEST_SHARE * kinetic)
-        loss = 1.0 - math.sqrt(1.0 - taken / kinetic)
-        first = firsts[tree]
-        for i in range(first, first + ints(mj.tree_dofnum, mj.ntree)[tree]):
-            mean = momentum[i] / masses[tree] if i < first + 3 and masses[tree] > 0.0 else 0.0
-            change = loss * (speeds[i] - mean)
-            speeds[i] -= change
-            if velocity != mj.qvel:
-                own[i] -= change
-        s.energy.kinetic -= taken

@@ -46,14 +46,13 @@ from hapticbridge.kernel.codes import (
     Part,
     State,
 )
+from hapticbridge.kernel.explicit_bias import take_back, write_bias
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
 from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
 from hapticbridge.kernel.ledger import (
     add_body_wrenches,
     set_kinetic_energy,
-    take_back,
-    write_bias,
 )
 from hapticbridge.kernel.mujoco_c import (
     floats,
@@ -171,7 +170,7 @@ def _exchange_awake(s: State) -> None:
 
 @compiled
 def write_tool_bias(s: State, velocity: int, result: int) -> None:
-    """Does what ``ledger.write_bias`` does, for the degrees of freedom of the tool's tree."""
+    """Does what ``write_bias`` does, for the degrees of freedom of the tool's tree alone."""
     mj, lossless = s.mj, s.lossless
     if not lossless.has_other_trees:
         write_bias(s, velocity, result)

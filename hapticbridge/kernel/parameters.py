@@ -19,8 +19,8 @@ from hapticbridge.pose import IDENTITY_POSE
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
 """Passivity controllers, numbered as in recordings: none; damping against the motion with a tank
-behind it, for the energy debt of both ports; damping for the debt of the environment's port
-alone."""
+behind it, for the energy debt of both ports; damping for the debt of the environment's port alone.
+The number 2 belonged to a controller that was removed."""
 
 MAX_BUTTONS = 32
 """Largest count of buttons in a mask. No handle has more."""
@@ -234,7 +234,8 @@ def refuse_scene_ticks(scheme: int, ticks: int) -> None:
         )
 
 
-_SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+SAME_AXES = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""Row-major rotation from the device's axes to those of the scene if they are equal."""
 
 TANK_STRETCH = 1e-3
 """Stretch c in m of the coupling whose energy is the cap of the tank of rigid contacts. Dissipation
@@ -287,7 +288,7 @@ class RunParameters:
     coupling: Coupling
     scale: float = 1.0
     force_scale: float = 1.0
-    axes: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    axes: tuple[float, ...] = SAME_AXES
     force_limit: float
     torque_limit: float
     ramp_ticks: int
@@ -359,7 +360,7 @@ class RunParameters:
             is_beside=True,
             scale=1.0,
             force_scale=1.0,
-            axes=_SAME_AXES,
+            axes=SAME_AXES,
             force_limit=self.force_limit / self.force_scale,
             torque_limit=self.torque_limit * self.scale / self.force_scale,
             ramp_ticks=0,

@@ -99,9 +99,9 @@ def guarded_energy(s: State) -> float:
 
         G + q min(S − S_0, 0),    q = force_scale / scale
 
-    G is the sum of w·δp − b ‖δp‖²/t in J; S_0 is the scene's storage at the start. Storage that the
-    scene has given up since then has paid for as much, and so has the work of other hands, which is
-    taken off S.
+    G is the sum of w·δp − b ‖δp‖²/t in J; S is the scene's storage less the work of the other
+    hands, S_0 the storage at the start. Energy that the scene has lost since the start, or that
+    other hands put in, is not energy from nowhere: it is subtracted.
     """
     energy = s.energy
     lost = min(energy.kinetic + energy.potential - energy.start_energy - energy.others_work, 0.0)

@@ -8,10 +8,10 @@ Each contact has a wanted normal velocity at the end of the step, in m/s,
 h is the time step in s, v the relative velocity at the start, μ|v_t| = sqrt(Σ (μ_j v_j)²) over the
 rows of friction and σ the share of the depenetration. The convex cone lifts a contact by μ times
 its sliding, which is subtracted; the impulse that stops the normal velocity v_n slows the sliding
-first. A point that still sinks by more than ``SUNK``, as the corner of a box does that stops more
-than slides, is aimed again with the sliding that is left at the end of the step. The wanted
-velocities of the friction rows are 0. MuJoCo's convex problem, with the
-regularisation R of each row, then gives impulses h λ with
+first. To *aim* a contact is to write its ŵ into its rows. A point may still sink by more than
+``SUNK``, for example the corner of a box that stops more than it slides. It is aimed again, with
+the sliding that is left at the end of the step. The wanted velocities of the friction rows are 0.
+MuJoCo's convex problem, with the regularisation R of each row, then gives impulses h λ with
 
     C = h λᵀ J v⁺ = h λᵀ ŵ − h² λᵀ R λ   <=   Σ_{p>0} (σ β p/h)² / (4 R)
 
@@ -24,16 +24,16 @@ environment has dissipated,
 
 so that Σ E_k <= 0 for any geometry, friction and collider: E_k = −½‖Δv‖²_M + C + r, and the
 remainder r of the integration (inertia that turns, explicit forces) is in E_k and paid next. A
-moved mocap body pays for its own push: its work, of the external port, is subtracted from C. One
-that recedes by δ takes δ/h from ŵ: what rests on it follows, and its energy goes into that port.
-All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before it closes:
-margins follow the speed (``follow_speed``).
+moved mocap body pays for its own push: its work belongs to the external port and is subtracted from
+C. If it recedes by δ, ŵ is smaller by δ/h: a body that rests on it follows, and gives its energy to
+that port. All this holds for any ŵ <= 0 in a gap. A contact therefore only has to be known before
+it closes: margins follow the speed (``follow_speed``).
 
-Limits of joints and tendons are rows like a contact's without friction, and equality constraints
-rows with ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign, of which a moved mocap body
-adds δp; all share the tank. What they hold stretched at the start is thus not pushed together for
-nothing. MuJoCo subtracts h J̇v from ŵ of ``connect`` and ``weld``; a repeated step does not.
-Equality constraints of a flex stay MuJoCo's.
+Limits of joints and tendons are rows like those of a contact without friction. An equality
+constraint has ŵ = −σ β p/h − (1 − σ) δp/h for an error p of either sign; δp is the part of p that a
+moved mocap body added. All these rows share the tank, so the tank also pays for an error that
+exists at the start. MuJoCo subtracts h J̇v from ŵ of ``connect`` and ``weld``; a repeated step does
+not. Equality constraints of a flex stay MuJoCo's.
 
 MuJoCo computes R and the reference acceleration of a row again in ``mj_step2``, from the contact's
 parameters and the row's position. These are therefore written between the halves of its step. With

@@ -1,8 +1,8 @@
 """A scene slower than the loop: the coupling pulls at a pose of the tool that is shown in between.
 
-The scene steps once in T_s = n T, in a loop of its own, with the handle of the moment at which its
-last result was taken over. When the next result arrives, it is older than the handle by T_s or
-more. The loop shows the tool where it is by now,
+The scene runs in its own loop, one step per n ticks: T_s = n T. Each step uses the handle pose from
+the moment when the previous result was collected. When the next result arrives, it is older than
+the handle by T_s or more. The loop shows the tool where it is by now,
 
     y* = x + v q + ½ a q²,    q = t − t_h
 
@@ -22,10 +22,12 @@ sum of squares. The scene took W = Σ f_s·δx, metered in its own loop. The tan
 
     D = Σ P − W
 
-is what the hand has given and the scene has not yet got. The tool is shown at the pose nearest to
-y*, on the way there, with which D does not become negative (passive set-position modulation, Lee &
-Huang 2010), so the hand gets nothing that the scene did not give. D is capped, so that an hour of
-dissipation does not pay for one push. The cap holds from the tick after a result on.
+is what the hand has given and the scene has not yet got. It is another tank than that of
+``rigid_contact``, which holds what the environment has dissipated. The tool is shown at the pose
+nearest to y*, on the way there, with which D does not become negative (passive set-position
+modulation, Lee & Huang 2010), so the hand gets nothing that the scene did not give. D is capped, so
+that an hour of dissipation does not pay for one push. The cap holds from the tick after a result
+on.
 
 A result may have taken more than the hand has given by now, W > Σ P, because the hand turned back
 meanwhile. D is then negative: a loan to the scene, −D. Until the scene or the hand has paid it, the

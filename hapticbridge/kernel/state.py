@@ -15,7 +15,7 @@ to functions by reference, at no cost. All fields are 8 bytes wide, so every fie
 | energy      | storage, works of all ports, slack, verdict       | ledger                        |
 | guard       | thresholds, ramp, fade, buttons                   | tick_guard                    |
 | observer    | energy at the device, added damping               | passivity_controller          |
-| watch       | late force, sign of the force, greatest share      | swing_watch                   |
+| watch       | late force, sign of the force, greatest ratio      | swing_watch                   |
 | lossless    | carried force, balanced velocity, present form    | lossless                      |
 | springs     | springs and dampers of the tool's tree            | springs                       |
 | contact     | tank and share of rigid contacts                  | rigid_contact                 |
@@ -489,7 +489,8 @@ class BoundHands:
 
 def _whole_gains(model: mujoco.MjModel, parameters: RunParameters, hand: int) -> tuple[float, ...]:
     """Returns the whole gains of a hand's actuators, for forces and then for torques."""
-    if parameters.scheme == Scheme.MIDPOINT:  # the model may have half of them
+    if parameters.scheme == Scheme.MIDPOINT:
+        # the model may have half of them; ``rendering.Method`` refuses any other rule
         forces, torques = implicit_gains(parameters.coupling, model.opt.timestep)
         return (*forces, *torques)
     gains: list[float] = []

@@ -35,6 +35,7 @@ from hapticbridge.kernel.codes import (
     State,
 )
 from hapticbridge.kernel.compared_methods import compared_wrench, drive_compared
+from hapticbridge.kernel.explicit_bias import take_back, take_mean_bias_in_substep
 from hapticbridge.kernel.force_level import (
     keep_state,
     limited_wrench,
@@ -69,8 +70,6 @@ from hapticbridge.kernel.ledger import (
     meter_ports,
     note_moved_mocap_bodies,
     refresh_energies,
-    take_back,
-    take_mean_bias_in_substep,
 )
 from hapticbridge.kernel.lossless import (
     apply_carried,

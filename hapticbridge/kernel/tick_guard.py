@@ -47,22 +47,14 @@ from hapticbridge.pose import (
     vector_of,
 )
 
-_FROM_PARAMETERS = (
-    "stale_ticks",
-    "fade_ticks",
-    "clutch",
-    "dead_man",
-    "has_hand",
-    "reach",
-    "full_speed",
-)
+_WHOLE = ("stale_ticks", "fade_ticks", "clutch", "dead_man", "has_hand")
+_REAL = ("reach", "full_speed")
 _THRESHOLDS = ("speed", "turn_speed", "stretch", "angle", "energy")
 
 GUARD_DTYPE = np.dtype(
     [
-        *((name, "<i8") for name in _FROM_PARAMETERS[:5]),
-        ("reach", "<f8"),
-        ("full_speed", "<f8"),
+        *((name, "<i8") for name in _WHOLE),
+        *((name, "<f8") for name in _REAL),
         *((f"max_{name}", "<f8") for name in _THRESHOLDS),
         ("commanded", "<i8"),
         ("flags", "<i8"),
@@ -81,11 +73,11 @@ GUARD_DTYPE = np.dtype(
 
 The first fields are those of ``GuardParameters``, the trips as ``max_*``. ``commanded`` holds
 ``FORCE_OFF`` and ``CLUTCHED``; ``flags`` are the guard's flags of the present tick;
-``time_since_sample`` and ``silence`` in s, the latter of the last silence of the device until the
-force has come back; ``longest_silence`` in s of the whole run ended at ``silent_tick``;
-``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio
-of the lever between device and handle;
-``rise_ticks`` its time from 0 to 1."""
+``time_since_sample`` is the time in s since the last new sample, 0 in a tick with one;
+``silence`` the length in s of the last interval without one, 0 once the force has come back;
+``longest_silence`` the longest in s of the whole run, and ``silent_tick`` its last tick;
+``fresh`` counts the ticks with a new sample; ``share`` is r, the ratio of the lever between
+device and handle; ``rise_ticks`` its time from 0 to 1."""
 
 FARTHEST = 2.0
 """Largest plausible distance in m of a device from the origin of its frame, where its data sheet
@@ -103,7 +95,7 @@ DEVICE_BUTTONS = 2**32 - 1
 def bind_guard(guard: Part, parameters: RunParameters) -> None:
     """Fills in the guard's thresholds and its state before the first tick."""
     limits = parameters.guarding
-    for name in _FROM_PARAMETERS:
+    for name in (*_WHOLE, *_REAL):
         guard[name] = getattr(limits, name)
     for name in _THRESHOLDS:
         guard[f"max_{name}"] = getattr(limits, name)

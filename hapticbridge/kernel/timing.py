@@ -1,6 +1,6 @@
 """Energy that a force sent late may have given to the hand, tick by tick.
 
-The condition b >= N, N = K T/2 + B', takes it that ticks come each T and that a force acts from the
+The condition b >= N, N = K T/2 + B', assumes one tick every T, and a force that acts from the
 moment of its sample. A tick comes τ after the one before, and its force is sent t_d after its
 sample: until then the old force acts on. With f on the tool, d the device's motion between two
 samples and η its part before the new force was sent, the hand gets
@@ -22,15 +22,15 @@ upper bound, found by comparison with the largest value of a quadratic form at a
 Its last term is what b burns at least, if η is not the even share β d. It must never be positive.
 
 The first term of b_k beyond N is paid by ``law.charge_lateness``: after a late sample the handle
-slips. What the springs cannot pay at once stays owed; the hand may have it, up to what the wrenches
-gave it beyond what b burned. The second term is not paid, so it is summed here, for translation and
-rotation each, as
+slips. A debt that the springs cannot cover is carried on. The hand is assumed to have it, but no
+more than the net energy that it received: the work of the wrenches less what b burned. The second
+term is not paid, so it is summed here, for translation and rotation each, as
 
     A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
 
-d is the handle's motion with the device, D the larger one of this tick and the last. Damping that
-pays for a late sample pays nothing here: ``lent`` is the sum of what late samples cost, and is paid
-first.
+d is the handle's motion with the device, D the larger one of this tick and the last. Each joule
+that b burns is counted once: first against the cost of late samples, whose sum is ``lent``, then
+against A.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ DELAY_PRICE = 3.0
 @compiled
 def note_delay(s: State, deadline_ns: int, read_ns: int, write_ns: int) -> None:
     """Notes the times from the tick's deadline to its sample, and from its sample to its force."""
-    t, lateness = s.timing, 1e-9 * (read_ns - deadline_ns)
+    t, late = s.timing, 1e-9 * (read_ns - deadline_ns)
     t.delay = 1e-9 * (write_ns - read_ns)
     t.delays += t.delay
-    t.jitter += max(lateness - t.lateness, 0.0)
-    t.lateness = lateness
+    t.jitter += max(late - t.lateness, 0.0)
+    t.lateness = late
 
 
 @compiled
@@ -97,8 +97,8 @@ def meter_delay(s: State, elapsed: float, interval: float) -> None:
 def meter_debt(s: State) -> None:
     """Notes the most that delays may have given, once the springs have paid for a late sample."""
     t, owed, ratio = s.timing, s.coupling.owed, s.run.force_scale / s.run.scale
-    held = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
-    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + held)
+    carried = min(ratio * (owed[0] + owed[1]), max(s.observer.net_device_energy, 0.0))
+    t.max_uncovered = max(t.max_uncovered, ratio * (t.uncovered[0] + t.uncovered[1]) + carried)
 
 
 @compiled

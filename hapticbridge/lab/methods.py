@@ -1,12 +1,17 @@
 """Rendering methods that exist only to be compared; importing this module registers them.
 
-To add a method, up to three files change:
+To add a method that exists only to be compared:
 
-1. here, a ``rendering.Method`` in ``_COMPARED``; with a free tool whose theory is known, also an
-   entry in ``THEORIES``, which the maps ``coupling`` and ``tool_mass`` show;
-2. for a new path of the wrench, a number of ``kernel.codes.Scheme`` with its ``SchemeProperties``;
-3. for such a path, its branches in ``drive_compared`` and ``compared_wrench`` of
-   ``kernel.compared_methods``.
+1. Here, add a ``rendering.Method`` to ``_COMPARED``. If the theory of a free tool is known, add an
+   entry to ``THEORIES``, which the maps ``coupling`` and ``tool_mass`` show.
+2. For a new path of the wrench, add a number to ``kernel.codes.Scheme`` with its
+   ``SchemeProperties``, and a branch to ``drive_compared`` and ``compared_wrench`` of
+   ``kernel.compared_methods``. A test fails while a scheme has no branch.
+3. For a coupling law with another wrench, add it to ``audit.motion.wrench_by_law``, by which the
+   audit computes every wrench again, and its gains to ``kernel.law.slack_gains`` and
+   ``audit.energy``. A path without a law has ``has_law=False`` and needs neither.
+
+``rendering`` has the recipe for a method of the product.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Real-time requests of the loop, undone when it ends.
+"""Real-time requests of the loop, lateness of its ticks, and time of a scene's step.
 
-The kernel may pause an ordinary process, take its memory pages away and move it between cores. Each
-request removes one of these causes of late ticks. A refusal is reported with the command that
-grants it.
+The requests are undone when the loop ends. The kernel may pause an ordinary process, take its
+memory pages away and move it between cores. Each request removes one of these causes of late ticks.
+A refusal is reported with the command that grants it.
 """
 
 from __future__ import annotations

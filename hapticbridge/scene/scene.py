@@ -14,12 +14,12 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids, held_body, held_joint
 from hapticbridge.kernel.colliders import use_exact_points
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
+from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene.compile import compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
 
-_UPRIGHT = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _MARGINS = ("geom_margin", "pair_margin", "flex_margin")
 _LIMIT_MARGINS = ("jnt_margin", "tendon_margin")
 _PRECISE = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8, "ls_tolerance": 0.01}
@@ -147,23 +147,25 @@ class Scene:
         A joint at q, in m or rad, has the pose (q, 0, 0, 1, 0, 0, 0).
         """
         if self.joint >= 0:
-            return (float(self.data.qpos[self.model.jnt_qposadr[self.joint]]), *_UPRIGHT)
+            return (float(self.data.qpos[self.model.jnt_qposadr[self.joint]]), *IDENTITY_POSE[1:])
         site_id = self.model.site(self.grip).id
         position, quaternion = self.data.site_xpos[site_id], self.data.site_xquat[site_id]
         sign = 1.0 if quaternion[0] >= 0 else -1.0
         return tuple(float(value) for value in (*position, *(sign * quaternion)))
 
-    def set_timestep(self, period: float, substeps: int = 1) -> None:
-        """Sets MuJoCo's timestep to period / substeps, in s.
+    def set_timestep(self, scene_period: float, substeps: int = 1) -> None:
+        """Sets MuJoCo's timestep to scene_period / substeps, in s.
+
+        ``scene_period`` is the time between two results: T, or n T of a slower scene.
 
         Raises:
             SceneError: The period is not finite and positive, or substeps is below 1.
         """
-        if not np.isfinite(period) or period <= 0:
-            raise SceneError(f"period is {period!r} s; it must be finite and > 0")
+        if not np.isfinite(scene_period) or scene_period <= 0:
+            raise SceneError(f"period is {scene_period!r} s; it must be finite and > 0")
         if substeps < 1:
             raise SceneError(f"substeps is {substeps}; it must be 1 or more")
-        self.model.opt.timestep, self._period = period / substeps, period
+        self.model.opt.timestep, self._period = scene_period / substeps, scene_period
 
     def set_reach(self, distance: float) -> None:
         """Lets MuJoCo detect contacts, without a force, from a distance in m before they touch.

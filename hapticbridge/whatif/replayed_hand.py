@@ -1,4 +1,4 @@
-"""Model hand that holds the recorded device in a repetition."""
+"""Recorded motion as a device, the hand behind it as a model, and the repetition of a run."""
 
 from __future__ import annotations
 
