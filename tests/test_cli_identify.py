@@ -15,7 +15,7 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.device import open_device
 from hapticbridge.device.profile import read_profile
 from hapticbridge.identify import Estimate, identify
-from hapticbridge.identify.profile import delay_of, measured_profile
+from hapticbridge.identify.identify import delay_of, measured_profile
 
 FREE = "simulated:hand=none,damping=1.5,friction=0.1,resolution=2e-5"
 

@@ -31,7 +31,7 @@ from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
 from hapticbridge.guard import limits_for
 from hapticbridge.identify import identify
-from hapticbridge.identify.profile import measured_profile
+from hapticbridge.identify.identify import measured_profile
 from hapticbridge.options import Workspace
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.scene import load_scene, scene_path

@@ -22,7 +22,7 @@ from hapticbridge.device.wheel.device import WheelDevice, find, open_wheel
 from hapticbridge.device.wheel.evdev import interval_of, range_of
 from hapticbridge.errors import DeviceError, DeviceLost, SafetyTrip
 from hapticbridge.identify import identify
-from hapticbridge.identify.profile import measured_profile
+from hapticbridge.identify.identify import measured_profile
 
 SCALE: dict[str, object] = {"max_torque": 2.0, "range": 900.0}
 TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])

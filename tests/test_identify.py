@@ -16,8 +16,7 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice, TrajectoryDevice
 from hapticbridge.errors import DeviceError, DeviceLost, IdentificationError
 from hapticbridge.identify import AxisFit, Estimate, Identification, fit_axis, identify
 from hapticbridge.identify.fit import noise_of
-from hapticbridge.identify.identify import duration_at, step_of
-from hapticbridge.identify.profile import measured_profile
+from hapticbridge.identify.identify import duration_at, measured_profile, step_of
 from hapticbridge.record import TickFlag
 
 PERIOD = 1e-3

@@ -21,8 +21,15 @@ from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify import Identification, identify
 from hapticbridge.identify.fit import CONFIDENCE
-from hapticbridge.identify.identify import FORCE_SHARE, TRAVEL, UNHELD, duration_at
-from hapticbridge.identify.profile import delay_of, draw_identification, measured_profile
+from hapticbridge.identify.identify import (
+    FORCE_SHARE,
+    TRAVEL,
+    UNHELD,
+    delay_of,
+    draw_identification,
+    duration_at,
+    measured_profile,
+)
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
