@@ -44,7 +44,7 @@ from hapticbridge.theory.rigid_body import CoupledStepRule, drive_mass, integrat
 NOTHING = (0.0, 0.0, 0.0)
 FRAME = Pose((0.01, -0.02, 0.03), quaternion_exp((0.3, -0.5, 0.7)))
 START = Pose((0.1, 0.2, 0.3), quaternion_exp((-0.4, 0.2, 0.9)))
-SINGLE_PRECISION = {"mujoco_warp", "physx", "physx_spring", "rapier"}
+SINGLE_PRECISION = {"mujoco_warp", "newton_xpbd", "newton_steel", "physx", "physx_spring", "rapier"}
 PARTS = {"rapier": 8}
 """Parts into which an engine divides a step under a held force, where more than one."""
 SPRINGS = {"ode_spring", "physx_spring"}
@@ -86,10 +86,9 @@ def test_a_driven_mass_follows_its_scheme_and_the_closed_form(engine: Engine) ->
     expected = drive_mass(COUPLING, MASS, handle, 1e-3, scheme).position
     # PhysX solves its spring in parts of a step, so it lies between the two schemes; Rapier every
     # force, so that it is nearer to an exact hold
-    apart = {"mujoco_warp": 1e-5, "physx": 1e-5, "physx_spring": 0.05, "rapier": 0.02}.get(
-        engine.name, 1e-12
-    )
-    assert np.abs(driven_path(engine, 1e-3) - expected).max() < apart * AMPLITUDE
+    apart = dict.fromkeys(SINGLE_PRECISION, 1e-5) | {"physx_spring": 0.05, "rapier": 0.02}
+    allowed = apart.get(engine.name, 1e-12) * AMPLITUDE
+    assert np.abs(driven_path(engine, 1e-3) - expected).max() < allowed
     coarse, fine = driven_error(engine, 2e-3), driven_error(engine, 1e-3)
     is_divided = engine.name in SPRINGS or engine.name in PARTS
     assert fine < (0.02 if is_divided else 0.002)
@@ -126,6 +125,8 @@ def test_a_wrong_mass_shows_as_a_worse_error(engine: Engine) -> None:
 GAINS = {
     "mujoco": (-0.2, 0.0),
     "mujoco_warp": (-0.2, 0.0),
+    "newton_xpbd": (0.0, 0.25),
+    "newton_steel": (0.0, 0.25),
     "ode": (-0.2, 0.0),
     "ode_spring": (-0.2, 0.0),
     "physx": (0.0, 0.02),

@@ -1,7 +1,7 @@
 """Identification of a device's mechanics from small motions.
 
-Read ``identify`` first. It moves one axis by the force of ``excitation``, and ``fit`` solves for
-mass, damping, friction and delay with intervals. ``profile`` stores the result for later runs.
+Read ``identify`` first. It moves one axis by the force of ``excitation``, ``fit`` solves for mass,
+damping, friction and delay with intervals, and the result becomes a profile for later runs.
 ``z_width`` tries virtual walls on the device and compares them with theory.
 """
 

@@ -11,6 +11,8 @@ experimental.
 |---|---|---|
 | ``mujoco`` | soft, two timesteps; Newton; ``implicitfast`` | held force |
 | ``mujoco_warp`` | the same, single precision | held force |
+| ``newton_xpbd`` | positions, 50 iterations, single precision | held force |
+| ``newton_steel`` | impulses, 200 iterations, single precision | held force |
 | ``ode`` | direct solver, contact layer of 0.1 µm | held force |
 | ``ode_spring`` | the same | soft joints, solved with the contacts |
 | ``physx`` | TGS, 20 iterations, single precision | held force |

@@ -26,8 +26,10 @@ GAP = 1e-3
 """Distance in m at which contacts are made. It covers the motion of some steps and is small against
 the parts; Newton's own is 0.1 m."""
 
-ITERATIONS = 50
-"""Iterations of a solver; Newton's own are 2 and 12."""
+XPBD_ITERATIONS, STEEL_ITERATIONS = 50, 200
+"""Iterations of the two solvers; Newton's own are 2 and 12. In a step of 4 ms a stack that a hand
+leans on gives way by 6.7, 3.9 and 2.1 mm at 2, 20 and 50 iterations of XPBD, and by 2.0, 0.26 and
+0.03 mm at 12, 50 and 200 of Steel."""
 
 _GUIDE = "Newton documentation, Solvers"
 _COLLISIONS = "Newton documentation, Collisions"
@@ -36,7 +38,6 @@ _SHARED = {
     "device": base.Setting("cpu", "Newton documentation, Installation"),
     "precision": base.Setting("single (the only one)", "Newton documentation, State"),
     "gap": base.Setting(f"{GAP:g} m", f"{_COLLISIONS}: Margin and gap"),
-    "iterations": base.Setting(f"{ITERATIONS}", _GUIDE),
 }
 
 Solver = Callable[[Any], Any]
@@ -67,6 +68,7 @@ class NewtonSimulation(HeldSimulation):
         warp.config.quiet = True
         builder = newton.ModelBuilder(gravity=task.gravity)
         builder.rigid_gap = GAP
+        newton.solvers.SolverSteel.register_custom_attributes(builder)
         config = newton.ModelBuilder.ShapeConfig(
             density=0.0, mu=task.body.friction, mu_torsional=0.0, mu_rolling=0.0
         )
@@ -76,6 +78,7 @@ class NewtonSimulation(HeldSimulation):
                 mass=free.body.mass,
                 inertia=warp.mat33(np.diag(free.body.inertia)),
                 lock_inertia=True,
+                custom_attributes={"steel:rigid_body_angular_damping": 0.0},
             )
             for shape, pose in free.shapes:
                 _add(builder, body, shape, pose, config)
@@ -151,16 +154,21 @@ def engines() -> tuple[base.Engine, ...]:
     """Returns the engines of this module."""
 
     def positions(model: Any) -> Any:
-        return newton.solvers.SolverXPBD(model, iterations=ITERATIONS)
+        return newton.solvers.SolverXPBD(model, iterations=XPBD_ITERATIONS)
 
     def impulses(model: Any) -> Any:
-        return newton.solvers.SolverSteel(model, iterations=ITERATIONS)
+        return newton.solvers.SolverSteel(model, iterations=STEEL_ITERATIONS)
 
+    xpbd = {
+        "solver": base.Setting("XPBD", _GUIDE),
+        "iterations": base.Setting(f"{XPBD_ITERATIONS} (default 2)", _GUIDE),
+    }
+    steel = {
+        "solver": base.Setting("Steel (marked experimental)", _GUIDE),
+        "iterations": base.Setting(f"{STEEL_ITERATIONS} (default 12)", _GUIDE),
+        "angular damping": base.Setting("0 (default 0.05)", _GUIDE),
+    }
     return (
-        NewtonEngine("newton_xpbd", positions, {"solver": base.Setting("XPBD", _GUIDE)}),
-        NewtonEngine(
-            "newton_steel",
-            impulses,
-            {"solver": base.Setting("Steel (marked experimental)", _GUIDE)},
-        ),
+        NewtonEngine("newton_xpbd", positions, xpbd),
+        NewtonEngine("newton_steel", impulses, steel),
     )
