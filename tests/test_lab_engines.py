@@ -126,7 +126,7 @@ GAINS = {
     "mujoco": (-0.2, 0.0),
     "mujoco_warp": (-0.2, 0.0),
     "newton_xpbd": (0.0, 0.25),
-    "newton_steel": (0.0, 0.25),
+    "newton_steel": (-0.2, 0.0),
     "ode": (-0.2, 0.0),
     "ode_spring": (-0.2, 0.0),
     "physx": (0.0, 0.02),
