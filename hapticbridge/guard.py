@@ -289,7 +289,7 @@ _REASONS = {
     BACKWARDS: "time ran backwards",
     STRETCHED: "the tool is farther from the handle than the stretch limit",
     TWISTED: "the tool is turned from the handle by more than the angle limit",
-    GAVE_ENERGY: "the device was given more energy beyond what the hand put in than the limit",
+    GAVE_ENERGY: "the hand would get more than it put in, by more than the energy limit",
 }
 _REMEDIES = {
     BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
@@ -301,9 +301,10 @@ _REMEDIES = {
     GAVE_ENERGY: "lower --stiffness",
 }
 _LIMIT_MOTORS = (
-    "the scene's motors did {} of work until then: limit their force (forcerange) or let them "
-    "start at rest (ctrl in keyframe 'home'); 'hapticbridge check SCENE' names those that push at "
-    "the start; if they are meant to push the hand, --energy-limit is what it may get"
+    "the scene's motors did {} of work until then{}: limit their force (forcerange), or start a "
+    "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
+    "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
+    "may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
@@ -328,7 +329,7 @@ def _hand_at(grip: str) -> str:
     return f"hand at '{grip}': " if grip else ""
 
 
-def trip_remedy(reason: str, motor_work: float, created: float = 0.0) -> str:
+def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest: str = "") -> str:
     """Returns the remedy for a trip, for the message to the user; empty if none is known.
 
     Exception and recording keep the bare reason, because it is compared when the run is repeated.
@@ -337,13 +338,16 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0) -> str:
         reason: Result of ``trip_reason``, or a sentence that ends with it.
         motor_work: Work of the scene's own motors until then in J, which may be the cause.
         created: Energy in J that the scene had created until then, which may be the cause.
+        strongest: Name of the actuator that pushes most, or empty.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
             if code == GAVE_ENERGY and created > USUAL_ENERGY:
                 return _FIND_PUMP.format(format_energy(created))
-            if code == GAVE_ENERGY and motor_work > USUAL_ENERGY:
-                return _LIMIT_MOTORS.format(format_energy(motor_work))
+            if code == GAVE_ENERGY and motor_work > 0.5 * USUAL_ENERGY:
+                return _LIMIT_MOTORS.format(
+                    format_energy(motor_work), f" ('{strongest}' pushes most)" * bool(strongest)
+                )
             return remedy
     return ""
 

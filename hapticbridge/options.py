@@ -590,6 +590,9 @@ class RunSetup:
             weightless = self._sent(holding_force(scene, parameters, has_weight=False))
             if weightless > max(most, force / 2):
                 return ""  # motors or springs push, more than the weight
+            unpowered = self._sent(holding_force(scene, parameters, has_motors=False))
+            if (force := min(force, unpowered)) <= most:
+                return ""  # motors push; what they hold of the tool counts for it
             return (
                 f"it pulls with up to {force:.3g} N, its first swing included, and the device "
                 f"holds {most:.3g} N"

@@ -138,6 +138,18 @@ def _gravity(model: mujoco.MjModel, *, is_on: bool) -> Iterator[None]:
         model.opt.gravity = gravity
 
 
+@contextmanager
+def _motors(model: mujoco.MjModel, *, is_on: bool) -> Iterator[None]:
+    """Lets a model's own actuators give forces, or none, for a while."""
+    limited, limits = model.actuator_forcelimited.copy(), model.actuator_forcerange.copy()
+    own = [i for i in range(model.nactuator) if i not in added_actuators(model) and not is_on]
+    try:
+        model.actuator_forcelimited[own], model.actuator_forcerange[own] = 1, 0.0
+        yield
+    finally:
+        model.actuator_forcelimited[:], model.actuator_forcerange[:] = limited, limits
+
+
 def _settled_load(scene: Scene, parameters: RunParameters) -> NDArray[np.float64]:
     rehearsal, grip = Rehearsal(scene, parameters), scene.grip_pose()
     model, data = rehearsal.model, rehearsal.data
@@ -206,7 +218,9 @@ HOLDING_STEPS = 1000
 that tip over slowly, and delay every start."""
 
 
-def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool = True) -> float:
+def holding_force(
+    scene: Scene, parameters: RunParameters, *, has_weight: bool = True, has_motors: bool = True
+) -> float:
     """Returns the largest force in N with which a still handle holds the tool at first.
 
     The coupling is not limited, and the tool moves freely on it. The scene is not changed.
@@ -215,11 +229,12 @@ def holding_force(scene: Scene, parameters: RunParameters, *, has_weight: bool =
         scene: The prepared scene, at its start.
         parameters: Parameters of the run; a handle with absolute poses is taken at the grip.
         has_weight: If false, gravity is left out.
+        has_motors: If false, the scene's own actuators give no force.
     """
     handle = parameters.handle_origin
-    if handle == IDENTITY_POSE or not has_weight:
+    if handle == IDENTITY_POSE or not (has_weight and has_motors):
         handle = scene.grip_pose()
-    with _gravity(scene.model, is_on=has_weight):
+    with _gravity(scene.model, is_on=has_weight), _motors(scene.model, is_on=has_motors):
         steps = Rehearsal(scene, parameters).steps(handle, HOLDING_STEPS)
         return max((float(np.linalg.norm(wrench[:3])) for wrench in steps), default=0.0)
 

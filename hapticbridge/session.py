@@ -26,6 +26,7 @@ from hapticbridge.device import Device
 from hapticbridge.device.base import checked_close, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.guard import (
+    may_be_pumped,
     refuse_implausible_pose,
     refuse_stretched_start,
     trip_remedy,
@@ -60,6 +61,7 @@ from hapticbridge.recording.ring import Snapshot
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import prepare, prepare_hands
 from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
+from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.signals import deferring_stops
 from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
 from hapticbridge.summary import RunOutcome, Summary
@@ -637,7 +639,11 @@ class Session:
             float(trip.records[name][-1]) if len(trip.records) else 0.0
             for name in ("actuator_work", "environment_energy")
         )
-        if remedy := trip_remedy(reason, work, created):
+        model, data = self.setup.scene.model, self.setup.scene.data
+        pump = first_pump(model) if may_be_pumped(reason) else None
+        if pump is not None:
+            trip.add_note(f"{pump.words}; write {pump.change}")
+        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data)):
             trip.add_note(remedy)
         return trip
 

@@ -27,7 +27,7 @@ from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
-from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
+from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping, motors_pushed
 from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
@@ -371,13 +371,17 @@ class Summary:
             yield "net to the hand", f"{format_energy(self.max_net_energy)} at most, {self._origin}"
 
     @property
+    def _has_pushed(self) -> bool:
+        return motors_pushed(self.energies["actuator_work"], self.max_net_energy)
+
+    @property
     def _origin(self) -> str:
         """Origin of energy that a hand got, as far as it is known."""
-        motors = self.energies["actuator_work"]
-        if motors > INSTANT:
+        if self._has_pushed:
+            work = format_energy(self.energies["actuator_work"])
             return (
-                f"beyond what it put in: the scene's motors did {format_energy(motors)} of work, "
-                "and no guarantee covers motors that push"
+                f"beyond what it put in: the scene's motors did {work} of work, and only "
+                "--energy-limit bounds what they give the hand"
             )
         return "beyond what it put in and what the device's damping burned"
 
@@ -390,12 +394,11 @@ class Summary:
         if self.is_certified is False and kept.fault:
             yield f"device not certified: {kept.fault}"
             return
-        yield kept.device_words(self.is_certified)
+        yield kept.device_words(self.is_certified, has_pushed=self._has_pushed)
         if not self.is_certified:
             yield from self.conditions
         if self.is_certified is False and method_named(self.method).has_law:
-            judge = "the audit" if self.recording else "with --record FILE the audit"
-            yield f"{judge} counts what the hand got; in a run only --energy-limit bounds it"
+            yield "only --energy-limit bounds what the hand gets"
 
     @property
     def verdict(self) -> str:

@@ -52,6 +52,19 @@ SWUNG = "its force came late, reversed or in steps"
 UNKNOWN = "it is not known whether its motors push the right way"
 """Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
 
+MOTORS_PUSHED = "motors of the scene pushed: what they give the hand, only --energy-limit bounds"
+"""Limit of the certificate, which covers no energy that a scene's motors give."""
+
+
+def motors_pushed(work: float, net: float) -> bool:
+    """Returns True if motors of a scene may have given the hand energy.
+
+    Args:
+        work: Work of the motors so far in J; negative if they took back more than they gave.
+        net: Largest energy in J that the hand had got beyond what it put in.
+    """
+    return min(abs(work), net) > INSTANT
+
 
 @dataclass(frozen=True, slots=True)
 class RunTimes:
@@ -212,10 +225,14 @@ class Timekeeping:
         is_refuted = self.is_kept is False or self.watch or (verdict and self.has_tripped)
         return False if is_refuted else verdict
 
-    def device_words(self, verdict: bool | None) -> str:
-        """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
+    def device_words(self, verdict: bool | None, *, has_pushed: bool = False) -> str:
+        """Returns the verdict on the device in a clause; ``fault`` has the reason in full.
+
+        ``has_pushed`` is as returned by ``motors_pushed``.
+        """
         if verdict:
-            return f"device certified{self.clause}: b >= {self._bound}"
+            limit = f", but {MOTORS_PUSHED}" if has_pushed else ""
+            return f"device certified{self.clause}: b >= {self._bound}{limit}"
         if verdict is None:
             return f"device not judged: {self._unproved}"
         return f"device not certified: {self.refutation or f'b < {self._bound}'}"

@@ -34,7 +34,7 @@ from hapticbridge.check.lean import MAY_GO
 from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.physics import depth_under
-from hapticbridge.check.run_faults import find_faults
+from hapticbridge.check.run_faults import find_faults, run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
@@ -533,23 +533,55 @@ def test_a_body_that_falls_for_ever_is_told(tmp_path: Path, floor: str, is_told:
 
 
 def test_what_a_run_changes_by_itself_and_a_motor_that_pushes_are_notes(tmp_path: Path) -> None:
-    slide = '<body name="tool"><joint name="rail" type="slide"/><geom size="0.01" mass="1"/>'
+    joint = '<joint name="rail" axis="1 0 0" type="slide"/>'
+    slide = f'<body name="tool">{joint}<geom size="0.01" mass="1"/>'
     motors = (
         '<actuator><{} joint="rail"/></actuator><keyframe><key name="home" ctrl="{}"/></keyframe>'
     )
     for motor, control, told in (
         ('motor gear="3"', 1.0, ["pushes joint 'rail' with 3 N"]),
         ('motor gear="3"', 0.0, []),
-        ('position kp="300"', 0.01, []),  # holds the joint at a place
+        ('position kp="300"', 0.01, ["pushes joint 'rail' with 3 N"]),  # 10 mm from its target
+        ('position kp="300"', 0.0, []),
+        ('position kp="300" forcerange="-0.05 0.05"', 0.01, []),
     ):
         text = mjcf(motors.format(motor, control), body=slide + '<site name="grip"/></body>')
         faults = faults_in(tmp_path, text, STILL)
         notes = [fault for fault in faults if fault.is_note]
         assert "time step" in {note.kind for note in notes}
         sentences = [fault.sentence for fault in notes if fault.kind == "motor"]
+        rest = [fault.change.split(" in")[0] for fault in notes if fault.kind == "motor"]
+        assert rest == ['ctrl="0"'] * len(told)
         assert [
             told_part in sentence for told_part, sentence in zip(told, sentences, strict=True)
         ] == ([True] * len(told))
+
+
+def test_what_a_motor_holds_against_gravity_is_not_told_but_what_it_pushes_beyond_is(
+    tmp_path: Path,
+) -> None:
+    lift = '<body name="tool"><joint name="lift" type="slide"/><geom size="0.01" mass="1"/>'
+    motor = (
+        '<actuator><general name="hoist" {} gainprm="2" gear="3"/></actuator><tendon><fixed '
+        'name="rope"><joint joint="lift" coef="1"/></fixed></tendon>'
+        '<keyframe><key name="home" ctrl="{}"/></keyframe>'
+    )
+    for driven in ('joint="lift"', 'tendon="rope"'):
+        for force, is_told in ((9.0, False), (9.81, False), (10.5, True), (-1.0, True)):
+            text = mjcf(motor.format(driven, force / 6), body=lift + '<site name="grip"/></body>')
+            found = [f for f in faults_in(tmp_path, text, STILL) if f.kind == "motor"]
+            assert [fault.place.element for fault in found] == ["actuator 'hoist'"] * is_told
+            assert all(f" with {abs(force):g} N from" in fault.sentence for fault in found)
+
+
+def test_a_solver_at_its_limit_in_one_tick_of_thousands_is_no_fault() -> None:
+    case = open_case(read_scene(scene_path("point_mass")))
+    assert case.observation is not None
+    ticks = case.samples.size
+    for full, is_told in ((1, False), (ticks // 1000, False), (ticks // 1000 + 1, True)):
+        seen = replace(case, observation=replace(case.observation, full_ticks=full))
+        found = [fault for fault in run_faults(seen) if fault.kind == "solver iterations"]
+        assert len(found) == is_told
 
 
 def test_wrong_units_come_alone_because_all_else_follows_from_them(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def test_check_names_line_and_change_of_a_fault(tmp_path: Path, call: Called) ->
     assert f" margin  {file}:{line}, geom 'button'" in out
     assert 'write: margin="0"' in out
     assert code == 1
-    assert "motion: the default hand motion: slow, 1 cm about each axis" in out
+    assert "motion: the default hand motion: slow, 1 cm along and 0.1 rad about each axis" in out
 
 
 def test_the_json_holds_counts_faults_and_cost(tmp_path: Path, call: Called) -> None:

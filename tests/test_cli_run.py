@@ -167,7 +167,7 @@ def test_trip_is_told_with_what_to_do_about_it(call: Called, tmp_path: Path) -> 
 DRIVEN = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
 <joint name="x" type="slide" axis="1 0 0"/><geom type="box" size=".02 .02 .02" mass="0.1"/>
 <site name="grip"/></body></worldbody>
-<actuator><position joint="x" kp="2000" kv="20"/></actuator>
+<actuator><position name="puller" joint="x" kp="2000" kv="20"/></actuator>
 <keyframe><key name="home" ctrl="0.1"/></keyframe></mujoco>"""
 """A motor that pulls the tool out of the hand from the first tick on."""
 
@@ -182,13 +182,15 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert code == 3
     assert "most of it from motors, springs or parts of the scene" in err
     assert "this tool weighs" not in err
-    assert "than the limit; the scene's motors did " in err
+    assert "than the energy limit; the scene's motors did " in err
+    assert "until then ('puller' pushes most)" in err
+    assert "actuator 'puller' pushes joint 'x' with 200 N from the start on" in err
     assert "lower --stiffness" not in err
     assert "passive (strict), then the guard stopped the run" in out
     assert "mJ at most, beyond what it put in: the scene's motors did " in out
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
-    assert "no guarantee covers motors that push" in out
+    assert "beyond what it put in, which only --energy-limit bounds" in out
     for energy in ("kinetic", "actuator work", "coupling work", "device energy"):
         row = next(line for line in summary.splitlines() if line.startswith(energy))
         assert f"{energy} {row.removeprefix(energy).strip()}" in out
@@ -196,6 +198,22 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert "what to change: the scene's motors did " in out
     scene.write_text(DRIVEN.replace('ctrl="0.1"', 'ctrl="0"'))  # as the remedy says
     assert call("run", scene, "--fast", "--duration", 0.2)[0] == 0
+
+
+def test_a_certificate_names_its_limit_where_motors_pushed(call: Called, tmp_path: Path) -> None:
+    scene, record, page = (tmp_path / name for name in ("weak.xml", "weak.mcap", "weak.html"))
+    pushed = "but motors of the scene pushed: what they give the hand, only --energy-limit bounds"
+    for control, told in (("0.002", True), ("0", False)):
+        scene.write_text(DRIVEN.replace('ctrl="0.1"', f'ctrl="{control}"'))
+        limit = ("--energy-limit", 1, "--record", record, "--overwrite")
+        code, out, _ = call("run", scene, "--fast", "--duration", 0.5, *limit)
+        assert (code, pushed in out, "device certified" in out) == (0, told, True)
+        code, out, _ = call("audit", record, "--report", page)
+        assert (code, f"device certified: b >= KT/2 + B_law, {pushed}" in out) == (0, told)
+        assert (pushed in page.read_text("utf-8")) == told
+        assert (", which only --energy-limit bounds" in call("audit", record, "--json")[1]) == told
+        _, out, _ = call("audit", record, "--what-if", "stiffness=900", "--in-process")
+        assert ("net to the hand" in out) == told
 
 
 PUMPED = """<mujoco><option timestep="0.001"/><worldbody><body name="drawer">
@@ -209,8 +227,8 @@ biasprm="0 -50 {bias}"/></actuator></mujoco>"""
 @pytest.mark.parametrize(
     ("damping", "bias", "told", "remedy"),
     [
-        (-6, 0, "joint 'slide' has a damping of -6", "the scene itself created"),
-        (1, 9, "actuator 'pump' pushes joint 'slide' harder", "the scene's motors did"),
+        (-6, 0, "joint 'slide' has a damping of -6", 'write damping="0" or more'),
+        (1, 9, "actuator 'pump' pushes joint 'slide' harder", "write a third number of at most 0"),
         (1, -9, "", ""),
         (1, 0.5, "", ""),
     ],
@@ -224,8 +242,10 @@ def test_what_pumps_is_named_before_it_trips(
     scene.with_suffix(".csv").write_text(f"t,x,y,z\n{sway}")
     code, _, err = call("run", scene, "--fast")
     assert code == (3 if told else 0)
-    assert told in err
-    assert remedy in err
+    assert "without a hand" not in err
+    trip = next((line for line in err.splitlines() if line.startswith("safety trip")), "")
+    assert told in trip
+    assert remedy in trip
     assert ("harder" in err or "has a damping" in err) == bool(told)
     assert "lower --stiffness" not in err
 

@@ -163,6 +163,7 @@ def test_the_command_lists_topics_and_prints_a_page(call: Called) -> None:
     [
         ("passiv", "did you mean 'passivity'"),
         ("tank", "the word is in 'glossary', "),
+        ("motor", "a heading with the word is in 'active-verdict'"),
         ("../../etc", "choose one of 'active-verdict', "),
     ],
 )

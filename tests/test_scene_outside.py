@@ -19,7 +19,7 @@ from outside_scenes import hand_file, scene_file
 from scipy.spatial.transform import Rotation
 
 import hapticbridge as hb
-from hapticbridge.rehearsal import loaded_handle, static_load
+from hapticbridge.rehearsal import holding_force, loaded_handle, static_load
 
 Array = NDArray[np.float64]
 Stops = list[tuple[float, tuple[float, float, float]]]
@@ -470,3 +470,20 @@ def test_equality_meant_as_a_spring_is_announced_where_it_becomes_rigid(
         assert f"'spring': a spring of {hertz:g} Hz → rigid (--contact scene keeps it" in said[0]
         with started(tmp_path, text, contact="scene") as bridge:
             assert not any("equality" in change for change in bridge.scene.changes)
+
+
+SERVO = """<mujoco><option timestep="0.001"/><worldbody><body>
+<joint name="z" type="slide" axis="0 0 1"/><geom type="box" size=".02 .02 .02" mass="0.11"/>
+<site name="grip"/></body></worldbody><actuator><position joint="z" kp="95"/></actuator>
+<keyframe><key name="home" ctrl="-0.1"/></keyframe></mujoco>"""
+"""A tool of 1.1 N that a servo pulls down with 9.5 N."""
+
+
+def test_the_force_of_a_servo_is_not_taken_for_the_weight_of_the_tool(tmp_path: Path) -> None:
+    with started(tmp_path, SERVO, device="simulated:force_limit=1000") as bridge:
+        scene, parameters = bridge.scene, bridge.session.parameters
+        limits = scene.model.actuator_forcelimited.copy()
+        weight = holding_force(scene, parameters, has_motors=False)
+        assert 1.0 < weight / (0.11 * 9.81) < 2.0  # the first swing included, damped
+        assert holding_force(scene, parameters) > 10.0
+        assert np.array_equal(scene.model.actuator_forcelimited, limits)

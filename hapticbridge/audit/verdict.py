@@ -48,7 +48,7 @@ from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
+from hapticbridge.timekeeping import RunTimes, Timekeeping, motors_pushed
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
@@ -147,6 +147,11 @@ class AuditReport:
         if not self.hands:
             del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
+
+    @property
+    def has_pushed(self) -> bool:
+        """True if motors of the scene may have given the hand energy; see ``motors_pushed``."""
+        return motors_pushed(self.energies.get("actuator_work", 0.0), self.max_net_energy)
 
     @property
     def exit_code(self) -> int:
@@ -431,11 +436,11 @@ def verdict_on(
 
 def _motor_words(work: float, net: float) -> str:
     """Returns a clause on motors of the scene that pushed the hand; empty if none did."""
-    if min(work, net) <= INSTANT:
+    if not motors_pushed(work, net):
         return ""
     return (
         f"the scene's motors did {format_energy(work)} of work and the hand got up to "
-        f"{format_energy(net)} beyond what it put in: no guarantee covers motors that push"
+        f"{format_energy(net)} beyond what it put in, which only --energy-limit bounds"
     )
 
 

@@ -253,7 +253,10 @@ def open_case(
     chosen = motion_for(scene, motion)
     name = str(motion) if motion is not None else scene.path.with_suffix(".csv").name
     if chosen is None:
-        chosen, name = _default_motion(), "the default hand motion: slow, 1 cm about each axis"
+        chosen, name = (
+            _default_motion(),
+            "the default hand motion: slow, 1 cm along and 0.1 rad about each axis",
+        )
     samples = samples_of(chosen, period)
     scene.set_timestep(period)
     observation, fault = None, ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any
 
 import mujoco
@@ -29,9 +30,10 @@ from hapticbridge.check.physics import (
     mesh_of,
 )
 from hapticbridge.check.source_map import Place, Places
+from hapticbridge.kernel.codes import added_actuators
 from hapticbridge.kernel.rigid_contact import LAST_RIGID
 from hapticbridge.scene import Scene, SceneSource
-from hapticbridge.scene.checks import OF_A_JOINT, pumps
+from hapticbridge.scene.checks import OF_A_JOINT, driven_name, pumps
 from hapticbridge.scene.contacts import (
     REFERENCE_STEPS,
     ROUNDING,
@@ -44,12 +46,14 @@ from hapticbridge.scene.contacts import (
 
 
 def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
-    """Yields faults that make a run feel wrong from its first second: units, pumps, angles, creep.
+    """Yields faults that make a run feel wrong from its first second.
+
+    These are units, pumps, the strongest of the motors that push, angles and creep.
 
     They need no motion, so that a run can tell them at its start. The scene is reset.
     """
     loaded = CompiledScene(source, scene, Places(source, scene.model))
-    for rule in (_units, _pumps, _angles, _frictions):
+    for rule in (_units, _pumps, _strongest_motor, _angles, _frictions):
         scene.reset()
         yield from rule(loaded)
 
@@ -306,30 +310,91 @@ def _pumps(case: CompiledScene) -> Iterator[Fault]:
 
 
 MOTOR_FORCE = 0.1
-"""Force in N, or torque in N m, of a motor at the start from which it is told."""
+"""Force in N, or torque in N m, of an actuator at the start from which it is told."""
 
 
 def _motors(case: CompiledScene) -> Iterator[Fault]:
-    """Finds motors that push from the start on, whatever the joint does; a servo holds it."""
+    """Finds actuators that push at the start with more than holds gravity and springs.
+
+    The strongest one comes first.
+    """
     model, data = case.model, case.scene.data
     case.scene.reset()
-    for motor in range(model.nu):
-        force = float(data.actuator_force[motor]) * float(model.actuator_gear[motor, 0])
-        is_there = int(model.actuator_trntype[motor]) in OF_A_JOINT
-        if not is_there or model.actuator_biasprm[motor, 1] != 0.0 or abs(force) < MOTOR_FORCE:
+    own = [i for i in range(model.nactuator) if i not in added_actuators(model)]
+    parts = {i: _joint_forces(model, data, i) for i in own}
+    total = sum(parts.values(), np.zeros(model.nv))
+    held = data.qfrc_bias - data.qfrc_passive
+    excess = total - np.clip(total, np.minimum(held, 0.0), np.maximum(held, 0.0))
+    for actuator in sorted(own, key=lambda i: -float(np.linalg.norm(parts[i]))):
+        forces = parts[actuator]
+        pushes = np.minimum(np.abs(forces), np.abs(excess)) >= MOTOR_FORCE
+        if not np.any(pushes & (forces * excess > 0.0)):
             continue
-        joint = int(model.actuator_trnid[motor, 0])
-        unit = "N" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "N m"
-        place = case.places.joint(joint)
+        force, unit = _motor_force(model, data, actuator)
+        name = model.actuator(actuator).name or actuator
         yield Fault(
             "motor",
-            place,
-            f"actuator '{model.actuator(motor).name}' pushes {place.element} with "
-            f"{number(abs(force))} {unit} from the start on; no guarantee covers what a motor "
-            "gives the hand",
-            "ctrl=\"0\" in keyframe 'home', or a smaller forcerange",
+            case.places.actuator(actuator),
+            f"actuator '{name}' pushes {driven_name(model, actuator)} with {number(force)} {unit} "
+            "from the start on; no guarantee covers what a motor gives the hand",
+            _motor_change(model, data, actuator, is_alone=len(own) == 1),
             is_note=True,
         )
+
+
+def _strongest_motor(case: CompiledScene) -> Iterator[Fault]:
+    yield from islice(_motors(case), 1)
+
+
+def _joint_forces(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> NDArray[np.float64]:
+    """Returns the generalised forces of an actuator in N and N m, (nv,)."""
+    found, force = np.zeros(model.nv), float(data.actuator_force[_output(model, actuator)])
+    first = int(data.moment_rowadr[_output(model, actuator)])
+    row = slice(first, first + int(data.moment_rownnz[_output(model, actuator)]))
+    np.add.at(found, data.moment_colind.ravel()[row], data.actuator_moment.ravel()[row] * force)
+    return found
+
+
+def _output(model: mujoco.MjModel, actuator: int) -> int:
+    return int(model.actuator_outadr[actuator])
+
+
+def _motor_force(model: mujoco.MjModel, data: mujoco.MjData, actuator: int) -> tuple[float, str]:
+    """Returns the size of an actuator's force on what it drives, and its unit."""
+    output, driven = _output(model, actuator), int(model.actuator_trnid[actuator, 0])
+    gear, force = model.actuator_gear[output], abs(float(data.actuator_force[output]))
+    kind = int(model.actuator_trntype[actuator])
+    if kind in OF_A_JOINT:
+        is_slide = model.jnt_type[driven] == mujoco.mjtJoint.mjJNT_SLIDE
+        return force * float(np.linalg.norm(gear)), "N" if is_slide else "N m"
+    if kind == mujoco.mjtTrn.mjTRN_SITE:
+        is_force = bool(np.any(gear[:3]))
+        return force * float(np.linalg.norm(gear[:3] if is_force else gear[3:])), (
+            "N" if is_force else "N m"
+        )
+    return force * abs(float(gear[0])), "N"
+
+
+def _motor_change(
+    model: mujoco.MjModel, data: mujoco.MjData, actuator: int, *, is_alone: bool
+) -> str:
+    """Returns what lets an actuator start without force: a motor at 0, a servo at its target."""
+    gain, control = float(model.actuator_gainprm[actuator, 0]), model.actuator_ctrladr[actuator]
+    is_fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0.0
+    is_direct = model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
+    if not (is_fixed and is_direct):
+        return "a smaller forcerange, or a start at which it does not push"
+    bias = model.actuator_biasprm[actuator] * (
+        model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE
+    )
+    length = float(data.actuator_length[_output(model, actuator)])
+    rest = -float(bias[0] + bias[1] * length) / gain + 0.0
+    name = "" if is_alone else f" of '{model.actuator(actuator).name or actuator}'"
+    if model.actuator_ctrllimited[control]:
+        low, high = model.actuator_ctrlrange[control]
+        if not low <= rest <= high:
+            return "a smaller forcerange, or a start at which it does not push"
+    return f"ctrl=\"{number(rest)}\"{name} in keyframe 'home', or a smaller forcerange"
 
 
 def _angles(case: CompiledScene) -> Iterator[Fault]:

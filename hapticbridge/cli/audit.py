@@ -244,15 +244,17 @@ class Audit:
         """Prints what to change after a trip of a run that was passive until then."""
         recording = read_recording(report.path, 0)
         cause = pump_behind_trip(recording, report, in_process=self.in_process)
+        work = report.energies.get("actuator_work", 0.0)
         if cause is not None:
             out.print(f"likely cause: {plain(f'{cause.kind}. {cause.evidence}')}")
             remedy = cause.remedy
         else:
-            names = "actuator_work", "environment_energy"
-            remedy = trip_remedy(report.reason, *(report.energies.get(name, 0.0) for name in names))
+            created = report.energies.get("environment_energy", 0.0)
+            remedy = trip_remedy(report.reason, work, created)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
-        out.print("next: hapticbridge guide faults")
+        page = "active-verdict" if cause is not None or report.has_pushed else "faults"
+        out.print(f"next: hapticbridge guide {page}")
 
     def _audit_many(self, files: list[Path]) -> int:
         if self.plot or self.report or self.what_if:
@@ -385,7 +387,7 @@ def _print_report(report: AuditReport) -> None:
     if not report.conditions and report.verdict != "invalid":
         out.print(f"  {_without_condition(report.path)}")
     if kept is not None and report.conditions:
-        out.print(f"  {kept.device_words(report.certified)}")
+        out.print(f"  {kept.device_words(report.certified, has_pushed=report.has_pushed)}")
     if report.is_cut:
         mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
         hint = f"; {mend}" if CUT in report.cut else ""
@@ -397,12 +399,7 @@ def _print_report(report: AuditReport) -> None:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())
         out.print(f"  events: {plain(listed)}")
     rate = f", {kept.remark}" if kept is not None and kept.remark else ""
-    unfinished = (
-        "; the tick that tripped is not among them: only the run's summary counts what the hand "
-        "got in it"
-        if "trip" in report.events
-        else ""
-    )
+    unfinished = "; the tick that tripped is not among them" if "trip" in report.events else ""
     out.print(f"  {report.ticks} ticks, {report.duration:.3f} s{rate}{unfinished}")
     if energies := [" ".join(row) for row in energy_rows(report.energies, report.start_potential)]:
         out.print(f"  {', '.join(energies)}")

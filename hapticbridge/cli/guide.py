@@ -54,9 +54,16 @@ def page(topic: str) -> str:
     advice = nearest(topic, topics).rstrip()
     if not advice:
         found = [name for name in topics if topic.lower() in page(name).lower()]
+        headed = [name for name in found if any(topic.lower() in h.lower() for h in headings(name))]
         lead = "the word is in" if topic and found else "choose one of"
-        advice = f"{lead} {choices(found or topics)}"
+        lead = "a heading with the word is in" if topic and headed else lead
+        advice = f"{lead} {choices(headed or found or topics)}"
     raise HapticBridgeError(f"the guide has no topic '{topic}'; {advice}")
+
+
+def headings(topic: str) -> list[str]:
+    """Returns the headings of a page."""
+    return [line.lstrip("# ") for line in page(topic).splitlines() if line.startswith("#")]
 
 
 @dataclass(frozen=True, slots=True)

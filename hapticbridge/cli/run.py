@@ -225,6 +225,11 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
             f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
             "it from motors, springs or parts of the scene that push the tool"
         )
+    elif 10.0 * float(np.linalg.norm(others)) > load:
+        yield (
+            f"at rest the hand bears {format_si(in_hand, 'N')}, {sag} beside the handle, most of "
+            "it the tool's weight; --no-tool-weight carries that"
+        )
     else:
         yield (
             f"this tool weighs {format_si(in_hand, 'N')} in the hand, which holds it {sag} beside "

@@ -33,7 +33,7 @@ from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.scene.checks import Pump, pumps
+from hapticbridge.scene.checks import first_pump
 from hapticbridge.scene.contacts import check_contacts, geom_name
 from hapticbridge.units import format_energy
 
@@ -372,7 +372,7 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
             "damps their contacts and welds against rest, so a fast move creates energy",
             "move them slower",
         )
-    pump = _first_pump(evidence.model)
+    pump = None if evidence.model is None else first_pump(evidence.model)
     # a motor's work is no creation, until its motion is beyond all measure
     if pump is not None and (pump.kind == "joint" or "trip" in report.events):
         return Cause("pump", f"{pump.words}; {where}", f"write {pump.change}")
@@ -385,15 +385,6 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
         return _method_cause(method, "the contacts are set as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
     return Cause("contact setting", f"{where}; {hard}", _SOFTER)
-
-
-def _first_pump(model: mujoco.MjModel | None) -> Pump | None:
-    """Returns the first joint or actuator that pushes what moves already; None without one."""
-    if model is None:
-        return None
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return next(iter(pumps(model, data)), None)
 
 
 def _cause_without_contact(evidence: Evidence, window: slice, where: str) -> Cause:
@@ -546,7 +537,7 @@ def pump_behind_trip(
     work = format_energy(report.energies.get("actuator_work", 0.0))
 
     def found(model: mujoco.MjModel) -> Cause | None:
-        pump = _first_pump(model)
+        pump = first_pump(model)
         if pump is None:
             return None
         words = f"; the scene's motors did {work} of work until the trip"

@@ -31,6 +31,7 @@ from hapticbridge.report.plots import (
     draw_timing,
 )
 from hapticbridge.run_description import meta_float
+from hapticbridge.timekeeping import MOTORS_PUSHED
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Facts of the run
@@ -366,7 +367,8 @@ def _device_notes(report: AuditReport) -> list[str]:
     kept = report.timekeeping
     if report.certified:
         clause = "" if kept is None or not kept.clause else f",{kept.clause}"
-        return [f"The device bears this coupling, in any hand{clause}."]
+        limit = f"; but {MOTORS_PUSHED}" if report.has_pushed else ""
+        return [f"The device bears this coupling, in any hand{clause}{limit}."]
     if report.certified is None:
         return ["It is not known if the device bears this coupling in any hand."]
     if kept is not None and kept.refutation:  # the reason has the numbers

@@ -146,12 +146,41 @@ def pumps(model: mujoco.MjModel, data: mujoco.MjData) -> list[Pump]:
         if bias > offset:
             words = (
                 f"actuator '{model.actuator(actuator).name or actuator}' pushes "
-                f"{_driven_name(model, actuator)} harder the faster it moves (velocity bias "
+                f"{driven_name(model, actuator)} harder the faster it moves (velocity bias "
                 f"{bias:.3g}; damping there offsets {offset:.3g})"
             )
             change = "a third number of at most 0 in its biasprm"
             found.append(Pump("actuator", actuator, words, change))
     return found
+
+
+def first_pump(model: mujoco.MjModel) -> Pump | None:
+    """Returns the first joint or actuator that pushes what moves already; None without one."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return next(iter(pumps(model, data)), None)
+
+
+def strongest_actuator(model: mujoco.MjModel, data: mujoco.MjData) -> str:
+    """Returns the name of the scene's own actuator with the largest force on joints; or empty.
+
+    In N or N m; none is named if all forces are zero or a force is not finite.
+    """
+    sizes = {
+        actuator: abs(float(data.actuator_force[output])) * _largest_arm(data, output)
+        for actuator, output in enumerate(model.actuator_outadr.tolist())
+        if actuator not in added_actuators(model)
+    }
+    best = max(sizes, key=lambda actuator: sizes[actuator], default=-1)
+    if best < 0 or not 0.0 < sizes[best] < math.inf:
+        return ""
+    return str(model.actuator(best).name or best)
+
+
+def _largest_arm(data: mujoco.MjData, output: int) -> float:
+    first = int(data.moment_rowadr[output])
+    row = slice(first, first + int(data.moment_rownnz[output]))
+    return float(np.abs(data.actuator_moment.ravel()[row]).max(initial=0.0))
 
 
 MIN_ARM = 1e-9
@@ -179,7 +208,8 @@ def _joint_name(model: mujoco.MjModel, joint: int) -> str:
     return f"joint '{name}'" if name else f"joint {joint}"
 
 
-def _driven_name(model: mujoco.MjModel, actuator: int) -> str:
+def driven_name(model: mujoco.MjModel, actuator: int) -> str:
+    """Returns the name of what an actuator drives: a joint, a tendon, a site."""
     kind, driven = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     if kind in OF_A_JOINT:
         return _joint_name(model, driven)

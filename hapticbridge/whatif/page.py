@@ -24,6 +24,7 @@ from hapticbridge.report.evidence import (
 )
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import PAGE_BINS, PICTURE_BINS, decimated, finish
+from hapticbridge.timekeeping import INSTANT
 from hapticbridge.units import format_energy, format_share, format_si, shown_energies
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
@@ -62,6 +63,8 @@ def rows(found: WhatIf) -> Iterator[Row]:
         joules = [each.get(name, 0.0) for each in shown]
         if any(joules):
             yield name, tuple(map(format_energy, joules))
+    if any(run.report.max_net_energy > INSTANT for run in runs):
+        yield "net to the hand", tuple(format_energy(run.report.max_net_energy) for run in runs)
     yield "slack used", tuple(format_share(run.report.slack_share) for run in runs)
     yield "device bears it", tuple(map(_certified, runs))
     yield "ran", tuple(f"{run.report.duration:.3f} s" for run in runs)
