@@ -26,7 +26,7 @@ from hapticbridge.kernel.codes import JOINT, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
-from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
+from hapticbridge.rendering import Method, RunCoupling, default_method
 from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping
 from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
@@ -393,9 +393,6 @@ class Summary:
         yield kept.device_words(self.is_certified)
         if not self.is_certified:
             yield from self.conditions
-        if self.is_certified is False and method_named(self.method).has_law:
-            judge = "the audit" if self.recording else "with --record FILE the audit"
-            yield f"{judge} counts what the hand got; in a run only --energy-limit bounds it"
 
     @property
     def verdict(self) -> str:

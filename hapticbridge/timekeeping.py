@@ -337,7 +337,10 @@ def _scene_speed(times: RunTimes, ticks: int) -> float:
 
 def _remedy(*, is_realtime: bool) -> str:
     request = "" if is_realtime else "--realtime, "
-    return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
+    return (
+        f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "
+        "'hapticbridge doctor' advises"
+    )
 
 
 def _at_times(

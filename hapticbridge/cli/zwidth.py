@@ -13,6 +13,7 @@ from rich.table import Table
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import (
+    NEEDED_SHARE,
     DampingCondition,
     delay_ticks,
     device_conditions,
@@ -390,18 +391,23 @@ class Bound:
             return
         needed = ways[0].needed
         if b >= needed:
-            out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
-            out.print(f"it bears any K up to {2 * b / period:.4g} N/m with any B up to {b:g} N s/m")
+            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand")
+            out.print(
+                f"method {method.name} needs the larger of KT/2 and B: any K up to "
+                f"{2 * b / period:g} N/m beside any B up to {b:g} N s/m"
+            )
             command = next_command(self.stiffness, max(self.damping, least), self.rate)
             if self.device is not None:
                 command += f" --device {shlex.quote(self.device)}"
             out.print(f"next: {plain(command)}")
             return
-        out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
+        out.print(f"device damping {b:g} < {needed:g} N s/m: [red]not passive in any hand[/]")
         self._print_remedies(b, needed, period)
 
     def _print_remedies(self, b: float, needed: float, period: float) -> None:
         lag, changes = default_method().compensated_share, []
+        b *= NEEDED_SHARE
+        needed /= NEEDED_SHARE
         if law_damping(self.stiffness, self.damping, period, lag) > 0:
             stiffness = min(self.stiffness, 2 * b / period)
             most = largest_effective_damping(b, stiffness, period, lag)
@@ -409,6 +415,7 @@ class Bound:
         if self.stiffness * period > 2 * b:
             changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")
             changes.append(f"raise the rate to {self.stiffness / (2 * b):.4g} Hz")
+        out.print("with 15 % in reserve:")
         if len(changes) == 3:
             out.print(f"  {changes[0]}, and {changes[1]} or {changes[2]}, or")
         else:
