@@ -26,11 +26,11 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured_points
+from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.theory.bounds import largest_effective_damping, law_damping
+from hapticbridge.theory.bounds import STIFFNESS_MARGIN, largest_effective_damping, law_damping
 from hapticbridge.theory.transfer import MAX_DELAY, scalar
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (
@@ -41,6 +41,7 @@ from hapticbridge.theory_plots import (
     recommended,
     recommended_coupling,
 )
+from hapticbridge.units import format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
 
@@ -103,6 +104,11 @@ class Zwidth:
             measured = None
             if device is not None:
                 clock = RealClock() if device.info.is_real else SimulatedClock()
+                if device.info.is_real:
+                    notify(
+                        f"about 15 walls at each of {len(SHARES)} dampings are tried: 2 to 3 "
+                        "minutes, longer at a slow swing"
+                    )
                 with interrupting_on_signals(), progress("measuring") as show:
                     measured = measure_width(device, clock, z, axis=axis, progress=show)
         finally:
@@ -111,6 +117,8 @@ class Zwidth:
         # the run command has no low-pass to offer, and without it this corner is not passive
         coupling = recommended(z)
         command = next_command(coupling.stiffness, coupling.damping, self.rate)
+        if self.measure is not None:
+            command += f" --device {shlex.quote(self.measure)}"
         next_step = None if z.filter_time else command
         if self.as_json:
             print_json(_z_width_facts(z, next_step) | _measured_facts(measured))
@@ -151,6 +159,9 @@ class Zwidth:
         delay = whole_ticks(
             _ARGUMENTS.number("--delay", self.delay, "s", least=0, most=MAX_DELAY * period), period
         )
+        if delay:
+            ticks = "1 tick" if delay == 1 else f"{delay} ticks"
+            notify(f"a delay of {format_si(self.delay, 's')} counts as {ticks}")
         if info is not None:
             numbers = {
                 name: getattr(info, name) if value is None else value
@@ -210,7 +221,9 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
-    out.print(f"use {sentence}: 80 % of the limit at a quarter of its damping")
+    at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
+    of = f"{safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    out.print(f"use {sentence}: 80 % of the {of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
