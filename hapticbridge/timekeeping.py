@@ -53,6 +53,13 @@ UNKNOWN = "it is not known whether its motors push the right way"
 """Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
 
 
+NO_DAMPING = (
+    "its damping is unknown; 'hapticbridge identify' measures it, or its class states it in "
+    "DeviceInfo(damping=..., delay=...)"
+)
+"""Reason why a device is not judged, with the next step."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunTimes:
     """Times of a run, from the loop's counters or from a recording.
@@ -225,11 +232,14 @@ class Timekeeping:
         """Number that is missing for a verdict on the device, in a clause."""
         on_hand = [each for each in self.in_time if each.is_felt]
         if any(each.available is None for each in on_hand):
-            return "its damping is unknown ('hapticbridge identify' measures it)"
+            return NO_DAMPING
         if any(each.delay is None for each in on_hand):
             return "its delay is unknown ('hapticbridge identify' measures it)"
         if any(each.delay for each in on_hand):
-            return "behind its delay the bound holds at walls, and none holds for every scene"
+            return (
+                "it answers late; behind a delay there is a bound for walls, and none for a scene "
+                "that moves"
+            )
         return "nothing proves that it bears the coupling"
 
     @property
