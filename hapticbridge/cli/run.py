@@ -303,9 +303,9 @@ class Run:
     device's grip axis moves. Scale, axes, limits and gains apply to every hand, --clutch and
     --dead-man to every real device. The method is 'implicit' or 'compensated'."""
     duration: float | None = None
-    """Duration in s; each missed deadline uses up one period of it. By default the run ends with
-    the device's motion, which a missed deadline delays; without an end of it with Ctrl-C, or after
-    5 s of --fast."""
+    """Duration in s; each missed deadline uses up one period of it. By default a recorded or
+    scripted motion is run to its end, which missed deadlines delay; any other device runs until
+    Ctrl-C, with --fast for 5 s."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
