@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Literal
 
 import numpy as np
@@ -18,6 +18,8 @@ from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
 from hapticbridge.units import format_si
+
+Axis = Literal["translation", "rotation"]
 
 # Additional device damping required by the device's own update rate and delay
 
@@ -65,7 +67,7 @@ def damping_for_delay(
     info: DeviceInfo,
     coupling: Coupling,
     period: float,
-    axis: Literal["translation", "rotation"] = "translation",
+    axis: Axis = "translation",
 ) -> float:
     """Returns the additional damping required by the delay, in N s/m or N m s/rad.
 
@@ -103,7 +105,7 @@ def required_damping(
     coupling: Coupling,
     period: float,
     law_evaluations: int = 1,
-    axis: Literal["translation", "rotation"] = "translation",
+    axis: Axis = "translation",
 ) -> float:
     """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
 
@@ -165,7 +167,7 @@ def required_damping_with_delay(
     coupling: Coupling,
     period: float,
     law_evaluations: int,
-    axis: Literal["translation", "rotation"] = "translation",
+    axis: Axis = "translation",
 ) -> float:
     """Returns the damping needed by a device with its own rate and delay."""
     needed = required_damping(coupling, device_period(info, period), law_evaluations, axis)
@@ -267,7 +269,8 @@ class DampingCondition:
         axis: ``translation`` or ``rotation``; if it is not felt, the names of the axes.
         needed: Right-hand side in N s/m (rotation: N m s/rad).
         available: The device's damping b; None if unknown.
-        remedy: Change that helps if the condition fails.
+        remedy: Changes with which it holds with 15 % in reserve (``NEEDED_SHARE``); empty if it
+            holds.
         delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
         tick: Length of such a tick in s.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
@@ -278,7 +281,7 @@ class DampingCondition:
     axis: str
     needed: float
     available: float | None
-    remedy: str = "lower stiffness or damping, or raise the rate"
+    remedy: str = ""
     delay: int | None = 0
     tick: float = 0.0
     is_felt: bool = True
@@ -322,6 +325,7 @@ def device_conditions(
     force_scale: float,
     law_evaluations: int = 1,
     method: Method | None = None,
+    timestep: float | None = None,
 ) -> tuple[DampingCondition, ...]:
     """Returns the condition for each kind of axis of a device with known translational damping.
 
@@ -341,33 +345,18 @@ def device_conditions(
         law_evaluations: Evaluations of the wrench per tick (substeps).
         method: Rendering method, which decides the remedy; None for one that uses the damping as
             requested.
+        timestep: MuJoCo's h in s, for the remedy; None for ``period`` / ``law_evaluations``.
 
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
-    conditions = []
-    delay, tick = delay_ticks(info, period), device_period(info, period)
     is_known = info.damping is not None or not info.moves
+    demand = _Demand(info, coupling, period, scale, force_scale, law_evaluations, method, timestep)
+    conditions = []
     if info.moves and info.damping is not None:
-        needed = (
-            scale
-            * force_scale
-            * required_damping_with_delay(info, coupling, period, law_evaluations)
-        )
-        remedy = _remedy(method, coupling.damping)
-        conditions.append(
-            DampingCondition("translation", needed, info.damping, remedy, delay, tick)
-        )
+        conditions.append(demand.condition("translation", info.damping))
     if info.turns and is_known:
-        needed = (
-            force_scale
-            / scale
-            * required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
-        )
-        remedy = _remedy(method, coupling.rotational_damping)
-        conditions.append(
-            DampingCondition("rotation", needed, info.rotational_damping, remedy, delay, tick)
-        )
+        conditions.append(demand.condition("rotation", info.rotational_damping))
     if info.sensed and is_known:
         conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))
     return tuple(conditions)
@@ -386,24 +375,177 @@ def required_axis_damping(
 
     Arguments are those of ``device_conditions``.
     """
-    if not method.has_coupling:
+    is_known = info.damping is not None or not info.moves
+    if not method.has_coupling or not is_known:
         return 0.0, 0.0
-    conditions = device_conditions(
-        info, coupling, period, scale, force_scale, law_evaluations, method
+    demand = _Demand(info, coupling, period, scale, force_scale, law_evaluations, method)
+    return (
+        demand.needed("translation") if info.moves else 0.0,
+        demand.needed("rotation") if info.turns else 0.0,
     )
-    needed = {condition.axis: condition.needed for condition in conditions}
-    return needed.get("translation", 0.0), needed.get("rotation", 0.0)
 
 
-def _remedy(method: Method | None, used: float) -> str:
-    """Returns the change that lowers the required damping.
+# Changes that a device would bear
 
-    For a method that subtracts its own damping, a softer spring or a shorter period raises B' by as
-    much as it saves, or more. While B' > 0, only a lower B helps.
+HALVINGS = 24
+"""Number of bisections of a limit; the printed three digits need half of them."""
+
+FASTEST = 20_000.0
+"""Largest rate in Hz that is proposed; loops of this package reach no higher one."""
+
+_ROUNDING = 1e-6  # relative; keeps a limit found by bisection from losing a digit
+
+_Part = Literal["stiffness", "damping", "period"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Demand:
+    """Damping that a coupling asks of a device, and what would ask for less.
+
+    Attributes are the arguments of ``device_conditions``.
     """
-    if method is None or method.compensated_share == 0.0:
-        return "lower stiffness or damping, or raise the rate"
-    return "lower the coupling's damping" if used > 0 else "lower the stiffness, or raise the rate"
+
+    info: DeviceInfo
+    law: Coupling
+    period: float
+    scale: float
+    force_scale: float
+    law_evaluations: int
+    method: Method | None
+    timestep: float | None = None
+
+    @property
+    def h(self) -> float:
+        """MuJoCo's time step in s."""
+        return self.timestep or self.period / self.law_evaluations
+
+    def needed(self, axis: Axis) -> float:
+        """Returns the damping that the device needs in N s/m or N m s/rad."""
+        is_linear = axis == "translation"
+        ratio = self.scale * self.force_scale if is_linear else self.force_scale / self.scale
+        return ratio * required_damping_with_delay(
+            self.info, self.law, self.period, self.law_evaluations, axis
+        )
+
+    def condition(self, axis: Axis, available: float | None) -> DampingCondition:
+        """Returns the condition, with the changes that would meet it if it fails."""
+        needed = self.needed(axis)
+        remedy = ""
+        if available is not None and available < needed:
+            remedy = self._remedy(axis, available)
+        return DampingCondition(
+            axis,
+            needed,
+            available,
+            remedy,
+            delay_ticks(self.info, self.period),
+            device_period(self.info, self.period),
+        )
+
+    def _remedy(self, axis: Axis, available: float) -> str:
+        """Returns changes with which the device has damping in reserve (``NEEDED_SHARE``).
+
+        Stiffness and damping are the requested ones. Each quantity is changed alone; if none
+        suffices alone, stiffness and damping are lowered together.
+        """
+        if self.method is not None and not self.method.has_law:
+            return "lower stiffness or damping, or raise the rate"
+        if available <= 0.0:
+            return "a device without damping bears no coupling"
+        prefix, spring, damper = _SETTINGS[axis]
+        parts: tuple[_Part, ...] = ("stiffness", "damping")
+        parts += ("period",) if self._is_rate_free else ()
+        share = {part: _largest(partial(self._bears, axis, available, part)) for part in parts}
+        stiffness, damping = self._gains(self._requested(), axis)
+        found = []
+        if share["stiffness"]:
+            limit = _three_digits(share["stiffness"] * stiffness)
+            found.append(f"lower the {prefix}stiffness to {limit} {spring}")
+        if share["damping"]:
+            limit = _three_digits(share["damping"] * damping)
+            found.append(f"lower the {prefix}damping to {limit} {damper}")
+        if share.get("period", 0.0) * FASTEST * self.period > 1:
+            limit = _three_digits(1 / (share["period"] * self.period), math.ceil)
+            found.append(f"raise the rate to {limit} Hz")
+        if not found:
+            less = NEEDED_SHARE * available / self.needed(axis)
+            gains = (less * gain for gain in self._gains(self._law_as_requested(), axis))
+            k, b = (_three_digits(gain) for gain in gains)
+            return f"lower the {prefix}stiffness to {k} {spring} and the damping to {b} {damper}"
+        told = ", or ".join(found)
+        if self.method is not None and self._is_hidden(axis):
+            added = self.method.compensated_share * share["stiffness"] * stiffness * self.h
+            at_most = _three_digits(added)
+            told += f", with a {prefix}damping of at most {at_most} {damper}"
+        return told
+
+    @property
+    def _is_rate_free(self) -> bool:
+        """True if a faster loop shortens all that the device waits for."""
+        is_prompt = self.info.rate is None and not delay_ticks(self.info, self.period)
+        return is_prompt and math.isclose(self.h * self.law_evaluations, self.period)
+
+    def _gains(self, coupling: Coupling, axis: Axis) -> tuple[float, float]:
+        if axis == "translation":
+            return coupling.stiffness, coupling.damping
+        return coupling.rotational_stiffness, coupling.rotational_damping
+
+    def _is_hidden(self, axis: Axis) -> bool:
+        """True if the method took off all requested damping, which may have had any value."""
+        share = 0.0 if self.method is None else self.method.compensated_share
+        return share > 0.0 and self._gains(self.law, axis)[1] == 0.0
+
+    def _law_as_requested(self) -> Coupling:
+        method = self.method
+        return self.law if method is None else method.requested_coupling(self.law, self.h)
+
+    def _requested(self) -> Coupling:
+        """Smallest requested coupling of this law; hidden damping counts as 0."""
+        found = self._law_as_requested()
+        return replace(
+            found,
+            damping=0.0 if self._is_hidden("translation") else found.damping,
+            rotational_damping=0.0 if self._is_hidden("rotation") else found.rotational_damping,
+        )
+
+    def _bears(self, axis: Axis, available: float, part: _Part, share: float) -> bool:
+        """Returns True if the device has reserve after one quantity is reduced to a share."""
+        requested, faster = self._requested(), 1.0
+        if part == "period":
+            faster = share
+        else:
+            name = part if axis == "translation" else f"rotational_{part}"
+            requested = replace(requested, **{name: share * getattr(requested, name)})
+        step = self.h * faster
+        law = requested if self.method is None else self.method.law_coupling(requested, step)
+        changed = replace(self, law=law, period=faster * self.period, timestep=step)
+        return changed.needed(axis) <= NEEDED_SHARE * available * (1 + _ROUNDING)
+
+
+_SETTINGS: dict[Axis, tuple[str, str, str]] = {
+    "translation": ("", "N/m", "N s/m"),
+    "rotation": ("rotational ", "N m/rad", "N m s/rad"),
+}
+
+
+def _largest(holds: Callable[[float], bool]) -> float:
+    """Returns a largest share in (0, 1) at which a condition holds; 0 if none does."""
+    low, high = 0.0, 1.0
+    if not holds(1e-3):
+        return 0.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low
+
+
+def _three_digits(value: float, rounded: Callable[[float], int] = math.floor) -> str:
+    """Formats a limit, rounded down or up."""
+    if value <= 0.0:
+        return "0"
+    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    slack = _ROUNDING if rounded is math.floor else -_ROUNDING
+    return f"{rounded(value / digit * (1.0 + slack)) * digit:.6g}"
 
 
 def run_conditions(
@@ -423,6 +565,7 @@ def run_conditions(
         parameters.force_scale,
         parameters.law_evaluations,
         method,
+        parameters.timestep,
     )
 
 

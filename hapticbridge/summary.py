@@ -27,7 +27,13 @@ from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
-from hapticbridge.timekeeping import INSTANT, RunTimes, Timekeeping, motors_pushed
+from hapticbridge.timekeeping import (
+    INSTANT,
+    NO_DAMPING,
+    RunTimes,
+    Timekeeping,
+    motors_pushed,
+)
 from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
@@ -393,6 +399,9 @@ class Summary:
             return
         if self.is_certified is False and kept.fault:
             yield f"device not certified: {kept.fault}"
+            return
+        if self.is_certified is None and not self.conditions:
+            yield f"device not judged: {NO_DAMPING}"
             return
         yield kept.device_words(self.is_certified, has_pushed=self._has_pushed)
         if not self.is_certified:

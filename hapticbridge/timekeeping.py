@@ -66,6 +66,13 @@ def motors_pushed(work: float, net: float) -> bool:
     return min(abs(work), net) > INSTANT
 
 
+NO_DAMPING = (
+    "its damping is unknown; 'hapticbridge identify' measures it, or its class states it in "
+    "DeviceInfo(damping=..., delay=...)"
+)
+"""Reason why a device is not judged, with the next step."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunTimes:
     """Times of a run, from the loop's counters or from a recording.
@@ -242,11 +249,14 @@ class Timekeeping:
         """Number that is missing for a verdict on the device, in a clause."""
         on_hand = [each for each in self.in_time if each.is_felt]
         if any(each.available is None for each in on_hand):
-            return "its damping is unknown ('hapticbridge identify' measures it)"
+            return NO_DAMPING
         if any(each.delay is None for each in on_hand):
             return "its delay is unknown ('hapticbridge identify' measures it)"
         if any(each.delay for each in on_hand):
-            return "behind its delay the bound holds at walls, and none holds for every scene"
+            return (
+                "it answers late; behind a delay there is a bound for walls, and none for a scene "
+                "that moves"
+            )
         return "nothing proves that it bears the coupling"
 
     @property
@@ -354,7 +364,10 @@ def _scene_speed(times: RunTimes, ticks: int) -> float:
 
 def _remedy(*, is_realtime: bool) -> str:
     request = "" if is_realtime else "--realtime, "
-    return f"{request}a lower --stiffness or --rate, or what 'hapticbridge doctor' advises"
+    return (
+        f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "
+        "'hapticbridge doctor' advises"
+    )
 
 
 def _at_times(

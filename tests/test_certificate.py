@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from hapticbridge.certificate import (
     NEEDED_SHARE,
+    DampingCondition,
     damping_for_delay,
     default_coupling,
     delay_ticks,
@@ -20,7 +22,7 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
-from hapticbridge.rendering import default_method
+from hapticbridge.rendering import METHODS, default_method
 
 T = 1e-3
 SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
@@ -122,3 +124,71 @@ def test_a_real_device_of_unknown_damping_is_taken_for_one_of_a_tenth() -> None:
     assert default_coupling(turning, T).rotational_stiffness == pytest.approx(
         0.1 * simulated.rotational_stiffness
     )
+
+
+def followed(remedy: str, requested: Coupling, axis: str) -> list[tuple[Coupling, float]]:
+    """Returns the requested coupling and the period after each of the changes."""
+    changes, _, at_most = remedy.partition(", with a ")
+    prefix = "rotational_" if axis == "rotation" else ""
+    found = []
+    for change in changes.split(", or "):
+        period, gains = T, {}
+        if at_most:
+            name = f"{prefix}damping"
+            most = float(at_most.split(" at most ")[1].split()[0])
+            gains[name] = min(getattr(requested, name), most)
+        for part, number in re.findall(r"(stiffness|damping|rate) to ([\d.e+-]+)", change):
+            if part == "rate":
+                period = 1.0 / float(number)
+            else:
+                gains[f"{prefix}{part}"] = float(number)
+        found.append((dataclasses.replace(requested, **gains), period))
+    return found
+
+
+@pytest.mark.parametrize("axis", ["translation", "rotation"])
+@pytest.mark.parametrize(
+    ("method", "laws", "sheet"),
+    [
+        ("lossless", 1, {}),
+        ("lossless", 1, {"delay": 3e-3, "rate": 1000.0}),
+        ("lossless", 1, {"rate": 500.0}),
+        ("compensated", 1, {}),
+        ("implicit", 1, {}),
+        ("implicit", 4, {}),
+        ("implicit", 2, {"delay": 2e-3}),
+    ],
+)
+@pytest.mark.parametrize("gains", [(600, 0.6), (600, 0.4), (600, 0.0), (5000, 1.9), (2400, 5.0)])
+def test_a_remedy_that_is_followed_leaves_a_reserve_of_15_percent(
+    axis: str, method: str, laws: int, sheet: dict[str, float], gains: tuple[float, float]
+) -> None:
+    chosen, device = METHODS[method], info(**{"rate": None, "delay": 0.0, **sheet})
+    device = dataclasses.replace(device, axes=SimulatedDevice().info.axes)
+    requested = Coupling(*gains, 1e-3 * gains[0], 1e-3 * gains[1])
+
+    def condition(coupling: Coupling, period: float) -> DampingCondition:
+        law = chosen.law_coupling(coupling, period / laws)
+        found = device_conditions(device, law, period, 1.2, 0.9, laws, chosen)
+        return next(each for each in found if each.axis == axis)
+
+    failing = condition(requested, T)
+    if failing.holds:
+        assert failing.remedy == ""
+        return
+    ways = followed(failing.remedy, requested, axis)
+    used = [condition(*way).needed / (failing.available or 0.0) for way in ways]
+    assert max(used) <= NEEDED_SHARE * 1.001  # the rate's own damping limit is rounded down
+    assert min(used) > 0.9 * NEEDED_SHARE
+
+
+def test_less_damping_is_no_remedy_behind_a_delay() -> None:
+    needed = []
+    for damping in (0.6, 0.4, 0.3):
+        method = default_method()
+        law = method.law_coupling(Coupling(600.0, damping, 0.0, 0.0), T)
+        (found,) = device_conditions(info(delay=3e-3, damping=1.0), law, T, 1.0, 1.0, method=method)
+        assert found.remedy.startswith("lower the stiffness to ")
+        assert "lower the damping" not in found.remedy
+        needed.append(found.needed)
+    assert needed == sorted(needed)  # the damper of the coupling helps at a wall

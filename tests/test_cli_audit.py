@@ -311,11 +311,13 @@ def test_a_device_without_a_condition_is_told_why(call: Called, tmp_path: Path) 
     assert call(*run)[0] == 0
     out = call("audit", path)[1]
     prescribed = "the device feels no force, as its motion is prescribed: there is nothing to cert"
-    unknown = "device not judged (b >= KT/2 + B_law): its damping b is unknown; 'hapticbridge ident"
+    unknown = "device not judged (b >= KT/2 + B_law): its damping is unknown; 'hapticbridge identi"
     assert prescribed in out and unknown not in out
     other = tmp_path / "other.mcap"
     device = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0), damping=None)
-    recorded(other, "point_mass", device, duration=0.02)
+    summary = recorded(other, "point_mass", device, duration=0.02)
+    unjudged = "device not judged: its damping is unknown; 'hapticbridge identify' measures it"
+    assert unjudged in str(summary)
     out = call("audit", other)[1]
     assert unknown in out and prescribed not in out
     recording = read_recording(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,30 @@ def test_it_recommends_the_coupling_that_a_run_takes_with_its_profile(
     sheet = read_profile(path).fill(info)
     assert sheet.delay == pytest.approx(1e-3 * delay, abs=1e-12)
     assert told == default_coupling(sheet, 1e-3).stiffness
+
+
+def test_it_says_what_a_class_states_and_as_how_many_ticks_a_delay_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "p.toml"
+    words = ["--axes", "x", "--duration", "5", "--save", str(path)]
+    assert main(["identify", f"{FREE},delay=3", *words]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    unknown = replace(open_device(FREE).info, damping=None, mass=None, friction=None, delay=None)
+    sheet = read_profile(path).fill(unknown)
+    assert f"DeviceInfo(mass={sheet.mass:.4g}, damping={sheet.damping:.4g}, friction=" in told
+    assert "delay=0.003); the delay counts as 3 ticks" in told
+    # behind a delay a damper lowers what a wall asks of the device, so that K may be larger
+    at_rest, with_damper = re.findall(r"([0-9.]+) N/m at B_law = ", told)
+    assert float(with_damper) > 1.2 * float(at_rest)
+    assert main(["identify", FREE, *words]) == 0
+    told, notes = capsys.readouterr()
+    assert "the delay counts as 0 ticks" in told
+    assert told.count("N/m at B_law = ") == 1
+    assert f"the profile that was there is now {path}.old" in " ".join(notes.split())
+    assert read_profile(path).fill(unknown).delay == 0.0
+    former = path.with_name("p.toml.old").rename(tmp_path / "former.toml")
+    assert read_profile(former).quantities["delay"].value == pytest.approx(3e-3)
 
 
 def test_what_was_measured_before_gives_way_to_a_new_measurement() -> None:

@@ -133,6 +133,38 @@ def test_one_damping_is_printed_before_the_run_after_it_and_by_the_audit(
     assert held in call("audit", record)[1]
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ((), ""),
+        (("--stiffness", 5000), ""),  # nobody asked for a damping
+        (("--damping", 3), ""),  # more than the method has at least
+        (("--damping", 0.5), "requested B = 0.5 N s/m: method lossless has at least 1.2 at this"),
+    ],
+)
+def test_only_a_damping_that_was_given_and_is_less_is_called_so(
+    given: tuple[Any, ...], told: str, call: Called
+) -> None:
+    err = call("run", "point_mass", "--fast", "--duration", 0.01, *given)[2]
+    assert "requested B_r" not in err
+    assert told in " ".join(err.split()) if told else "requested B =" not in err
+
+
+def test_the_advice_of_a_run_that_is_not_certified_is_followed_with_success(
+    call: Called, tmp_path: Path
+) -> None:
+    command = ("run", "point_mass", "--fast", "--duration", 0.01)
+    path = tmp_path / "stiff.mcap"
+    code, out, err = call(*command, "--stiffness", 5000, "--record", path)
+    advice = "lower the stiffness to 3400 N/m, or raise the rate to 1480 Hz, with a damping of at"
+    texts = (out, err, call("audit", path)[1])
+    assert code == 1
+    assert all(advice in " ".join(text.split()) for text in texts)
+    assert not any("counts what the hand got" in text for text in texts)
+    assert call(*command, "--stiffness", 3400)[0] == 0
+    assert call(*command, "--stiffness", 5000, "--rate", 1480)[0] == 0
+
+
 LIFTED = RESTING.replace("0 0 0.03", "0 0 {height}")
 
 

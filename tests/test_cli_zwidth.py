@@ -61,6 +61,8 @@ def test_a_device_of_less_damping_than_was_said_is_found_out(call: Called) -> No
     for damping, is_told in (("--damping 2 ", True), ("", False)):
         code, out, _ = call(*f"zwidth {damping}--measure simulated:hand=none,damping=1".split())
         assert (code, "it bears less than theory allows" in out) == (0, is_told)
+        following = out.split("next: ")[1].splitlines()[0]
+        assert following.endswith(" --device simulated:hand=none,damping=1")
 
 
 def test_a_device_is_closed_whatever_was_refused(
@@ -78,3 +80,8 @@ def test_a_device_is_closed_whatever_was_refused(
     for wrong in ("--axis q", "--damping nan"):
         assert call(*f"zwidth --measure {FREE} {wrong}".split())[0] == 2
     assert len(closed) == 2
+
+
+def test_a_delay_is_told_as_the_ticks_that_it_counts(call: Called) -> None:
+    assert "a delay of 140 µs counts as 1 tick\n" in call(*f"{ZWIDTH} --delay 0.00014".split())[2]
+    assert "counts as" not in call(*ZWIDTH.split())[2]

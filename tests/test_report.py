@@ -22,6 +22,7 @@ from report_runs import Made
 import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.parameters import DAMPER
@@ -29,7 +30,7 @@ from hapticbridge.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
 from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
-from hapticbridge.report.cause import Cause, likely_cause, what_would_do
+from hapticbridge.report.cause import Cause, likely_cause
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.page import (
     MAX_EVENTS,
@@ -237,7 +238,13 @@ def test_a_browser_shows_the_page_without_a_request_or_a_complaint(
         (report_runs.active_by_contact, "environment", "contact setting", 'solref "-20000 -50"'),
         (report_runs.active_by_rate, "device", "rate", "the coupling needs 5"),
         (report_runs.active_by_delay, "device", "delay", "2 ticks old"),
-        (report_runs.active_by_quantisation, "device", "quantisation", "0.45 N"),
+        # steps of its encoder too, but it has less damping than the coupling needs
+        (
+            report_runs.active_by_quantisation,
+            "device",
+            "rate",
+            "is 2 N s/m, the coupling needs 2.25",
+        ),
         (report_runs.active_by_mocap, "environment", "inputs", "'pusher' touched geom 'ball'"),
         (report_runs.active_beside_a_fan, "environment", "contact setting", "while geom 0 touched"),
         (report_runs.active_by_rotation, "device", "rate", "rotation: the device's damping"),
@@ -260,8 +267,6 @@ def test_a_run_is_active_for_the_cause_that_it_was_made_for(
 @pytest.mark.parametrize(
     ("run", "had", "has", "kind"),
     [
-        # friction enough to hold still between the steps of a coarse encoder
-        (report_runs.active_by_quantisation, '"friction": 0.0', '"friction": 0.5', "rate"),
         # swings over many steps of a fine one
         (report_runs.active_by_rate, '"resolution": 0.0', '"resolution": 1e-9', "rate"),
         (report_runs.active_by_rate, '"damping": 2.0', '"damping": 20.0', "unknown"),
@@ -274,6 +279,19 @@ def test_another_device_has_another_cause(
     assert had in recording.meta["device"]
     meta = recording.meta | {"device": recording.meta["device"].replace(had, has)}
     assert cause_of(recording, report, meta=meta).kind == kind
+
+
+def test_steps_of_the_encoder_are_the_cause_where_the_damping_suffices(made: Made) -> None:
+    recording, report = made(report_runs.active_by_quantisation)
+    evidence = evidence_of(recording)
+    borne = replace(evidence.worst.coupling, stiffness=3900.0)
+    evidence = replace(evidence, worst=replace(evidence.worst, coupling=borne))
+    cause = cause_by(evidence, report)
+    assert cause.kind == "quantisation"
+    assert "takes a friction of K D/2 + B_law D/T = 0.39 N" in cause.evidence
+    # friction enough to hold still between the steps of a coarse encoder
+    held = replace(evidence, info=replace(evidence.info, friction=0.5))
+    assert cause_by(held, report).kind == "unknown"
 
 
 def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -> None:
@@ -333,12 +351,12 @@ def test_a_fast_turn_without_contact_is_suspected_and_a_slow_one_is_not(made: Ma
 @pytest.mark.parametrize(
     ("run", "told"),
     [
-        # K <= 2 b/T with b = 2 N s/m and B' = 0; with K = 10000 T <= 2 b/K
-        (report_runs.active_by_rate, "lower the stiffness to 4000 N/m, or raise the rate to 2500"),
-        # K_r <= 2 b_r/T with 0.002 N m s/rad
-        (report_runs.active_by_rotation, "lower the rotational stiffness to 4 N m/rad, or raise"),
+        # with b = 85 % of 2 N s/m and B' = 0: K <= 2 b/T; with K = 10000 T <= 2 b/K
+        (report_runs.active_by_rate, "lower the stiffness to 3400 N/m, or raise the rate to 2950"),
+        # K_r <= 2 b_r/T with 85 % of 0.002 N m s/rad
+        (report_runs.active_by_rotation, "lower the rotational stiffness to 3.4 N m/rad, or raise"),
         # a wall behind two samples: K <= b/(T/2 + 2 T); a faster loop does not shorten a delay
-        (report_runs.active_by_delay, "lower the stiffness to 800 N/m"),
+        (report_runs.active_by_delay, "lower the stiffness to 680 N/m"),
     ],
 )
 def test_the_remedy_is_what_the_device_condition_asks_for(
@@ -351,23 +369,29 @@ def test_the_remedy_is_what_the_device_condition_asks_for(
     if run is report_runs.active_by_rate:  # no rate of the loop helps a device with its own
         sheet = recording.meta["device"].replace('"rate": null', '"rate": 500.0')
         slow = evidence_of(changed(recording, meta=recording.meta | {"device": sheet}))
-        assert what_would_do(slow) == "lower the stiffness to 2000 N/m"
+        assert remedy_of(slow).startswith("lower the stiffness to 1700 N/m, with a damping of")
 
 
 def test_a_damper_beyond_the_device_is_called_so_and_no_rate_is_asked_for(made: Made) -> None:
     recording, report = made(report_runs.active_by_rate)
     evidence = evidence_of(recording)
     for method, damping, kind, remedy in (
-        ("implicit", 1.9, "rate", "raise the rate to 2500 Hz"),  # T <= 2 (b - B)/K
-        ("implicit", 2.1, "damping", "lower the damping to 1.75 N s/m"),  # b - K T/2
-        ("lossless", 1.9, "damping", "lower the damping to 2 N s/m"),  # B = B' + K T/2 <= b
+        # with b = 85 % of 2 N s/m
+        ("implicit", 1.6, "rate", "raise the rate to 10000 Hz"),  # T <= 2 (b - B)/K
+        ("implicit", 1.9, "damping", "lower the damping to 0.7 N s/m"),  # b - K T/2
+        ("lossless", 1.9, "damping", "lower the damping to 1.7 N s/m"),  # B = B' + K T/2 <= b
     ):
-        coupling = replace(evidence.worst.coupling, stiffness=500.0, damping=damping)
+        coupling = replace(evidence.worst.coupling, stiffness=2000.0, damping=damping)
         worst = replace(evidence.worst, coupling=coupling)
         cause = cause_by(replace(evidence, worst=worst, method=method_named(method)), report)
         assert cause.kind == kind
         assert remedy in cause.remedy
         assert ("raise the rate" in cause.remedy) == (kind == "rate")
+
+
+def remedy_of(evidence: Evidence) -> str:
+    """Returns the changes that the condition on translation names."""
+    return run_conditions(evidence.info, evidence.worst, evidence.method)[0].remedy
 
 
 def test_remedies_start_from_the_stiffest_coupling_that_commands_selected(tmp_path: Path) -> None:
@@ -385,6 +409,6 @@ def test_remedies_start_from_the_stiffest_coupling_that_commands_selected(tmp_pa
     evidence = Evidence.of(read_recording(path))
     assert evidence is not None
     # b = 1 N s/m bears K T/2 up to 2000 N/m, and has borne the coupling at the start
-    assert (
-        what_would_do(evidence) == "lower the stiffness to 2000 N/m, or raise the rate to 2000 Hz"
+    assert remedy_of(evidence) == (  # with 15 % in reserve
+        "lower the stiffness to 1700 N/m, or raise the rate to 2360 Hz"
     )

@@ -335,8 +335,8 @@ def _decide_on_records(
     if excess is not None and not (active is not None and active[0] <= excess[0]):
         tick, joules = excess
         reason = (
-            f"from tick {tick} the device received {format_energy(joules)} more than its damping "
-            "dissipated and scene and coupling released"
+            f"until tick {tick} the hand got {format_energy(joules)} beyond what it put in, what "
+            "the device's damping burned, and what scene and coupling released"
         )
         other: Environment = "within slack" if unstrict else "strict"
         return Decision("active", other, reason, tick, "device", joules, energies.slack_share)

@@ -35,6 +35,7 @@ from hapticbridge.report import check_page_name, plot_recording, telling_time, w
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence, is_motion_prescribed
 from hapticbridge.sweep import Interrupted, Table
+from hapticbridge.timekeeping import NO_DAMPING
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
@@ -359,10 +360,7 @@ def _without_condition(path: Path) -> str:
     """Returns the reason why a device has no condition."""
     if all(is_motion_prescribed(hand.meta) for hand in open_hands(path)):
         return "the device feels no force, as its motion is prescribed: there is nothing to certify"
-    return (
-        "device not judged (b >= KT/2 + B_law): its damping b is unknown; 'hapticbridge identify' "
-        "measures it"
-    )
+    return f"device not judged (b >= KT/2 + B_law): {NO_DAMPING}"
 
 
 def _print_report(report: AuditReport) -> None:

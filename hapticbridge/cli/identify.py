@@ -8,14 +8,15 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 from rich.table import Table
 
-from hapticbridge.certificate import default_coupling, whole_ticks
+from hapticbridge.certificate import default_coupling, delay_ticks, whole_ticks
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
-from hapticbridge.device import AXES, open_device
+from hapticbridge.device import AXES, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.profile import Profile, own_folder
 from hapticbridge.errors import HapticBridgeError, choices
@@ -67,18 +68,23 @@ def nominal_period(result: Identification) -> float:
     return next(iter(result.runs.values())).period
 
 
-def coupling_of_run(result: Identification, profile: Profile) -> RunCoupling:
-    """Returns the coupling that a run chooses by itself with the profile of what was measured.
+def measured_sheet(result: Identification, profile: Profile) -> DeviceInfo:
+    """Returns the data sheet that a run uses with the profile of what was measured.
 
     What was measured before, or stated, gives way to it.
     """
     measured: dict[str, Any] = dict.fromkeys({*profile.quantities} & REPLACED)
-    period, info = nominal_period(result), profile.fill(replace(result.info, **measured))
+    return profile.fill(replace(result.info, **measured))
+
+
+def coupling_of_run(result: Identification, profile: Profile) -> RunCoupling:
+    """Returns the coupling that a run chooses by itself with the profile of what was measured."""
+    period, info = nominal_period(result), measured_sheet(result, profile)
     return RunCoupling.of(default_method(), period, default_coupling(info, period))
 
 
 def print_result(
-    result: Identification, z: ZWidth | None, coupling: RunCoupling, device: str
+    result: Identification, z: ZWidth | None, coupling: RunCoupling, device: str, info: DeviceInfo
 ) -> None:
     """Prints what was measured, how surely, and the coupling to use.
 
@@ -87,6 +93,7 @@ def print_result(
         z: What ``safe_width`` made of it.
         coupling: What ``coupling_of_run`` returned.
         device: The device as the user named it.
+        info: What ``measured_sheet`` returned.
     """
     for turns, units in ((False, ("kg", "N s/m", "N")), (True, ("kg m²", "N m s/rad", "N m"))):
         names = zip(("mass", "damping", "friction"), units, strict=True)
@@ -121,18 +128,39 @@ def print_result(
             )
     if left := [axis for axis in result.info.axes if axis not in result.fits]:
         out.print(f"not measured: {', '.join(left)}; a profile takes axes of a kind for alike")
+    out.print(_sheet_words(info, nominal_period(result)))
     if z is None:
         out.print(why_none(result))
         return
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
-        f"{z.limit[0]:.4g} N/m at B_law = 0 ({z.corner_limited_by})"
+        f"{z.limit[0]:.4g} N/m at B_law = 0 ({z.corner_limited_by}){_with_more_damping(z)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
     requested = coupling.requested
     if requested is not None:
         command = next_command(requested.stiffness, requested.damping, 1.0 / nominal_period(result))
         out.print(f"next: {plain(f'{command} --device {shlex.quote(device)}')}")
+
+
+def _sheet_words(info: DeviceInfo, period: float) -> str:
+    """Returns what a device class states of it, and as how many ticks its delay counts."""
+    known = {name: getattr(info, name) for name in ("mass", "damping", "friction", "delay")}
+    listed = ", ".join(f"{name}={each:.4g}" for name, each in known.items() if each is not None)
+    late = delay_ticks(info, period)
+    ticks = "" if late is None else f"; the delay counts as {late} tick{'s' * (late != 1)}"
+    return f"in a class of your own: DeviceInfo({listed}){ticks}"
+
+
+def _with_more_damping(z: ZWidth) -> str:
+    """Returns the largest safe stiffness where the coupling's damper raises it; or nothing.
+
+    Behind a delay the damper lowers what a wall asks of the device.
+    """
+    at = int(np.argmax(z.limit))
+    if z.limit[at] < 1.01 * z.limit[0]:
+        return ""
+    return f"; {z.limit[at]:.4g} N/m at B_law = {z.damping[at]:.3g} N s/m"
 
 
 def why_none(result: Identification) -> str:
@@ -241,10 +269,10 @@ class Identify:
         if self.as_json:
             print_json(facts(result, z, coupling, path))
         else:
-            print_result(result, z, coupling, self.device)
+            print_result(result, z, coupling, self.device, measured_sheet(result, profile))
         if path is not None:
-            _write(profile, path)
-            notify(f"wrote {path}")
+            kept = _write(profile, path)
+            notify(f"wrote {path}{kept and f'; the profile that was there is now {kept}'}")
         if self.plot is not None:
             write_figure(draw_identification(result), self.plot)
         if self.zwidth is not None and z is not None:
@@ -279,9 +307,14 @@ class Identify:
         return own_folder() / f"{'-'.join(filter(None, (profile.device, profile.serial)))}.toml"
 
 
-def _write(profile: Profile, path: Path) -> None:
+def _write(profile: Profile, path: Path) -> str:
+    """Writes a profile; returns where the file that it replaces was moved to, or nothing."""
+    former = ""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_file():
+            former = str(path.replace(path.with_name(f"{path.name}.old")))
         path.write_text(profile.to_toml(), encoding="utf-8")
     except OSError as error:
         raise HapticBridgeError(f"cannot write '{path}': {error.strerror}") from None
+    return former

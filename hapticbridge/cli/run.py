@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -68,12 +68,13 @@ if TYPE_CHECKING:
     from hapticbridge.view import Window
 
 
-def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
+def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: bool) -> None:
     """Prints the coupling and the device conditions that do not hold.
 
-    ``is_method_chosen`` is true if the user named the method.
+    ``given`` has the gains of the coupling that the user named, ``is_method_chosen`` is true if
+    they named the method.
     """
-    coupling, method, substeps = setup.coupling, setup.method, setup.substeps
+    method, substeps = setup.method, setup.substeps
     scene, device = escape(setup.scene.name), escape(setup.info.name)
     at = f" at '{escape(setup.scene.grip)}'" if setup.scene.has_several_hands else ""
     err.print(
@@ -81,7 +82,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         f"{method.contact} contacts"
     )
     held = is_always_implicit(setup.scene.model, setup.scene.grip)
-    rendered = RunCoupling.of(method, setup.timestep, coupling, is_always_implicit=held)
+    rendered = RunCoupling.of(method, setup.timestep, setup.coupling, is_always_implicit=held)
     scales = setup.workspace.scales
     for sentence in rendered.felt_at(setup.scene.grip, *scales).sentences(setup.info):
         err.print(f"  {sentence}")
@@ -102,15 +103,7 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
         err.print(f"[yellow]warning:[/yellow] {escape(method.hazard)}")
     if setup.scene_ticks:
         _announce_slow(setup)
-    attainable = setup.attainable
-    if not (
-        math.isclose(attainable.damping, coupling.damping)
-        and math.isclose(attainable.rotational_damping, coupling.rotational_damping)
-    ):
-        err.print(
-            f"  requested B = {coupling.damping:g} N s/m, B_r = {coupling.rotational_damping:g} "
-            f"N m s/rad: less than method {method.name} has at this stiffness and rate"
-        )
+    _announce_damping(setup, given)
     for sentence in _without_motor(setup):
         err.print(f"  {sentence}")
     reach = setup.guard.reach
@@ -122,11 +115,31 @@ def announce(setup: RunSetup, *, is_method_chosen: bool) -> None:
     if not method.has_law:
         return  # printed once the weld is measured: ``announce_measured``
     conditions = device_conditions(
-        setup.info, setup.law, setup.period, *scales, setup.law_evaluations, method
+        setup.info,
+        setup.law,
+        setup.period,
+        *scales,
+        setup.law_evaluations,
+        method,
+        setup.timestep,
     )
     for condition in conditions:
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
+
+
+def _announce_damping(setup: RunSetup, given: Mapping[str, float]) -> None:
+    """Says where the user named less damping than the method can render."""
+    for symbol, name, unit in (
+        ("B", "damping", "N s/m"),
+        ("B_r", "rotational_damping", "N m s/rad"),
+    ):
+        least = getattr(setup.attainable, name)
+        if name in given and given[name] < least * (1.0 - 1e-9):
+            err.print(
+                f"  requested {symbol} = {given[name]:g} {unit}: method {setup.method.name} has "
+                f"at least {least:.4g} at this stiffness and rate"
+            )
 
 
 def _announce_slow(setup: RunSetup) -> None:
@@ -295,9 +308,9 @@ class Run:
     device's grip axis moves. Scale, axes, limits and gains apply to every hand, --clutch and
     --dead-man to every real device. The method is 'implicit' or 'compensated'."""
     duration: float | None = None
-    """Duration in s; each missed deadline uses up one period of it. By default the run ends with
-    the device's motion, which a missed deadline delays; without an end of it with Ctrl-C, or after
-    5 s of --fast."""
+    """Duration in s; each missed deadline uses up one period of it. By default a recorded or
+    scripted motion is run to its end, which missed deadlines delay; any other device runs until
+    Ctrl-C, with --fast for 5 s."""
     record: Path | None = None
     """File to record to (.mcap)."""
     overwrite: bool = False
@@ -616,7 +629,7 @@ class Run:
                 window.on_hand = device.aim
         if not self.as_json:
             for setup in bridge.setups:
-                announce(setup, is_method_chosen=self.method is not None)
+                announce(setup, self._gains(), is_method_chosen=self.method is not None)
         with err.status("preparing (the first run on a machine compiles for about a minute) …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short

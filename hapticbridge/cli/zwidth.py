@@ -13,6 +13,7 @@ from rich.table import Table
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import (
+    NEEDED_SHARE,
     DampingCondition,
     delay_ticks,
     device_conditions,
@@ -25,11 +26,11 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.errors import HapticBridgeError, choices
-from hapticbridge.identify.z_width import MeasuredWidth, measure_width, measured_points
+from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.theory.bounds import largest_effective_damping, law_damping
+from hapticbridge.theory.bounds import STIFFNESS_MARGIN, largest_effective_damping, law_damping
 from hapticbridge.theory.transfer import MAX_DELAY, scalar
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (
@@ -40,6 +41,7 @@ from hapticbridge.theory_plots import (
     recommended,
     recommended_coupling,
 )
+from hapticbridge.units import format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
 
@@ -102,6 +104,11 @@ class Zwidth:
             measured = None
             if device is not None:
                 clock = RealClock() if device.info.is_real else SimulatedClock()
+                if device.info.is_real:
+                    notify(
+                        f"about 15 walls at each of {len(SHARES)} dampings are tried: 2 to 3 "
+                        "minutes, longer at a slow swing"
+                    )
                 with interrupting_on_signals(), progress("measuring") as show:
                     measured = measure_width(device, clock, z, axis=axis, progress=show)
         finally:
@@ -110,6 +117,8 @@ class Zwidth:
         # the run command has no low-pass to offer, and without it this corner is not passive
         coupling = recommended(z)
         command = next_command(coupling.stiffness, coupling.damping, self.rate)
+        if self.measure is not None:
+            command += f" --device {shlex.quote(self.measure)}"
         next_step = None if z.filter_time else command
         if self.as_json:
             print_json(_z_width_facts(z, next_step) | _measured_facts(measured))
@@ -150,6 +159,9 @@ class Zwidth:
         delay = whole_ticks(
             _ARGUMENTS.number("--delay", self.delay, "s", least=0, most=MAX_DELAY * period), period
         )
+        if delay:
+            ticks = "1 tick" if delay == 1 else f"{delay} ticks"
+            notify(f"a delay of {format_si(self.delay, 's')} counts as {ticks}")
         if info is not None:
             numbers = {
                 name: getattr(info, name) if value is None else value
@@ -209,7 +221,9 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
-    out.print(f"use {sentence}: 80 % of the limit at a quarter of its damping")
+    at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
+    of = f"{safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    out.print(f"use {sentence}: 80 % of the {of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"
@@ -390,18 +404,23 @@ class Bound:
             return
         needed = ways[0].needed
         if b >= needed:
-            out.print(f"device damping {b:g} >= {needed:.4g} N s/m: passive in any hand")
-            out.print(f"it bears any K up to {2 * b / period:.4g} N/m with any B up to {b:g} N s/m")
+            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand")
+            out.print(
+                f"method {method.name} needs the larger of KT/2 and B: any K up to "
+                f"{2 * b / period:g} N/m beside any B up to {b:g} N s/m"
+            )
             command = next_command(self.stiffness, max(self.damping, least), self.rate)
             if self.device is not None:
                 command += f" --device {shlex.quote(self.device)}"
             out.print(f"next: {plain(command)}")
             return
-        out.print(f"device damping {b:g} < {needed:.4g} N s/m: [red]not passive in any hand[/]")
+        out.print(f"device damping {b:g} < {needed:g} N s/m: [red]not passive in any hand[/]")
         self._print_remedies(b, needed, period)
 
     def _print_remedies(self, b: float, needed: float, period: float) -> None:
         lag, changes = default_method().compensated_share, []
+        b *= NEEDED_SHARE
+        needed /= NEEDED_SHARE
         if law_damping(self.stiffness, self.damping, period, lag) > 0:
             stiffness = min(self.stiffness, 2 * b / period)
             most = largest_effective_damping(b, stiffness, period, lag)
@@ -409,6 +428,7 @@ class Bound:
         if self.stiffness * period > 2 * b:
             changes.append(f"lower the stiffness to {2 * b / period:.4g} N/m")
             changes.append(f"raise the rate to {self.stiffness / (2 * b):.4g} Hz")
+        out.print("with 15 % in reserve:")
         if len(changes) == 3:
             out.print(f"  {changes[0]}, and {changes[1]} or {changes[2]}, or")
         else:

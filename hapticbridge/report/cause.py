@@ -6,7 +6,6 @@ import math
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Literal
 
 import mujoco
@@ -18,6 +17,7 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.certificate import (
+    NEEDED_SHARE,
     DampingCondition,
     delay_ticks,
     device_period,
@@ -83,82 +83,6 @@ def window_before(evidence: Evidence, report: AuditReport) -> slice | None:
     return slice(max(0, begin), report.tick + 1)
 
 
-# Stiffness, damping or rate that a device would bear
-
-HALVINGS = 40
-"""Number of bisections of a limit; the printed three digits need a third of them."""
-
-FASTEST = 20_000.0
-"""Largest rate in Hz that is proposed; loops of this package reach no higher one."""
-
-
-def what_would_do(evidence: Evidence, *, is_late: bool = False) -> str:
-    """Returns changes that satisfy the device condition, as a user would type them.
-
-    Stiffness and damping are the requested ones, not the law's. Each is changed alone; a change
-    that does not help alone is left out. A faster loop is no remedy for a delay (``is_late``). The
-    device's damping must be known.
-    """
-    found = []
-    for axis, units in _SETTING_UNITS.items():
-        if _holds(evidence, axis, "period", 1.0):
-            continue
-        name = axis.replace(" ", "_")
-        for part, unit in zip(("stiffness", "damping"), units, strict=True):
-            share = _largest(partial(_holds, evidence, axis, part))
-            if share:
-                value = share * getattr(evidence.requested, f"{name}{part}")
-                limit = _three_digits((1 + _ROUNDING) * value, math.floor)
-                found.append(f"lower the {axis}{part} to {limit} {unit}")
-    period = evidence.parameters.period
-    slowest = period * FASTEST
-    if not is_late and evidence.info.rate is None and slowest > 1:
-        share = min(_largest(partial(_holds, evidence, axis, "period")) for axis in _SETTING_UNITS)
-        if share and 1 / share < slowest:
-            rate = _three_digits((1 - _ROUNDING) / (share * period), math.ceil)
-            found.append(f"raise the rate to {rate} Hz")
-    return ", or ".join(found) or "lower stiffness and damping together"
-
-
-_SETTING_UNITS = {"": ("N/m", "N s/m"), "rotational ": ("N m/rad", "N m s/rad")}
-_ROUNDING = 1e-9  # relative; keeps a limit found by bisection from losing a digit
-
-
-def _holds(evidence: Evidence, axis: str, part: str, share: float) -> bool:
-    """Returns True if the condition on a kind of axis holds after one quantity is reduced.
-
-    ``axis`` is a key of ``_SETTING_UNITS``. ``part`` (``stiffness``, ``damping`` or ``period``) is
-    reduced to ``share`` of its value.
-    """
-    worst, requested, method = evidence.worst, evidence.requested, evidence.method
-    period = worst.period * (share if part == "period" else 1.0)
-    if part != "period":
-        name = f"{axis.replace(' ', '_')}{part}"
-        requested = replace(requested, **{name: share * getattr(requested, name)})
-    changed = replace(worst, period=period)
-    changed = replace(changed, coupling=method.law_coupling(requested, changed.timestep))
-    kind = "rotation" if axis else "translation"
-    conditions = run_conditions(evidence.info, changed, method)
-    return all(c.holds is not False for c in conditions if c.axis == kind)
-
-
-def _largest(holds: Callable[[float], bool]) -> float:
-    """Returns the largest share in (0, 1) up to which all shares hold; 0 if none does."""
-    low, high = 0.0, 1.0
-    if not holds(1e-6):
-        return 0.0
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low
-
-
-def _three_digits(value: float, rounded: Callable[[float], int]) -> str:
-    """Formats a limit, rounded down or up."""
-    digit = 10.0 ** (math.floor(math.log10(value)) - 2)
-    return f"{rounded(value / digit) * digit:.6g}"
-
-
 # Causes of unpaid energy at the device
 
 COUNTED = 2.0
@@ -179,13 +103,12 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
     failing = [condition for condition in conditions if condition.holds is False]
     if found := _delay_cause(evidence, failing):
         return found
-    if not failing and (found := _timing_cause(evidence, window)):
-        return found
-    if counts := _quantisation_words(evidence, window):
-        others = f", or {what_would_do(evidence)}" if failing else ""
-        return Cause("quantisation", counts, f"take a finer encoder or more friction{others}")
     if failing:
         return _overload_cause(evidence, failing)
+    if found := _timing_cause(evidence, window):
+        return found
+    if counts := _quantisation_words(evidence, window):
+        return Cause("quantisation", counts, "take a finer encoder or more friction")
     return _method_cause(method) if method.hazard else _unknown_cause(evidence)
 
 
@@ -199,6 +122,10 @@ def _failing_words(failing: list[DampingCondition]) -> str:
         f"{c.needed:.4g}"
         for c in failing
     )
+
+
+def _remedies(failing: list[DampingCondition]) -> str:
+    return "; and ".join(condition.remedy for condition in failing)
 
 
 _UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
@@ -218,7 +145,7 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
         "delay",
         f"{prompt:.3g} N s/m of damping would bear the coupling without delay, the device has "
         f"{own:.3g}; its samples are {late} ticks old; {_failing_words(failing)}",
-        f"shorten the delay, or {what_would_do(evidence, is_late=True)}",
+        f"shorten the delay, or {_remedies(failing)}",
     )
 
 
@@ -226,14 +153,14 @@ def _overload_cause(evidence: Evidence, failing: list[DampingCondition]) -> Caus
     """Returns too stiff a spring for the rate, or too strong a damper, as the cause."""
     worst, own = evidence.worst, evidence.info.damping or 0.0
     damper = worst.scale * worst.force_scale * evidence.requested.damping
-    if failing[0].axis == "translation" and damper >= own:
+    if failing[0].axis == "translation" and damper > NEEDED_SHARE * own:
         return Cause(
             "damping",
             f"{_failing_words(failing)}; its damper alone needs {damper:.4g} at any rate",
-            what_would_do(evidence),
+            _remedies(failing),
         )
     return Cause(
-        "rate", f"{_failing_words(failing)}: it is too stiff for its rate", what_would_do(evidence)
+        "rate", f"{_failing_words(failing)}: it is too stiff for its rate", _remedies(failing)
     )
 
 
