@@ -369,4 +369,4 @@ def test_a_run_names_what_is_missing(call: Called, monkeypatch: pytest.MonkeyPat
     code, out, _ = call("devices")
     assert code == 0
     assert f"Racing Wheel (046d:c24f) at {PATH}" in out
-    assert "run peg_in_hole --device wheel:max_torque=NM --force-limit 2" in out
+    assert "identify wheel:max_torque=NM" in out

@@ -319,9 +319,12 @@ def take_handle_frames(s: State) -> None:
 
 
 @compiled
-def turns_actuators_alone(mj: Part) -> bool:
-    """Returns True if in MuJoCo's velocity stage only those actuators depend on the handle."""
-    return bool(mj.is_handle_alone != 0 and mj.held_qpos == 0)
+def turns_actuators_alone(s: State) -> bool:
+    """Returns True if in MuJoCo's velocity stage only those actuators depend on the handle.
+
+    Springs of the tool's joints and tendons change their form with it (``kernel.springs``).
+    """
+    return bool(s.mj.is_handle_alone != 0 and s.mj.held_qpos == 0 and s.springs.count == 0)
 
 
 @compiled

@@ -341,7 +341,7 @@ def take_handle_in(s: State) -> None:
     take_handle_frames(s)
     if mj.nsensor > 0:
         mj_sensor_pos(mj.model, mj.data)
-    if turns_actuators_alone(mj):
+    if turns_actuators_alone(s):
         take_actuator_velocities(mj)
     else:
         take_velocities(s)
@@ -568,7 +568,7 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     if has_positions and not is_sound(s):
         loop.has_positions = 0
     end_tick(s, row)
-    if loop.has_positions and turns_actuators_alone(s.mj):
+    if loop.has_positions and turns_actuators_alone(s):
         take_velocities(s)
     return OK
 
