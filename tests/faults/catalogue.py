@@ -690,7 +690,7 @@ FAULTS = (
     Fault("MuJoCo warns: bad velocity", filled("qvel", 2e10), "trip", "diverged"),
     Fault("MuJoCo warns: bad acceleration", filled("qfrc_applied", 1e15), "trip", "diverged"),
     Fault("scene diverges", filled("qvel", np.nan), "trip", "diverged"),
-    Fault("motor drives the tool", _motor, "trip", "more energy", NO_TRIPS, cause=PUSHED),
+    Fault("motor drives the tool", _motor, "trip", "more than it put in", NO_TRIPS, cause=PUSHED),
     Fault("10 x too stiff, free", stiff(10, None), "slips", "", UNGUARDED),
     Fault("10 x too stiff, in a hand", stiff(10, DEFAULT_HAND), "slips"),
     Fault("edge of the workspace", _edge, "fades", within=150),
