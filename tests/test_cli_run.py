@@ -400,7 +400,7 @@ def test_a_signal_at_any_moment_of_start_up_leaves_neither_file_nor_process(
         code, _, err = call(*run, "--record", path)
         is_over.set()
         thread.join(PATIENCE)
-        assert children(os.getpid()) == before
+        assert set(children(os.getpid())) <= set(before)
         assert not any(map(np.any, device.writes))
         if code in {0, 1}:  # it ran
             assert len(read_recording(path).ticks) > 0 and device.is_closed
