@@ -401,7 +401,7 @@ class Summary:
             yield f"device not certified: {kept.fault}"
             return
         if self.is_certified is None and not self.conditions:
-            yield f"device not judged: {NO_DAMPING}"
+            yield f"device not judged: {NO_DAMPING}{kept.slowness}"
             return
         yield kept.device_words(self.is_certified, has_pushed=self._has_pushed)
         if not self.is_certified:

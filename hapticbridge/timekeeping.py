@@ -154,6 +154,11 @@ MANY_KEPT = 0.95
 A virtual machine is stopped by its host now and then, and nothing inside it helps."""
 
 
+SPARSE = 0.75
+"""Share of ticks with a new sample below which the device is said to be slower than the loop; no
+unit. Two clocks of one rate that drift past each other repeat fewer."""
+
+
 @dataclass(frozen=True, slots=True)
 class Timekeeping:
     """Time that a run kept, and the device condition at this time.
@@ -177,6 +182,7 @@ class Timekeeping:
         scene_speed: Share of them that it gave, 0 to 1.
         scene_silence: Longest time in s without a new one.
         silence: Longest silence of the device, in a sentence; empty if no force faded for it.
+        sample_rate: New samples per second of a device slower than the loop; 0 for another.
     """
 
     rate: float
@@ -196,6 +202,7 @@ class Timekeeping:
     scene_speed: float
     scene_silence: float
     silence: str
+    sample_rate: float
 
     @classmethod
     def from_times(
@@ -225,6 +232,7 @@ class Timekeeping:
             scene_speed=_scene_speed(times, parameters.scene_ticks),
             scene_silence=times.scene_silence,
             silence=silence_sentence(times, parameters),
+            sample_rate=_sample_rate(times, parameters.period),
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
@@ -241,8 +249,10 @@ class Timekeeping:
             limit = f", but {MOTORS_PUSHED}" if has_pushed else ""
             return f"device certified{self.clause}: b >= {self._bound}{limit}"
         if verdict is None:
-            return f"device not judged: {self._unproved}"
-        return f"device not certified: {self.refutation or f'b < {self._bound}'}"
+            return f"device not judged: {self._unproved}{self.slowness}"
+        if self.refutation:
+            return f"device not certified: {self.refutation}"
+        return f"device not certified: b < {self._bound}{self.slowness}"
 
     @property
     def _unproved(self) -> str:
@@ -314,7 +324,18 @@ class Timekeeping:
     @property
     def remedy(self) -> str:
         """Changes that help a run to keep its time."""
-        return _remedy(is_realtime=self.is_realtime)
+        return _remedy(is_realtime=self.is_realtime, sample_rate=self.sample_rate)
+
+    @property
+    def slowness(self) -> str:
+        """Clause on a device whose samples come more seldom than it can bear; or empty."""
+        if not self.sample_rate or self.silence or self.is_kept:
+            return ""
+        return (
+            f"; the device gave new samples at {self.sample_rate:.3g} Hz; in the ticks between "
+            "them the handle slips toward the tool, so that the hand feels less force: try "
+            f"{self.remedy}"
+        )
 
     @property
     def hint(self) -> str:
@@ -353,7 +374,7 @@ class Timekeeping:
             )
         if self.silence and self.share >= MANY_KEPT:
             return f"{NOT_KEPT}: {self.silence}; check its link and its power ({found})"
-        return f"{NOT_KEPT}: {found}; try {self.remedy}"
+        return f"{NOT_KEPT}: {found}{self.slowness or f'; try {self.remedy}'}"
 
 
 def _scene_speed(times: RunTimes, ticks: int) -> float:
@@ -362,7 +383,15 @@ def _scene_speed(times: RunTimes, ticks: int) -> float:
     return min(times.scene_steps / due, 1.0) if due > 0 else 1.0
 
 
-def _remedy(*, is_realtime: bool) -> str:
+def _sample_rate(times: RunTimes, period: float) -> float:
+    """Returns the new samples per second in Hz of a device slower than the loop; 0 for another."""
+    is_sparse = times.ticks and times.fresh * times.due < SPARSE * times.ticks
+    return times.fresh / period if is_sparse else 0.0
+
+
+def _remedy(*, is_realtime: bool, sample_rate: float) -> str:
+    if sample_rate:
+        return f"--rate {sample_rate:.3g} with the stiffness left to the run"
     request = "" if is_realtime else "--realtime, "
     return (
         f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "
@@ -389,5 +418,8 @@ def _at_times(
         )
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
-        return replace(at_times, remedy=_remedy(is_realtime=times.is_realtime))
+        sample_rate = _sample_rate(times, parameters.period)
+        return replace(
+            at_times, remedy=_remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
+        )
     return at_times

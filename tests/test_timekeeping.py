@@ -374,6 +374,49 @@ def test_samples_that_are_not_new_count_as_missed_deadlines(tmp_path: Path) -> N
     assert report.exit_code == 1
 
 
+def pressed(tick: int) -> tuple[float, ...]:
+    """Returns the poses of a hand that goes 2 mm into a wall 1 cm away, in 0.8 s."""
+    return (1.5e-5 * min(tick, 800), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("damping", [2.0, None], ids=["not certified", "not judged"])
+def test_a_device_slower_than_the_loop_feels_weak_and_gets_the_rate_that_mends_it(
+    damping: float | None, tmp_path: Path, call: Called
+) -> None:
+    def run(path: Path, ticks_per_sample: int, **options: float) -> Summary:
+        scale = 4 if options else 1
+        device = ScriptedDevice(
+            lambda tick: pressed(scale * tick),
+            is_stale=lambda tick: tick % ticks_per_sample != 0,
+            damping=damping,
+        )
+        coupling = Coupling(1500.0, 0.5)
+        with fast("virtual_wall", device, recording=path, coupling=coupling, **options) as bridge:
+            return bridge.run(1.0)
+
+    slow, usual = run(tmp_path / "slow.mcap", 4), run(tmp_path / "usual.mcap", 1)
+    mended = run(tmp_path / "mended.mcap", 1, rate=250.0)
+    assert slow.peak_force < 0.1 * usual.peak_force
+    assert mended.peak_force == pytest.approx(usual.peak_force, rel=0.1)
+    words = "new samples at 250 Hz; in the ticks between them the handle slips"
+    for name, summary in (("slow", slow), ("usual", usual), ("mended", mended)):
+        _, out, _ = call("audit", tmp_path / f"{name}.mcap")
+        for text in (str(summary), " ".join(out.split())):
+            assert text.count(words) == text.count("try --rate 250 with") == (name == "slow")
+
+
+def test_a_slow_device_that_bears_the_coupling_is_not_weakened_and_hears_nothing() -> None:
+    peaks = []
+    for every in (1, 4):
+        device = ScriptedDevice(pressed, is_stale=lambda tick, n=every: tick % n != 0)  # type: ignore[misc]
+        with fast("virtual_wall", device, coupling=Coupling(400.0, 0.5)) as bridge:
+            summary = bridge.run(1.0)
+        peaks.append(summary.peak_force)
+        assert "the handle slips" not in str(summary)
+        assert summary.is_certified
+    assert peaks[1] == pytest.approx(peaks[0], rel=0.05)
+
+
 def test_a_run_that_the_guard_stopped_is_not_certified(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with (

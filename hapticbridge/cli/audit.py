@@ -383,7 +383,8 @@ def _print_report(report: AuditReport) -> None:
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
     if not report.conditions and report.verdict != "invalid":
-        out.print(f"  {_without_condition(report.path)}")
+        slowness = kept.slowness if kept is not None else ""
+        out.print(f"  {_without_condition(report.path)}{slowness}")
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified, has_pushed=report.has_pushed)}")
     if report.is_cut:
