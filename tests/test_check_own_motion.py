@@ -6,6 +6,7 @@ from pathlib import Path
 
 from cli_cases import Called
 
+from hapticbridge.check.case import open_case
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import (
     NO_HAND,
@@ -14,8 +15,10 @@ from hapticbridge.check.own_motion import (
     own_motion,
     own_substeps,
 )
+from hapticbridge.check.run_faults import own_motion_faults
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.scene import SceneSource, compile_scene, read_scene
+from hapticbridge.scene.checks import first_pump
 
 PERIOD = 1e-3
 SWING = """<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 0"/><worldbody>
@@ -64,6 +67,16 @@ def test_a_swing_that_the_file_damps_by_its_own_step_is_seen(tmp_path: Path) -> 
     assert "--substeps" in found.remedy(Setting(NO_HAND, 0.01, contact="scene"))
     for step in (0.0002, 0.001):
         assert moved(scene(tmp_path, SWING.format(step=step, integrator="RK4"))).jnd < 0.1
+
+
+def test_beside_a_pump_only_the_pump_is_told(tmp_path: Path) -> None:
+    swing = SWING.format(step=0.01, integrator="implicitfast")
+    pump = '<body pos="1 0 0"><joint type="slide" damping="{}"/><geom size=".02" mass="1"/></body>'
+    for damping, kinds in ((0.5, {"own motion"}), (-0.5, set())):
+        text = swing.replace("</worldbody>", pump.format(damping) + "</worldbody>")
+        case = open_case(scene(tmp_path, text.replace('qpos="0.02"', 'qpos="0.02 0"')))
+        assert {fault.kind for fault in own_motion_faults(case)} == kinds
+        assert (first_pump(case.model) is None) == bool(kinds)
 
 
 STICK = """<mujoco><option timestep="0.002"/><worldbody><geom type="plane" size="1 1 .1"/>

@@ -312,7 +312,7 @@ def test_page_says_who_is_ahead_of_the_default_by_how_much_and_what_it_takes() -
     assert "the default, lossless, 1 ms, is on the front" in standing(own)
     ahead = made_up(0.005, 0.2, method="explicit", verdict="within slack")
     text = standing([*own, ahead])
-    assert "Ahead: explicit, 1 ms. The best has 1/2 of its error at 1/2 of its cost" in text
+    assert "Ahead: explicit, 1 ms. The best has 50 % of its error at 50 % of its cost" in text
     assert "a light tool diverges" in text
     # its error falls with the square of the step
     assert text.endswith("'lossless' reaches that error at a period of 0.71 ms.")

@@ -294,6 +294,30 @@ def test_force_of_a_motor_is_not_taken_for_weight(tmp_path: Path) -> None:
         assert not bridge.scene.is_carried  # 15 N at an arm of 0.1 m, with or without gravity
 
 
+LIFT = """<mujoco><worldbody><body><joint name="lift" type="slide" axis="0 0 1" damping="20" {}/>
+<geom size="0.02" mass="{}"/><site name="grip"/></body></worldbody>
+<actuator><motor joint="lift"/></actuator>
+<keyframe><key name="home" ctrl="{}"/></keyframe></mujoco>"""
+"""A tool that can go up and down, with a spring and a motor."""
+
+
+@pytest.mark.parametrize(
+    ("spring", "mass", "motor", "is_carried"),
+    [
+        ("", 0.6, -6.0, False),  # without the motor, the device holds the weight of 6 N
+        ('stiffness="100" springref="-0.15"', 0.1, 0.0, False),  # the spring pulls with 15 N
+        ("", 1.2, -2.0, True),  # the weight alone is 12 N
+    ],
+    ids=["motor", "spring", "weight"],
+)
+def test_what_is_carried_is_the_weight_not_a_push(
+    tmp_path: Path, spring: str, mass: float, motor: float, *, is_carried: bool
+) -> None:
+    """The simulated device holds 10 N."""
+    with started(tmp_path, LIFT.format(spring, mass, motor)) as bridge:
+        assert bridge.scene.is_carried == is_carried
+
+
 @pytest.mark.parametrize(
     ("mass", "end", "is_carried"), [(5.0, 0.6, True), (0.5, 0.6, False), (5.0, -0.6, False)]
 )

@@ -189,12 +189,13 @@ def standing(points: Sequence[Measurement]) -> str:
             "passive point errs less at its cost."
         )
     best = min(ahead, key=lambda each: each.score.jnd)
-    error, cost = default.score.jnd / best.score.jnd, default.cost.median / best.cost.median
+    error, cost = best.score.jnd / default.score.jnd, best.cost.median / default.cost.median
     but = f"; but {best.setting.method.hazard}" if best.setting.method.hazard else ""
     names = ", ".join(dict.fromkeys(each.setting.label for each in ahead))
     return (
         f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is not on the front. Ahead: "
-        f"{names}. The best has 1/{error:.2g} of its error at 1/{cost:.2g} of its cost{but}. "
+        f"{names}. The best has {100 * error:.2g} % of its error at {100 * cost:.0f} % of its cost"
+        f"{but}. "
         f"{_period_words(points, best.score.jnd)}"
     )
 
