@@ -428,10 +428,11 @@ class Summary:
         ledger = Ledger.from_state(state)
         conditions = run_conditions(info, parameters, method)
         timing = state["timing"][0]
-        due = outcome.ticks + outcome.skipped
+        due, new = outcome.ticks + outcome.skipped, int(state["guard"]["fresh"][0])
         times = RunTimes(
             ticks=outcome.ticks,
-            fresh=fresh_share(info, parameters.period, int(state["guard"]["fresh"][0]), due),
+            fresh=fresh_share(info, parameters.period, new, due),
+            new_samples=new,
             due=due,
             mean_delay=float(timing["delays"]) / max(outcome.ticks, 1),
             mean_jitter=float(timing["jitter"]) / max(outcome.ticks, 1),

@@ -86,6 +86,7 @@ class RunTimes:
         delay_energy: Largest energy in J that delays may have given to the hand.
         is_realtime: True if real time was requested from the system.
         fresh: Share of the samples due that were new, 0 to 1.
+        new_samples: Number of ticks with a new sample.
         flags: Combined flags of the records, or of the watch alone.
         has_tripped: True if the guard stopped the run.
         scene_steps: Results that a scene slower than the loop has given.
@@ -101,6 +102,7 @@ class RunTimes:
     mean_jitter: float
     delay_energy: float
     is_realtime: bool
+    new_samples: int
     flags: int = 0
     has_tripped: bool = False
     scene_steps: int = 0
@@ -211,7 +213,11 @@ class Timekeeping:
         """Judges the times of a run by its device conditions; none for a run without a law."""
         share = times.ticks / times.due if times.due > times.ticks else 1.0
         least = min(share, times.fresh)
-        late = tuple(_at_times(each, parameters, least, times) for each in conditions)
+        silence = silence_sentence(times, parameters)
+        is_felt = parameters.has_law and (not conditions or any(c.is_felt for c in conditions))
+        sample_rate = _sample_rate(times, parameters.period, bool(silence)) if is_felt else 0.0
+        remedy = _remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
+        late = tuple(_at_times(each, parameters, least, times, remedy) for each in conditions)
         verdicts = [each.holds for each in late if each.available is not None]
         is_borne = bool(verdicts) and all(each.holds is not False for each in conditions)
         return cls(
@@ -231,8 +237,8 @@ class Timekeeping:
             scene_rate=1.0 / parameters.scene_period if parameters.scene_ticks else None,
             scene_speed=_scene_speed(times, parameters.scene_ticks),
             scene_silence=times.scene_silence,
-            silence=silence_sentence(times, parameters),
-            sample_rate=_sample_rate(times, parameters.period),
+            silence=silence,
+            sample_rate=sample_rate,
         )
 
     def certified(self, verdict: bool | None) -> bool | None:
@@ -252,7 +258,7 @@ class Timekeeping:
             return f"device not judged: {self._unproved}{self.slowness}"
         if self.refutation:
             return f"device not certified: {self.refutation}"
-        return f"device not certified: b < {self._bound}{self.slowness}"
+        return f"device not certified: b < {self._bound}"
 
     @property
     def _unproved(self) -> str:
@@ -329,10 +335,10 @@ class Timekeeping:
     @property
     def slowness(self) -> str:
         """Clause on a device whose samples come more seldom than it can bear; or empty."""
-        if not self.sample_rate or self.silence or self.is_kept:
+        if not self.sample_rate or self.is_kept:
             return ""
         return (
-            f"; the device gave new samples at {self.sample_rate:.3g} Hz; in the ticks between "
+            f"; the device gave new samples at {self.sample_rate:.0f} Hz; in the ticks between "
             "them the handle slips toward the tool, so that the hand feels less force: try "
             f"{self.remedy}"
         )
@@ -372,7 +378,7 @@ class Timekeeping:
                 "late samples and forces may have given the hand "
                 f"{format_si(self.delay_energy, 'J')}, more than {format_si(INSTANT, 'J')}"
             )
-        if self.silence and self.share >= MANY_KEPT:
+        if self.silence and self.share >= MANY_KEPT and not self.sample_rate:
             return f"{NOT_KEPT}: {self.silence}; check its link and its power ({found})"
         return f"{NOT_KEPT}: {found}{self.slowness or f'; try {self.remedy}'}"
 
@@ -383,15 +389,22 @@ def _scene_speed(times: RunTimes, ticks: int) -> float:
     return min(times.scene_steps / due, 1.0) if due > 0 else 1.0
 
 
-def _sample_rate(times: RunTimes, period: float) -> float:
-    """Returns the new samples per second in Hz of a device slower than the loop; 0 for another."""
-    is_sparse = times.ticks and times.fresh * times.due < SPARSE * times.ticks
-    return times.fresh / period if is_sparse else 0.0
+def _sample_rate(times: RunTimes, period: float, was_silent: bool) -> float:
+    """Returns the new samples per second in Hz of a device slower than the loop; 0 for another.
+
+    A silence for which the force faded does not count. Where many deadlines were missed, the loop
+    was slow.
+    """
+    heard = times.due * period - (times.silence if was_silent else 0.0)
+    is_late = times.ticks < MANY_KEPT * times.due
+    if is_late or times.fresh * times.due * period >= SPARSE * heard:
+        return 0.0
+    return times.new_samples / heard
 
 
 def _remedy(*, is_realtime: bool, sample_rate: float) -> str:
     if sample_rate:
-        return f"--rate {sample_rate:.3g} with the stiffness left to the run"
+        return f"--rate {sample_rate:.0f} with the stiffness left to the run"
     request = "" if is_realtime else "--realtime, "
     return (
         f"{request}a lower --stiffness, a lower --rate with the stiffness left to the run, or what "
@@ -400,7 +413,11 @@ def _remedy(*, is_realtime: bool, sample_rate: float) -> str:
 
 
 def _at_times(
-    condition: DampingCondition, parameters: RunParameters, share: float, times: RunTimes
+    condition: DampingCondition,
+    parameters: RunParameters,
+    share: float,
+    times: RunTimes,
+    remedy: str,
 ) -> DampingCondition:
     """Returns a device condition at a run's share of deadlines kept and mean times."""
     if not condition.is_felt:
@@ -418,8 +435,5 @@ def _at_times(
         )
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
-        sample_rate = _sample_rate(times, parameters.period)
-        return replace(
-            at_times, remedy=_remedy(is_realtime=times.is_realtime, sample_rate=sample_rate)
-        )
+        return replace(at_times, remedy=remedy)
     return at_times

@@ -405,6 +405,46 @@ def test_a_device_slower_than_the_loop_feels_weak_and_gets_the_rate_that_mends_i
             assert text.count(words) == text.count("try --rate 250 with") == (name == "slow")
 
 
+PERIODS = 1000
+"""Deadlines of the runs below."""
+
+
+@pytest.mark.parametrize(
+    ("ticks", "new", "silence", "rate"),
+    [
+        (1000, 250, 0.004, 250.0),  # every fourth tick
+        (1000, 800, 0.002, 0.0),
+        (500, 250, 0.004, 0.0),  # the loop itself was slow
+        (1000, 500, 0.5, 0.0),  # prompt, but for one silence
+        (1000, 240, 0.06, 255.0),  # slow, and silent once
+    ],
+)
+def test_who_was_slow_is_told_by_what_came(
+    ticks: int, new: int, silence: float, rate: float
+) -> None:
+    with fast(
+        "point_mass", ScriptedDevice(sway, damping=B), coupling=Coupling(3000.0, 0.4)
+    ) as bridge:
+        bridge.run(0.01)
+        parameters, kept = bridge.session.parameters, bridge.summary().timekeeping
+    times = timekeeping.RunTimes(
+        ticks=ticks,
+        fresh=new / PERIODS,
+        new_samples=new,
+        due=PERIODS,
+        mean_delay=0.0,
+        mean_jitter=0.0,
+        delay_energy=0.0,
+        is_realtime=True,
+        silence=silence,
+    )
+    found = timekeeping.Timekeeping.from_times(times, parameters, kept.in_time)
+    assert found.sample_rate == pytest.approx(rate, abs=1.0)
+    assert bool(found.slowness) == bool(rate)
+    unfelt = [replace(each, is_felt=False) for each in kept.in_time]
+    assert not timekeeping.Timekeeping.from_times(times, parameters, unfelt).slowness
+
+
 def test_a_slow_device_that_bears_the_coupling_is_not_weakened_and_hears_nothing() -> None:
     peaks = []
     for every in (1, 4):

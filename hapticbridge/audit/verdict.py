@@ -463,9 +463,10 @@ def _joined(of_hands: Sequence[dict[str, Any]], recordings: Sequence[RecordingFi
     found["certified"] = worst_verdict(certified)
     margins = [own["damping_margin"] for own in of_hands if own["damping_margin"] is not None]
     found["damping_margin"] = min(margins, default=None)
-    worst = certified.index(found["certified"])
-    if "timekeeping" in of_hands[worst]:
-        found["timekeeping"] = of_hands[worst]["timekeeping"]
+    worst = [own for own in of_hands if own["certified"] == found["certified"]]
+    kept = [own["timekeeping"] for own in worst if "timekeeping" in own]
+    if kept:
+        found["timekeeping"] = max(kept, key=lambda each: bool(each.slowness))
     return found
 
 
@@ -678,6 +679,7 @@ def _time_facts(
     times = RunTimes(
         ticks=timing.ticks,
         fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
+        new_samples=timing.fresh,
         due=timing.due,
         mean_delay=timing.delays / max(timing.ticks, 1),
         mean_jitter=timing.jitter / max(timing.ticks, 1),

@@ -356,11 +356,12 @@ class Audit:
             return None
 
 
-def _without_condition(path: Path) -> str:
+def _without_condition(report: AuditReport) -> str:
     """Returns the reason why a device has no condition."""
-    if all(is_motion_prescribed(hand.meta) for hand in open_hands(path)):
+    if all(is_motion_prescribed(hand.meta) for hand in open_hands(report.path)):
         return "the device feels no force, as its motion is prescribed: there is nothing to certify"
-    return f"device not judged (b >= KT/2 + B_law): {NO_DAMPING}"
+    slowness = "" if report.timekeeping is None else report.timekeeping.slowness
+    return f"device not judged (b >= KT/2 + B_law): {NO_DAMPING}{slowness}"
 
 
 def _print_report(report: AuditReport) -> None:
@@ -383,8 +384,7 @@ def _print_report(report: AuditReport) -> None:
     for sentence in report.conditions:
         out.print(f"  {plain(sentence)}{in_time}")
     if not report.conditions and report.verdict != "invalid":
-        slowness = kept.slowness if kept is not None else ""
-        out.print(f"  {_without_condition(report.path)}{slowness}")
+        out.print(f"  {_without_condition(report)}")
     if kept is not None and report.conditions:
         out.print(f"  {kept.device_words(report.certified, has_pushed=report.has_pushed)}")
     if report.is_cut:

@@ -370,7 +370,8 @@ def _device_notes(report: AuditReport) -> list[str]:
         limit = f"; but {MOTORS_PUSHED}" if report.has_pushed else ""
         return [f"The device bears this coupling, in any hand{clause}{limit}."]
     if report.certified is None:
-        return ["It is not known if the device bears this coupling in any hand."]
+        slowness = "" if kept is None else kept.slowness
+        return [f"It is not known if the device bears this coupling in any hand{slowness}."]
     if kept is not None and kept.refutation:  # the reason has the numbers
         return ["The device is not certified. This run stayed passive; another one need not."]
     return [
