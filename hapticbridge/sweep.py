@@ -441,7 +441,9 @@ def sweep(
         results: File that keeps the results. Points that it holds, failed ones too, are not
             computed again. One sweep at a time may use a file.
         chunk: Points per task, >= 1; by default 1/32 of a core's share, at most 256.
-        executor: Any executor; it stays open. By default fresh processes, one per core.
+        executor: Any executor; it stays open. By default fresh processes, one per core, with
+            OPENBLAS_NUM_THREADS=1. Without it, short loops with a simulated device take twice as
+            long in an executor's processes.
         scheduler: Address of a dask.distributed scheduler (extra ``cluster``) instead.
         jobs: Largest number of processes, >= 1; 1 works in this process.
         progress: Called with the numbers of finished and of all points, first before any task.

@@ -177,9 +177,13 @@ def draw(table: Table, boundary: Mapping[str, Any]) -> Figure:
     _draw_energy(panels[0, 1])
     _draw_depths(panels[1, 0], boundary["compared"], "median_depth", "median penetration in µm")
     _draw_depths(panels[1, 1], boundary["compared"], "largest_depth", "largest penetration in µm")
+    masses, stiffnesses, frictions = (
+        " and ".join(f"{value:g}" for value in values)
+        for values in (np.multiply(1e3, MASSES), STIFFNESSES, FRICTIONS)
+    )
     below.suptitle(
-        f"{len(COMPARED_RIGS)} rigs in random hands: 30, 100 and 300 g, K = 1000 and 6000 N/m, "
-        "friction 0, 0.1 and 0.4;\nshipped scenes as they are",
+        f"{len(COMPARED_RIGS)} rigs in random hands: {masses} g, K = {stiffnesses} N/m, "
+        f"friction {frictions};\nshipped scenes as they are",
         fontsize="small",
     )
     figure.suptitle(
@@ -279,7 +283,7 @@ def _rule() -> tuple[Array, Array, list[Array]]:
     return steps, ratio, regions
 
 
-DEFAULT_POINTS = 360
+DEFAULT_POINTS = 250
 """Approximate number of points by default."""
 
 

@@ -213,13 +213,13 @@ blocks."""
 COMPARED_RIGS = tuple(name for name in RIGS if name != "wall")
 """Rigs on which treatments are compared; the wall is for the settings of the grid."""
 
-MASSES = (0.03, 0.1, 0.3)
-"""Tool masses in kg."""
+MASSES = (0.03, 0.3)
+"""Tool masses in kg, from the ends of the range, as are the others below."""
 
 STIFFNESSES = (1000.0, 6000.0)
 """Stiffnesses K in N/m."""
 
-FRICTIONS = (0.0, 0.1, 0.4)
+FRICTIONS = (0.0, 0.4)
 """Coefficients of friction."""
 
 ROTATION = (1e-3, 5e-4)
