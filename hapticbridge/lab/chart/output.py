@@ -110,8 +110,8 @@ def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: boo
     if best is not None:
         alone = "" if is_borne_out(best, points) else ALONE
         return (
-            f"{goal}, use {best.setting.label}: {_numbers(best)}. It is passive, has no hazard, "
-            f"and for at most {100 * SPARE:g} % of a core more no such point errs noticeably less."
+            f"{goal}, use {best.setting.label}: {_numbers(best)}. It is passive and has no hazard; "
+            f"no such point that costs up to {100 * SPARE:g} % of a core more errs noticeably less."
             f"{alone} {_way_to(best, points)}"
         )
     tried = [each for each in points if _is_at_rate(each) and np.isfinite(each.score.jnd)]

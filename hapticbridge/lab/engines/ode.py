@@ -226,9 +226,9 @@ def step(
 
 
 LAYER = 1e-7
-"""Depth in m that a contact keeps; the pose is wrong by about this depth. At 0, and with the default
-CFM, a settled peg is right to 1e-6 µm, but contacts come and go: of 8 pegs that a hand jams, at
-1 ms, one is thrown by 1.2 mm instead of 51 µm."""
+"""Depth in m that a contact keeps; the pose is wrong by about this depth. At 0 and the default CFM
+a settled peg is right to 1e-6 µm, but contacts come and go: of 8 pegs that a hand jams, at 1 ms,
+one is thrown by 1.2 mm instead of 51 µm."""
 
 CFM = 1e-7
 """Constraint force mixing of the contacts in 1/kg times s. At the default of 1e-10 the equations of

@@ -60,7 +60,7 @@ PATH = base.swinging(0.0075, 1.5, duration=2.0, count=201)
 """Path of a hand that goes 5 mm deep into the wall three times in 2 s."""
 
 
-DEFAULT_POINTS = 4000
+DEFAULT_POINTS = 3500
 """Approximate number of points by default."""
 
 
