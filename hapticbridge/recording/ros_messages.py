@@ -259,8 +259,8 @@ FAULTS = ("trip", "bridge_died", "recorder_died")
 
 def _ros_pose(rows: NDArray[np.void], frame: str) -> NDArray[np.float64]:
     """Returns position in m and quaternion (x, y, z, w) of a frame, (n, 7)."""
-    turned = np.roll(rows[f"{frame}_quaternion"], -1, axis=1)
-    return np.concatenate([rows[f"{frame}_position"], turned], axis=1)
+    vector_first = rows[f"{frame}_quaternion"][:, [1, 2, 3, 0]]
+    return np.concatenate([rows[f"{frame}_position"], vector_first], axis=1)
 
 
 def _by_axes(axes: NDArray[np.float64], wrench: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -501,7 +502,6 @@ class IdentifiedDevice(SimulatedDevice):
         )
         self._motion = intended(info, hand, ticks, period, start)
         self._start = np.array(start)
-        self._origin = Rotation.from_quat(self._start[3:], scalar_first=True)
         self._outside = Outside(ticks, period)
         self._has_axis = np.array([axis in info.axes for axis in AXES], dtype=np.float64)
         self.info = replace(info, is_real=False, duration=float(self._motion[-1, 0]))
@@ -531,6 +531,9 @@ class IdentifiedDevice(SimulatedDevice):
     def _to_recorded_frame(self, sample: NDArray[np.void]) -> NDArray[np.void]:
         """Moves a sample from coordinates relative to the start to the device's coordinates."""
         sample["position"][0] += self._start[:3]
-        turned = Rotation.from_quat(sample["quaternion"][0], scalar_first=True) * self._origin
-        sample["quaternion"][0] = turned.as_quat(canonical=True, scalar_first=True)
+        quaternion = sample["quaternion"][0]
+        mujoco.mju_mulQuat(quaternion, quaternion.copy(), self._start[3:])
+        mujoco.mju_normalize4(quaternion)
+        if quaternion[0] < 0.0:
+            quaternion *= -1.0
         return sample
