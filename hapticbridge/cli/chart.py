@@ -64,7 +64,7 @@ class Chart:
     out: Path = Path("chart")
     """Folder to write to."""
     quick: bool = False
-    """Three time steps and three rounds of timing: half a minute."""
+    """Three time steps and three rounds of timing: about a minute."""
     scene_rates: bool = False
     """Chart a scene that steps less often than the loop, beside a loop that is as slow."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
