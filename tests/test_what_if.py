@@ -18,11 +18,12 @@ import report_runs
 from audit_cases import TAP, ScriptedDevice, SlowClock, recorded, rewritten
 from cli_cases import Called
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo, Hand, SimulatedDevice
+from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import RecordingError, SafetyTrip
 from hapticbridge.guard import Limits
 from hapticbridge.options import Workspace
@@ -196,6 +197,40 @@ def test_the_closed_loop_is_what_a_live_run_with_that_setting_does(
     assert np.abs(forces[0] - forces[1]).max() < 0.05 * forces[1].max()
     if "rate" not in changes:  # and it is not what was recorded
         assert np.abs(forces[2] - forces[1]).max() > 0.2 * forces[1].max()
+
+
+class TurnedDevice(SimulatedDevice):
+    """A simulated device whose handle is turned at the start, in its own coordinates."""
+
+    FIRST = Rotation.from_rotvec([0.4, -0.9, 0.2])
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        sample = super().start(period, parts)
+        self.turn(sample)
+        return sample
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        flags = super().read(sample)
+        self.turn(sample)
+        return flags
+
+    def turn(self, sample: NDArray[np.void]) -> None:
+        moved = Rotation.from_quat(sample["quaternion"][0], scalar_first=True)
+        sample["quaternion"][0] = (moved * self.FIRST).as_quat(canonical=True, scalar_first=True)
+
+
+def test_a_device_that_starts_turned_turns_as_recorded(tmp_path: Path) -> None:
+    share = np.linspace(0.0, 1.0, 11)
+    turns = Rotation.from_rotvec(share[:, None] * [0.3, 0.2, -0.3]).as_quat(scalar_first=True)
+    path = Motion(0.4 * share, np.zeros((11, 3)), turns.tolist())
+    recorded(tmp_path / "turned.mcap", "point_mass", TurnedDevice(path=path), duration=0.4)
+    found = what_if(tmp_path / "turned.mcap", {})
+    before, after = (
+        Rotation.from_quat(run.recording.ticks["device_quaternion"], scalar_first=True)
+        for run in (found.runs[0], run_of(found, "closed loop"))
+    )
+    assert (before[-1] * before[0].inv()).magnitude() > 0.2
+    assert (after * before.inv()).magnitude().max() < 0.01
 
 
 def test_what_the_hand_wanted_is_found_where_it_is_known() -> None:

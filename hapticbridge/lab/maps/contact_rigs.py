@@ -214,7 +214,7 @@ COMPARED_RIGS = tuple(name for name in RIGS if name != "wall")
 """Rigs on which treatments are compared; the wall is for the settings of the grid."""
 
 MASSES = (0.03, 0.3)
-"""Tool masses in kg, from the ends of the range, as are the others below."""
+"""Tool masses in kg. They, the stiffnesses and the frictions are the ends of a range."""
 
 STIFFNESSES = (1000.0, 6000.0)
 """Stiffnesses K in N/m."""
