@@ -316,8 +316,14 @@ def test_page_says_who_is_ahead_of_the_default_by_how_much_and_what_it_takes() -
     assert "a light tool diverges" in text
     # its error falls with the square of the step
     assert text.endswith("'lossless' reaches that error at a period of 0.71 ms.")
-    none = standing([*own, made_up(0.005, 1e-3, method="explicit", verdict="strict")])
-    assert none.endswith("'lossless' does not reach that error at any step that was tried.")
+    exact = made_up(0.005, 1e-3, method="explicit", verdict="strict")
+    assert standing([*own, exact]).endswith(
+        "'lossless' does not reach that error at any step that was tried; as its error falls with "
+        "the step, it would take a period of 0.05 ms."
+    )
+    even = [replace(each, score=own[1].score) for each in own]
+    assert standing([*even, exact]).endswith("and its error hardly falls with the step.")
+    assert standing([own[1], exact]).endswith("at any step that was tried.")
     # what is cheaper and worse, or dearer and better, or not passive, or slower is not ahead
     others = [
         made_up(0.005, 0.5),

@@ -523,14 +523,19 @@ def forced(change: Callable[[], Change], hand: Hand, limit: float = 10.0) -> Cal
         rig.points = ((0.0, 0.0), (0.2, 0.0), (0.9, reach), (9.0, reach))
         if hand is TWO_FINGERS_TURN:
             rig.scene, rig.turns = "ratchet", True
-        act = change()
-
-        def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
-            wrench[:] = act(tick, wrench.copy())
-
-        rig.device.refuse = refuse
+        disobey(rig, change)
 
     return do
+
+
+def disobey(rig: Rig, change: Callable[[], Change]) -> None:
+    """Lets the motors do what a function makes of the written wrench, from the start on."""
+    act = change()
+
+    def refuse(tick: int, wrench: NDArray[np.float64]) -> None:
+        wrench[:] = act(tick, wrench.copy())
+
+    rig.device.refuse = refuse
 
 
 def late(ticks_of: Callable[[int], int]) -> Callable[[], Change]:
@@ -594,6 +599,11 @@ def turning(speed: float) -> Callable[[], Change]:
 def _reversed_x(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     wrench[0] = -wrench[0]
     return wrench
+
+
+def reversing() -> Change:
+    """Returns motors that pull where they should push, and turn the other way."""
+    return lambda _tick, wrench: -wrench
 
 
 def _exchanged(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:

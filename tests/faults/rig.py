@@ -119,8 +119,8 @@ class FaultyDevice:
         self.inner.read(self.true)
         moved = self.true["position"][0] - place
         turned = np.array(turn_between(pose, self.true["quaternion"][0].tolist()))
-        burnt = (self.info.damping or 0.0) / PERIOD * float(moved @ moved)
-        burnt += (self.info.rotational_damping or 0.0) / PERIOD * float(turned @ turned)
+        burnt = (self.inner.info.damping or 0.0) / PERIOD * float(moved @ moved)
+        burnt += (self.inner.info.rotational_damping or 0.0) / PERIOD * float(turned @ turned)
         work = float(self._held[:3] @ moved + self._held[3:] @ turned)
         self.to_the_hand.append(self.to_the_hand[-1] + work - burnt)
 

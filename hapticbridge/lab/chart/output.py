@@ -53,6 +53,9 @@ IMPERCEPTIBLE = 0.1
 
 ALONE = " No other time step bears this out, so it may be luck."
 
+LEAST_ORDER = 0.25
+"""Order in the step below which an error is not extrapolated. Methods here have 1 or 2."""
+
 TOLERANCE = 1e-9
 """Relative tolerance of the rate: 1/(1 ms) is 1000 Hz but for rounding."""
 
@@ -201,24 +204,33 @@ def standing(points: Sequence[Measurement]) -> str:
 
 
 def _period_words(points: Sequence[Measurement], error: float) -> str:
-    """States the period at which the default's method reaches an error in JND."""
+    """States the period at which the default's method reaches an error in JND.
+
+    Between two tried periods it is interpolated, below the finest extrapolated from the two
+    finest, both as a power of the period. An order below ``LEAST_ORDER`` is no convergence.
+    """
     own = sorted(
         (each.setting.period, each.score.jnd)
         for each in points
         if replace(each.setting, period=DEFAULT.period) == DEFAULT and 0 < each.score.jnd < math.inf
     )
     name = DEFAULT.method.name
-    reached = [step for step, jnd in own if jnd <= error]
-    if not reached:
-        return f"'{name}' does not reach that error at any step that was tried."
-    fine = max(reached)
-    coarse = min((pair for pair in own if pair[0] > fine), default=None)
-    if coarse is None:
-        return f"'{name}' reaches that error at {1e3 * fine:.2g} ms."
-    (low, below), (high, above) = (fine, dict(own)[fine]), coarse
-    share = math.log(error / below) / math.log(above / below)
-    step = low * (high / low) ** share
-    return f"'{name}' reaches that error at a period of {1e3 * step:.2g} ms."
+    reached = [pair for pair in own if pair[1] <= error]
+    is_reached = bool(reached)
+    if is_reached and max(reached) == own[-1]:
+        return f"'{name}' reaches that error at {1e3 * own[-1][0]:.2g} ms."
+    ends = own[own.index(max(reached)) :][:2] if is_reached else own[:2]
+    not_tried = f"'{name}' does not reach that error at any step that was tried"
+    if len(ends) < 2:
+        return f"{not_tried}."
+    (low, below), (high, above) = ends
+    order = math.log(above / below) / math.log(high / low)
+    if not is_reached and order < LEAST_ORDER:
+        return f"{not_tried}, and its error hardly falls with the step."
+    step = f"{1e3 * low * (error / below) ** (1 / order):.2g} ms"
+    if is_reached:
+        return f"'{name}' reaches that error at a period of {step}."
+    return f"{not_tried}; as its error falls with the step, it would take a period of {step}."
 
 
 def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
