@@ -37,7 +37,7 @@ from hapticbridge.report.evidence import Evidence, is_motion_prescribed
 from hapticbridge.sweep import Interrupted, Table
 from hapticbridge.timekeeping import NO_DAMPING
 from hapticbridge.units import energy_rows, format_energy
-from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_if, write_what_if
+from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_ifs, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences
 from hapticbridge.whatif.what_if import RUN_WORDS
 
@@ -297,15 +297,8 @@ class Audit:
         if len(asked) > 1 and (self.plot or self.report):
             raise RecordingError("--plot and --report show one change; give one value of each")
         with progress("simulating the changed runs") as show:
-            found, *others = (
-                what_if(
-                    file,
-                    changed,
-                    strict=self.strict,
-                    in_process=self.in_process,
-                    progress=show,
-                )
-                for changed in asked
+            found, *others = what_ifs(
+                file, asked, strict=self.strict, in_process=self.in_process, progress=show
             )
         if others:
             every = [found, *others]

@@ -12,3 +12,4 @@ from hapticbridge.whatif.settings import changes_from as changes_from
 from hapticbridge.whatif.what_if import WhatIf as WhatIf
 from hapticbridge.whatif.what_if import WhatIfRun as WhatIfRun
 from hapticbridge.whatif.what_if import what_if as what_if
+from hapticbridge.whatif.what_if import what_ifs as what_ifs

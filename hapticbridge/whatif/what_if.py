@@ -163,8 +163,24 @@ def what_if(
         RecordingError: The recording cannot be judged or simulated, or a change is unknown.
         HapticBridgeError: The changed bridge is refused; the message names the reason.
     """
-    progress = progress or (lambda _done, _total, _name: None)
-    progress(0, 4, "auditing what was recorded")
+    (found,) = what_ifs(path, (changes,), strict=strict, in_process=in_process, progress=progress)
+    return found
+
+
+def what_ifs(
+    path: str | Path,
+    alternatives: Sequence[Mapping[str, Value]],
+    *,
+    strict: bool = False,
+    in_process: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> list[WhatIf]:
+    """Asks ``what_if`` for several changes; what does not depend on them is simulated once.
+
+    Arguments and errors are those of ``what_if``, with a mapping for each change.
+    """
+    steps = _Steps(progress or (lambda _done, _total, _name: None), 2 + 2 * len(alternatives))
+    steps.begin("auditing what was recorded")
     judge = partial(audit, strict=strict, in_process=in_process)
     report = judge(path)
     if report.verdict == "invalid":
@@ -178,7 +194,22 @@ def what_if(
                 f"'{recordings[0].path}' has {len(hands[0].ticks)} ticks; a what-if needs 3"
             )
         file = folder / "run.mcap"
-        return _Experiment(hands, report, file, progress, judge, in_process).changed(changes)
+        experiment = _Experiment(hands, report, file, steps, judge, in_process)
+        return [experiment.changed(changes) for changes in alternatives]
+
+
+@dataclass(slots=True)
+class _Steps:
+    """Count of the steps of an experiment that have begun."""
+
+    show: Callable[[int, int, str], None]
+    total: int
+    begun: int = 0
+
+    def begin(self, name: str) -> None:
+        """Shows the next step."""
+        self.show(self.begun, self.total, name)
+        self.begun += 1
 
 
 START_TIME, MAX_TIMES = 40.0, 100.0
@@ -193,10 +224,12 @@ class _Experiment:
     hands: tuple[RecordedRun, ...]
     report: AuditReport
     path: Path
-    progress: Callable[[int, int, str], None]
+    steps: _Steps
     judge: Callable[[Path], AuditReport]
     in_process: bool
     concerns: dict[str, None] = field(default_factory=dict)
+    unchanged: WhatIfRun | None = None
+    as_recorded: bool | None = None
 
     @property
     def run(self) -> RecordedRun:
@@ -210,6 +243,7 @@ class _Experiment:
 
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
         """Runs all repetitions and returns the result."""
+        self.concerns = {}
         run, settings = self.run, [hand.settings for hand in self.hands]
         grips = [hand.parameters.grip for hand in self.hands]
         by_grip, changed_values = changed_of_hands(dict(zip(grips, settings, strict=True)), changes)
@@ -225,7 +259,7 @@ class _Experiment:
         peaks = self._peaks(recordings)
         recorded = WhatIfRun(RECORDED, self.report, peaks, run.trip, run.period, recordings)
         runs = [recorded]
-        self.progress(1, 4, "the recorded motion")
+        self.steps.begin("the recorded motion")
         runs.append(self._prescribed(new))
         if not is_changed:
             notes.append(self._agreement())
@@ -236,10 +270,9 @@ class _Experiment:
         if missing := self._missing_for_closed_loop():
             notes.append(f"no closed loop: {missing}")
         else:
-            self.progress(2, 4, "the model hand, nothing changed")
-            same = self._closed(settings)
+            same = self._same(settings)
             hand_error = max(map(_distance, same.recordings, recordings))
-            self.progress(3, 4, "the model hand")
+            self.steps.begin("the model hand")
             runs.append(self._closed(new) if is_changed else same)
             notes.append(
                 f"with nothing changed the model hand is {format_si(hand_error, 'm')} off the "
@@ -285,6 +318,13 @@ class _Experiment:
 
         return self._simulated(CLOSED, devices, SimulatedClock(), settings)
 
+    def _same(self, settings: Sequence[Settings]) -> WhatIfRun:
+        """Returns the closed loop of the recorded settings; it is simulated once."""
+        if self.unchanged is None:
+            self.steps.begin("the model hand, nothing changed")
+            self.unchanged = self._closed(settings)
+        return self.unchanged
+
     def _simulated(
         self,
         name: str,
@@ -316,11 +356,13 @@ class _Experiment:
 
     def _is_scene_as_recorded(self) -> bool:
         recording, parameters = self.run.recording, [hand.parameters for hand in self.hands]
-        return bool(
-            self._in_bounds(
-                lambda _: is_as_recorded(compile_recorded(recording, *parameters), recording)
+        if self.as_recorded is None:
+            self.as_recorded = bool(
+                self._in_bounds(
+                    lambda _: is_as_recorded(compile_recorded(recording, *parameters), recording)
+                )
             )
-        )
+        return self.as_recorded
 
     def _in_bounds(self, work: Work, times: float = 1.0) -> Any:
         """Does work with the run's scene in a child process with limits (``confinement``).
