@@ -355,7 +355,8 @@ def twins() -> Twins:
             scene=base.free_tool_and_wall,
             device=partial(SimulatedDevice, damping=DEVICE_DAMPING, path=PATH, **NO_LIMITS),
             coupling=TWIN_COUPLING,
-            options=replace(UNGUARDED_OPTIONS, method=method, rate=1 / PERIOD),
+            # by default 'implicit' has rigid contacts, which 'implicitfast' cannot have
+            options=replace(UNGUARDED_OPTIONS, method=method, contact="scene", rate=1 / PERIOD),
             duration=1.0,
         ),
     )

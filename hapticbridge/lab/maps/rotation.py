@@ -586,7 +586,7 @@ def twins() -> Twins:
             scene=spinning_scene,
             device=partial(TrajectoryDevice, motion, **NO_LIMITS),
             coupling=coupling_of(SOFT),
-            options=replace(UNGUARDED_OPTIONS, method=method, rate=1 / PERIOD),
+            options=replace(UNGUARDED_OPTIONS, method=method, contact="scene", rate=1 / PERIOD),
             duration=0.5,
         ),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,18 @@ from hapticbridge.scene import Scene
 ENDINGS = ("fails.mcap", "safe.mcap")
 """Endings of the files of both twins, the one that fails first."""
 
-UNGUARDED_OPTIONS = BridgeOptions(limits=UNLIMITED, controller="off")
+NEVER = 1e6
+"""Force in N and torque in N m that no twin reaches."""
+
+UNGUARDED_OPTIONS = BridgeOptions(
+    limits=replace(UNLIMITED, force=NEVER, torque=NEVER), controller="off"
+)
 """Options of a bridge whose guard changes nothing. By default it stops or damps a run before its
 fault shows."""
 
 NO_LIMITS: Mapping[str, Any] = {
-    "force_limit": UNLIMITED.force,
-    "torque_limit": UNLIMITED.torque,
+    "force_limit": NEVER,
+    "torque_limit": NEVER,
     "speed_limit": 0.0,
 }
 """Limits in the data sheet of a device for ``UNGUARDED_OPTIONS``; a speed limit of 0 is unknown."""
