@@ -72,7 +72,9 @@ class Run:
                 recording=path,
             )
             with bridge:
-                bridge.run(self.duration)
+                summary = bridge.run(self.duration)
+        if summary.stopped_by == "signal":
+            raise KeyboardInterrupt  # the bridge ended the run, and the map must end too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
