@@ -71,6 +71,7 @@ SQUARES = StabilityMap(
     summarize=summarize,
     draw=draw,
     sentences=sentences,
+    twins=MAPS["restitution"].twins,
 )
 
 

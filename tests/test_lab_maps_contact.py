@@ -19,7 +19,7 @@ from hapticbridge.lab.maps.contact_rigs import Case, ContactRun, Treatment, run_
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene.contacts import SUGGESTED, contact_numbers
 
-LIGHT = contact.WORST
+LIGHT = rigs.WORST
 """A peg of 30 g without friction in a random hand: the hardest case of the map."""
 
 DAMPED = Treatment(solref=(SUGGESTED[0] * rigs.PERIOD, SUGGESTED[1]))

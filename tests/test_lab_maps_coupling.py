@@ -64,17 +64,6 @@ def test_coupling_that_the_device_cannot_bear_is_unstable_though_the_scene_is_pa
     assert above["environment"] == "strict"
 
 
-def test_implicitfast_is_at_fault_where_explicit_stays_within_its_slack() -> None:
-    fast = evaluate(cell("implicitfast", 1500.0, 0.6))
-    assert (fast["environment"], fast["fault_port"]) == ("active", "environment")
-    assert fast["fault_tick"] == 25
-    assert float(fast["slack_share"]) > 1
-    assert float(fast["created"]) > 0
-    explicit = evaluate(cell("explicit", 1500.0, 0.6))
-    assert (explicit["environment"], explicit["fault_tick"]) == ("within slack", -1)
-    assert evaluate(cell("implicit", 1500.0, 0.6))["created"] == 0.0
-
-
 def test_weld_is_judged_by_its_device_port_and_has_no_wall_without_contact() -> None:
     # on a wall the hand is given what neither the scene gave up nor the damping burns
     found = evaluate(cell("weld", 1500.0, 0.6))

@@ -82,14 +82,6 @@ def test_at_the_cut_the_torque_flips_by_twice_pi_stiffness_in_one_tick() -> None
     assert short.largest_angle < 0.9 * np.pi
 
 
-def test_explicit_creates_energy_at_the_cut_and_implicit_does_not() -> None:
-    speed = 1.3 * rotation.cut_speed(SOFT)
-    assert rotation.sudden("implicit", SOFT, speed).environment == "strict"
-    explicit = rotation.sudden("explicit", SOFT, speed)
-    assert explicit.environment == "active"
-    assert explicit.first_active >= 0
-
-
 def test_the_map_says_what_its_table_holds(tmp_path: Path) -> None:
     boundary = boundary_of(rotation, tmp_path, 190)
     assert boundary["fastest_passive"]["implicit"] > 0

@@ -163,9 +163,11 @@ def _print(files: ChartFiles) -> None:
 class Stability:
     """Map where ways to render a tool lose passivity or stability.
 
-    Theory is drawn on top of measurement. Writes NAME.png, NAME.csv and NAME.json into the folder.
-    What is done stays in NAME.parts: begun again after a stop, a map goes on from there. After a
-    change of hapticbridge or MuJoCo the old file is refused: give another folder or delete them.
+    Theory is drawn on top of measurement. Writes NAME.png, NAME.csv and NAME.json into the folder,
+    and two recordings for 'audit', 'view' and 'compare': NAME.fails.mcap fails in the way that the
+    map is about; NAME.safe.mcap differs in one named value and holds. What is done stays in
+    NAME.parts: begun again after a stop, a map goes on from there. After a change of hapticbridge
+    or MuJoCo the old file is refused: give another folder or delete them.
 
     Example:
         hapticbridge stability coupling --out maps
@@ -219,4 +221,7 @@ def _print_map(each: StabilityMap, files: MapFiles) -> None:
     out.print(f"[bold]{each.name}[/]: {plain(files.finding.paragraph)}")
     if files.failed:
         out.print(f"  [yellow]{files.failed} points could not be computed[/]; see {files.table}")
-    err.print(f"wrote {plain(str(files.picture))}, {files.table.name}, {files.boundary.name}")
+    fails, safe = (report.path for report in files.twins.reports)
+    out.print(f"  recorded twins: {plain(files.twins.sentence)}")
+    others = (files.table, files.boundary, fails, safe)
+    err.print(f"wrote {plain(str(files.picture))}, {', '.join(path.name for path in others)}")

@@ -1,7 +1,8 @@
 """Stability maps of the rendering methods, theory drawn over measurement.
 
 Read ``base`` first, then one map, such as ``coupling``: its rig, its points, the evaluation of one
-point, the reading of its table and its picture stand in one file.
+point, the reading of its table, its picture and its twins stand in one file. ``twins`` records a
+run that fails and its safe twin.
 
 To add a map, write such a file, with ``DEFAULT_POINTS`` and the functions that ``StabilityMap``
 names, and add it to ``_IN_ORDER`` below. Its docstring begins with "Map NAME: its subject."

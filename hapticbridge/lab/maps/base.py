@@ -22,10 +22,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.device import Motion
+from hapticbridge.device import Hand, Motion
 from hapticbridge.errors import StudyError
 from hapticbridge.files import finite_or_null, prepared_folder
 from hapticbridge.lab.closed_loop import ClosedLoop
+from hapticbridge.lab.maps.twins import ENDINGS, RecordedTwins, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import write_picture
 from hapticbridge.scene import Scene, load_scene
@@ -72,6 +73,7 @@ class StabilityMap:
         summarize: Returns the numbers of a table: limits of the methods, measured beside predicted.
         draw: Draws a table and its numbers.
         sentences: States the numbers; see ``paragraph``.
+        twins: Returns two runs that differ in one value: one fails, one holds.
     """
 
     name: str
@@ -82,11 +84,12 @@ class StabilityMap:
     summarize: Callable[[Table], Mapping[str, Any]]
     draw: Callable[[Table, Mapping[str, Any]], Figure]
     sentences: Callable[[Mapping[str, Any]], Sentences]
+    twins: Callable[[], Twins]
 
     @classmethod
     def from_module(cls, module: Any) -> StabilityMap:
         """Returns the map that a module holds under the names of these attributes."""
-        names = ("points", "evaluate", "summarize", "draw", "sentences")
+        names = ("points", "evaluate", "summarize", "draw", "sentences", "twins")
         functions = {name: getattr(module, name) for name in names}
         return cls(
             name=module.__name__.rpartition(".")[2],
@@ -133,8 +136,10 @@ class MapFiles:
     Attributes:
         picture: PNG.
         table: CSV or Parquet, one row per point.
-        boundary: JSON: ``about``, ``paragraph``, ``points``, ``failed`` and ``boundary``.
+        boundary: JSON: ``about``, ``paragraph``, ``points``, ``failed``, ``boundary``,
+            ``twins``.
         finding: Figure, paragraph and limits.
+        twins: Recordings of a run that fails and of its safe twin.
         failed: Number of points that could not be computed; their reasons are in the table.
     """
 
@@ -142,6 +147,7 @@ class MapFiles:
     table: Path
     boundary: Path
     finding: Finding
+    twins: RecordedTwins
     failed: int
 
 
@@ -155,7 +161,7 @@ def run_map(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> MapFiles:
-    """Computes a map and writes its picture, table and boundary.
+    """Computes a map and writes its picture, table, boundary and the recordings of its twins.
 
     Results are kept in ``folder/NAME.parts``. After an interruption a new run of the map continues
     from there.
@@ -171,6 +177,7 @@ def run_map(
 
     Raises:
         StudyError: The folder, the workers or the number cannot be used, or every point failed.
+        HapticBridgeError: A recording cannot be written.
     """
     if points is not None and not MIN_POINTS <= points <= MAX_POINTS:
         raise StudyError(
@@ -178,7 +185,7 @@ def run_map(
         )
     name = stability_map.name
     check_format(form)
-    files = {end: folder / f"{name}.{end}" for end in ("png", form, "json")}
+    files = {end: folder / f"{name}.{end}" for end in ("png", form, "json", *ENDINGS)}
     prepared_folder(folder, [path.name for path in files.values()])
     table = sweep(
         stability_map.evaluate,
@@ -192,6 +199,8 @@ def run_map(
     failed = int(table.failed.sum())
     finding = stability_map.read(table)
     write_picture(finding.figure, files["png"])
+    fails, safe = (files[ending] for ending in ENDINGS)
+    twins = stability_map.twins().record((fails, safe))
     facts = {
         "map": name,
         "about": stability_map.about,
@@ -199,13 +208,14 @@ def run_map(
         "failed": failed,
         "paragraph": finding.paragraph,
         "boundary": finding.boundary,
+        "twins": twins.facts,
     }
     text = json.dumps(finite_or_null(facts), indent=2, allow_nan=False)
     try:
         files["json"].write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise StudyError(f"cannot write '{files['json']}': {error.strerror}") from None
-    return MapFiles(files["png"], files[form], files["json"], finding, failed)
+    return MapFiles(files["png"], files[form], files["json"], finding, twins, failed)
 
 
 WIDTH = 1e-3
@@ -344,6 +354,31 @@ STILL = Motion([0.0, 1.0], np.zeros((2, 3)))
 """Path of a hand that pulls towards its place."""
 
 
+STEADY_HAND = Hand(
+    mass=0.0,
+    damping=0.0,
+    stiffness=1.0,
+    rotational_inertia=0.0,
+    rotational_damping=0.0,
+    rotational_stiffness=0.0,
+)
+"""Hand that presses with a steady force of 1 N per metre of its target's distance. A stiffer one
+would add to the stiffness of a wall."""
+
+
+def pressing(*forces: tuple[float, float]) -> Motion:
+    """Returns the path of ``STEADY_HAND`` along x that presses with given forces.
+
+    Args:
+        forces: Time in s and force in N, from the start of the run; the force is linear in between
+            and constant afterwards.
+    """
+    table = np.array([(0.0, 0.0), *forces])
+    path = np.zeros((len(table), 3))
+    path[:, 0] = table[:, 1] / STEADY_HAND.stiffness
+    return Motion(table[:, 0], path)
+
+
 def swinging(amplitude: float, frequency: float, duration: float, count: int) -> Motion:
     """Returns the path of a hand that swings along x and turns nothing: A (1 − cos 2πft).
 
@@ -390,6 +425,11 @@ def free_body(mass: float, inertia: ArrayLike) -> str:
     </body>
   </worldbody>
 </mujoco>"""
+
+
+def free_wall(mass: float) -> Scene:
+    """Loads a wall without contact: a free body of a mass in kg that no hand moves."""
+    return scene_of(free_body(mass, np.full(3, mass)))
 
 
 def free_tool_and_wall() -> Scene:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -27,11 +28,14 @@ from hapticbridge.lab.maps.contact_rigs import (
     SCENE,
     STIFFNESSES,
     TREATMENTS,
+    WORST,
     Case,
     Treatment,
     run_case,
     run_cases,
+    worst_peg,
 )
+from hapticbridge.lab.maps.twins import UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene.contacts import (
     HEAVY_SLACK_STEPS,
@@ -127,10 +131,6 @@ def cases_of(rig: str) -> list[Case]:
     found = itertools.product(stiffnesses, masses, frictions, HANDS[is_shipped])
     return [Case(rig, *values) for values in found]
 
-
-WORST = Case("peg", 6000.0, 0.03, 0.0, 5)
-"""Run of which the picture shows the energy: a light peg without friction, which creates more than
-the slack with the settings as shipped."""
 
 STEPS = (0.25, 20.0)
 """Range of timeconst/T, even in its logarithm."""
@@ -365,4 +365,23 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "Under 'implicitfast' a mass on a wall creates energy at "
         "{active_share_of_implicitfast:.0%} of the settings",
         boundary,
+    )
+
+
+def twins() -> Twins:
+    """Returns a light peg that jams in its hole, with MuJoCo's contacts and with rigid ones."""
+    return Twins(
+        shared=f"A peg of {1e3 * WORST.mass:g} g without friction jams in its hole, "
+        f"K = {WORST.stiffness:g} N/m, solref {' '.join(f'{n:g}' for n in SCENE.solref)}",
+        name="contact",
+        values=(SCENE.contact, RIGID.contact),
+        run=lambda contact: Run(
+            scene=worst_peg,
+            device=lambda: contact_rigs.device_of(WORST, worst_peg(), PERIOD),
+            coupling=contact_rigs.coupling_of(WORST),
+            options=replace(
+                UNGUARDED_OPTIONS, method=SCENE.method, contact=contact, rate=1 / PERIOD
+            ),
+            duration=1.7,
+        ),
     )

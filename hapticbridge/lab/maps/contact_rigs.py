@@ -194,8 +194,11 @@ _shoved = partial(wandering, size=(0.012, 6e-3, 8e-3), angle=0.1, fastest=3.0)
 _tapped = partial(wandering, size=(4e-3, 4e-3, 6e-3), angle=0.15, approach=6e-3, tap=4e-3)
 _FLOOR = _box("0.1 0.1 0.01", "0 0 -0.02")
 
+PEG_CLEARANCE = 2e-4
+"""Clearance in m a side of the rig ``peg``."""
+
 RIGS: Mapping[str, Rig] = {
-    "peg": _made(_hole(2e-4), wandering),
+    "peg": _made(_hole(PEG_CLEARANCE), wandering),
     "tight peg": _made(_hole(5e-5), wandering),
     "planar peg": _made(_hole(2e-4, is_planar=True), wandering),
     "tight planar peg": _made(_hole(5e-5, is_planar=True), wandering),
@@ -284,6 +287,10 @@ class Treatment:
         base.set_tool_mass(model, "tool", case.mass)
         mujoco.mj_setConst(model, scene.data)
 
+
+WORST = Case("peg", 6000.0, 0.03, 0.0, 5)
+"""Hardest case: a light peg without friction, whose contacts as shipped create more than the
+slack."""
 
 SCENE, RIGID = Treatment(), Treatment("rigid")
 
@@ -376,6 +383,17 @@ def contact_run(outcome: LoopOutcome) -> ContactRun:
     )
 
 
+def worst_peg() -> Scene:
+    """Loads the rig ``peg`` for ``WORST``, with mass and contact settings written in its file.
+
+    A recording holds the file, and its audit compiles it again.
+    """
+    solref, solimp = (" ".join(map(repr, numbers)) for numbers in (SCENE.solref, SHIPPED_SOLIMP))
+    setting = f'<default><geom solref="{solref}" solimp="{solimp}" condim="1"/></default>'
+    text = _hole(PEG_CLEARANCE).replace("<worldbody>", f"{setting}<worldbody>")
+    return base.scene_of(text.replace('mass="0.1"', f'mass="{WORST.mass!r}"'))
+
+
 def run_case(
     treatment: Treatment, case: Case, *, keep_records: bool = False, same_law: bool = False
 ) -> LoopOutcome:
@@ -392,30 +410,46 @@ def run_case(
     rig, period = RIGS[case.rig], treatment.period
     loop = base.loop_in(rig.load, "contact")
     treatment.apply(loop.scene, case)
-    path, hand = _path_and_hand(case)
-    per_k, rotational_damping = ROTATION
-    requested = Coupling(case.stiffness, rig.damping, per_k * case.stiffness, rotational_damping)
+    requested = coupling_of(case)
     coupling, method = requested, METHODS[treatment.method].with_contact(treatment.contact)
     if same_law:
         law = METHODS["lossless"].law_coupling(requested, period)
         coupling = method.requested_coupling(law, period)
-    device = SimulatedDevice(
-        damping=DEVICE_MARGIN * (requested.stiffness * period / 2 + requested.damping),
-        rotational_damping=DEVICE_MARGIN
-        * (requested.rotational_stiffness * period / 2 + requested.rotational_damping),
-        hand=hand if hand is not None else scene_hand(loop.scene.model, loop.scene.path),
-        path=path,
-        force_limit=UNLIMITED.force,
-        torque_limit=UNLIMITED.torque,
-    )
     return loop.run(
-        device,
+        device_of(case, loop.scene, period),
         coupling,
         method,
         period=period,
-        ticks=math.floor(path.duration / period),
+        ticks=math.floor(_path_and_hand(case)[0].duration / period),
         substeps=treatment.substeps,
         keep_records=keep_records,
+    )
+
+
+def coupling_of(case: Case) -> Coupling:
+    """Returns the coupling that a case requests."""
+    per_k, rotational_damping = ROTATION
+    damping = RIGS[case.rig].damping
+    return Coupling(case.stiffness, damping, per_k * case.stiffness, rotational_damping)
+
+
+def device_of(case: Case, scene: Scene, period: float) -> SimulatedDevice:
+    """Returns a device in the hand of a case that bears the requested coupling.
+
+    Args:
+        case: Rig, coupling, tool and hand.
+        scene: The rig's scene; it may name a hand.
+        period: T in s.
+    """
+    requested, (path, hand) = coupling_of(case), _path_and_hand(case)
+    return SimulatedDevice(
+        damping=DEVICE_MARGIN * (requested.stiffness * period / 2 + requested.damping),
+        rotational_damping=DEVICE_MARGIN
+        * (requested.rotational_stiffness * period / 2 + requested.rotational_damping),
+        hand=hand if hand is not None else scene_hand(scene.model, scene.path),
+        path=path,
+        force_limit=UNLIMITED.force,
+        torque_limit=UNLIMITED.torque,
     )
 
 

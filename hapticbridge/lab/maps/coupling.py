@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
 from hapticbridge.lab.maps.tool_mass import effective_response, worst_angle
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
@@ -334,4 +336,27 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "B is the requested damping; 'compensated' and 'lossless' use B − K T and B − K T/2, 0 at "
         "least, and (6) holds for what is used",
         {},
+    )
+
+
+TWIN_COUPLING = Coupling(1500.0, 0.6, 1.0, 1e-3)
+"""Coupling of the twins: far below (6), and K above B/T, where ``implicitfast`` exceeds its
+slack."""
+
+
+def twins() -> Twins:
+    """Returns a hand that taps the wall through one coupling, by two methods."""
+    return Twins(
+        shared=f"A hand taps a wall, K = {TWIN_COUPLING.stiffness:g} N/m and "
+        f"B = {TWIN_COUPLING.damping:g} N s/m",
+        name="method",
+        values=("implicitfast", "implicit"),
+        run=lambda method: Run(
+            scene=base.free_tool_and_wall,
+            device=partial(SimulatedDevice, damping=DEVICE_DAMPING, path=PATH, **NO_LIMITS),
+            coupling=TWIN_COUPLING,
+            # by default 'implicit' has rigid contacts, which 'implicitfast' cannot have
+            options=replace(UNGUARDED_OPTIONS, method=method, contact="scene", rate=1 / PERIOD),
+            duration=1.0,
+        ),
     )

@@ -8,6 +8,8 @@ damper they differ by their B', and each is measured.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
@@ -54,10 +57,6 @@ QUANTUM = STIFFNESS * RESOLUTION
 
 DEVICE_MASS = 0.1
 """Mass m_d in kg of the default simulated device."""
-
-PULL = 1.0
-"""Stiffness of the hand in N/m. Its force varies by a five hundredth of K's step in force, so it
-presses with a steady force."""
 
 PRESSED = 5.5
 """Force of the hand in steps of K Δ. The half matters: the wall can answer with five or six steps,
@@ -154,24 +153,13 @@ def pressed_device(beta: float, sigma: float, limit: float = 10.0) -> SimulatedD
         sigma: f_c/(K Δ), without unit, >= 0.
         limit: Limit of its data sheet, in N and N m.
     """
-    time = [0.0, 0.02, 100.0]
-    target = np.zeros((3, 3))
-    target[1:, 0] = PRESSED * QUANTUM / PULL
-    hand = Hand(
-        mass=0.0,
-        damping=0.0,
-        stiffness=PULL,
-        rotational_inertia=0.0,
-        rotational_damping=0.0,
-        rotational_stiffness=0.0,
-    )
     return SimulatedDevice(
         mass=DEVICE_MASS,
         damping=beta * STIFFNESS * PERIOD,
         friction=sigma * QUANTUM,
         resolution=RESOLUTION,
-        hand=hand,
-        path=Motion(time, target),
+        hand=base.STEADY_HAND,
+        path=base.pressing((0.02, PRESSED * QUANTUM)),
         force_limit=limit,
         torque_limit=limit,
     )
@@ -497,4 +485,49 @@ def predicted_regions(cells: Table) -> NDArray[np.object_]:
             for b, s in zip(cells["beta"], cells["sigma"], strict=True)
         ],
         dtype=object,
+    )
+
+
+TWIN_FORCE = 6.0
+"""Force in N with which the twins' hand presses before it lets go: it leaves a swing of 3 mm, which
+friction alone stops only if it is small."""
+
+TWIN_SIGMA = 0.6
+"""Friction of the twins' device as σ, above the ½ at which a pressed device rests."""
+
+TWIN_BETAS = (0.4, 0.6)
+"""Dampings of the twins' devices as β, on both sides of ½."""
+
+
+def twins() -> Twins:
+    """Returns a device that a hand presses on a wall and lets go, locally stable and passive."""
+    path = base.pressing((0.02, TWIN_FORCE), (0.1, TWIN_FORCE), (0.101, PRESSED * QUANTUM))
+
+    def run(damping: float) -> Run:
+        return Run(
+            scene=partial(base.free_wall, WALL_MASS),
+            device=partial(
+                SimulatedDevice,
+                mass=DEVICE_MASS,
+                damping=damping,
+                friction=TWIN_SIGMA * QUANTUM,
+                resolution=RESOLUTION,
+                hand=base.STEADY_HAND,
+                path=path,
+                **NO_LIMITS,
+            ),
+            coupling=Coupling(STIFFNESS, 0.0, 0.0, 0.0),
+            options=replace(UNGUARDED_OPTIONS, method=METHODS_SHOWN[0], rate=1 / PERIOD),
+            duration=2.0,
+        )
+
+    fails, safe = (beta * STIFFNESS * PERIOD for beta in TWIN_BETAS)
+    return Twins(
+        shared=f"A hand lets go of a wall after pressing with {TWIN_FORCE:g} N, "
+        f"K = {STIFFNESS:g} N/m, friction {1e3 * TWIN_SIGMA * QUANTUM:g} mN, encoder steps of "
+        f"{1e6 * RESOLUTION:g} µm",
+        name="device damping",
+        unit="N s/m",
+        values=(fails, safe),
+        run=run,
     )

@@ -7,6 +7,8 @@ methods behind the coupling then differ only in the B' that their law uses, with
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -16,13 +18,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import SimulatedDevice
+from hapticbridge.device import Motion, SimulatedDevice
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
+from hapticbridge.scene import Scene
 from hapticbridge.sweep import Table
 from hapticbridge.theory.sampled_loop import WorstHand
 
@@ -349,3 +353,67 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "over all lengths; eq. (6), which has no length in it, says {predicted_6:.4g}",
             boundary[name] | {"name": name},
         )
+
+
+TWIN_STIFFNESS = 1e4
+"""Contact stiffness K_c of the twins in N/m per wall; the longest stable peg is 28 mm."""
+
+TWIN_LENGTHS = (0.05, 0.02)
+"""Lengths L of the twins' pegs in m."""
+
+TWIN_TORQUE = 1e-3
+"""Torque in N m with which the twins' hand turns the peg against its walls."""
+
+
+def fitting_peg(length: float) -> Scene:
+    """Loads a peg of length L in m that fills its hole, as ``set_length`` makes it.
+
+    Mass and inertia are the same for any length.
+    """
+    return base.scene_of(f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0" cone="elliptic"><flag diagexact="enable"/></option>
+  <worldbody>
+    <geom type="box" size="0.01 0.01 {length!r}" pos="0.02 0 0"/>
+    <geom type="box" size="0.01 0.01 {length!r}" pos="-0.02 0 0"/>
+    <body name="peg">
+      <joint type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <joint type="hinge" axis="0 1 0"/>
+      <inertial pos="0 0 0" mass="0.1" diaginertia="3e-5 3e-5 1e-5"/>
+      <geom type="box" size="0.01 0.01 {length / 2!r}"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+</mujoco>""")
+
+
+def twins() -> Twins:
+    """Returns a hand that turns a peg in its hole, rendered directly, with two lengths."""
+    turn = np.array([[1.0, 0.0, 0.0, 0.0], [np.cos(0.5), 0.0, np.sin(0.5), 0.0]])
+    device = partial(
+        SimulatedDevice,
+        damping=4 * TWIN_STIFFNESS * PERIOD,
+        rotational_damping=DEVICE_DAMPING,
+        hand=replace(base.STEADY_HAND, stiffness=0.0, rotational_stiffness=TWIN_TORQUE),
+        path=Motion([0.0, PERIOD], np.zeros((2, 3)), turn),  # by 1 rad
+        **NO_LIMITS,
+    )
+    return Twins(
+        shared=f"A hand turns a peg that fills its hole, method 'direct', "
+        f"K_c = {1e-3 * TWIN_STIFFNESS:g} kN/m, device damping "
+        f"{1e3 * DEVICE_DAMPING:g} mN m s/rad",
+        name="length",
+        unit="mm",
+        factor=1e3,
+        values=TWIN_LENGTHS,
+        run=lambda length: Run(
+            scene=partial(fitting_peg, length),
+            device=device,
+            # two contacts on a wall, one at each end of the width
+            coupling=Coupling(TWIN_STIFFNESS / 2, 0.0, 0.0, 0.0),
+            options=replace(UNGUARDED_OPTIONS, method="direct", rate=1 / PERIOD),
+            duration=0.3,
+        ),
+    )

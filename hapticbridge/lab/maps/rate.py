@@ -8,6 +8,8 @@ loop of ``UNEVEN_PERIOD``, whose bound it keeps, beside the bound of a loop as s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import matplotlib
@@ -22,6 +24,7 @@ from hapticbridge.device import Hand, SimulatedDevice
 from hapticbridge.lab.closed_loop import PARTS, LoopOutcome, Timing
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
@@ -505,3 +508,35 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
                 {key: values[-1] for key, values in selected.items()}
                 | {"axis": AXES[what].capitalize(), "hand": hand},
             )
+
+
+TWIN_COUPLING = Coupling(1500.0, 0.0, 0.0, 0.0)
+"""Coupling of the twins: a spring with K = 2b/T at 375 Hz."""
+
+TWIN_FORCE = 1.0
+"""Force in N with which the twins' hand presses."""
+
+
+def twins() -> Twins:
+    """Returns a hand that presses on a wall, at a rate below K T/2 = b and at one above."""
+    device = partial(
+        SimulatedDevice,
+        damping=DEVICE_DAMPING,
+        hand=base.STEADY_HAND,
+        path=base.pressing((0.02, TWIN_FORCE)),
+        **NO_LIMITS,
+    )
+    return Twins(
+        shared=f"A hand presses on a wall with {TWIN_FORCE:g} N, K = {TWIN_COUPLING.stiffness:g} "
+        f"N/m, device damping b = {DEVICE_DAMPING:g} N s/m",
+        name="rate",
+        unit="Hz",
+        values=(200.0, 1000.0),
+        run=lambda rate: Run(
+            scene=partial(base.free_wall, WALL_MASS),
+            device=device,
+            coupling=TWIN_COUPLING,
+            options=replace(UNGUARDED_OPTIONS, method=METHODS_SHOWN[0], rate=rate),
+            duration=0.5,
+        ),
+    )

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import Any
 
 import mujoco
@@ -18,10 +18,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.plotting import new_figure
+from hapticbridge.scene import Scene
 from hapticbridge.sweep import Table
 from hapticbridge.theory.impact import ImpactBody, Law, resolve_impact
 
@@ -370,3 +374,65 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
             "Newton's law {largest_by_newton:+.2g} J; the nearest law is {nearest}",
             selected | {"name": name, "nearest": selected["nearest_law"] or "none"},
         )
+
+
+TWIN_SETTING = SETTINGS["bouncy, implicitfast"]
+"""Contact setting of the twin that fails; the other one has another damping ratio."""
+
+TWIN_RATIOS = (TWIN_SETTING.solref[1], 1.0)
+"""Damping ratios of the twins' contacts, without unit: bouncy, and critically damped."""
+
+TWIN_ANGLE = 45.0
+"""Angle in degrees of the twins' rod above the floor."""
+
+
+def falling_rod(ratio: float) -> Scene:
+    """Loads the rod as it slides and falls, beside a tool that a hand holds still.
+
+    Args:
+        ratio: Damping ratio of the rod's contact, without unit.
+    """
+    angle, (timeconst, _) = float(np.radians(TWIN_ANGLE)), TWIN_SETTING.solref
+    height = float(LENGTH / 2 * np.sin(angle) + TIP + APPROACH * TWIN_SETTING.timestep / 2)
+    low, high = TWIN_SETTING.impedance
+    setting = f"""
+  <default>
+    <geom solref="{timeconst!r} {ratio!r}" solimp="{low!r} {high!r} 0.001"
+      friction="{SHOWN!r} 0 0"/>
+  </default>
+  <worldbody>"""
+    rest = f"""
+    <body name="tool" pos="0 0 1">
+      <freejoint/>
+      <geom type="sphere" size="0.01" mass="0.1" contype="0" conaffinity="0"/>
+      <site name="grip"/>
+    </body>
+  </worldbody>
+  <keyframe>
+    <key name="home" qpos="0 {height!r} {-angle!r} 0 0 1 1 0 0 0"
+      qvel="{SLIDE!r} {-APPROACH!r} 0 0 0 0 0 0 0"/>
+  </keyframe>"""
+    return base.scene_of(ROD.replace("<worldbody>", setting).replace("</worldbody>", rest))
+
+
+def twins() -> Twins:
+    """Returns a rod that slides and falls on the floor, with a bouncy and with a damped contact."""
+    return Twins(
+        shared=f"A rod of {MASS:g} kg falls on MuJoCo's floor at {APPROACH:g} m/s, "
+        f"{TWIN_ANGLE:g}° above it and sliding at {SLIDE:g} m/s, "
+        f"timeconst {1e3 * TWIN_SETTING.solref[0]:g} ms",
+        name="damping ratio of the contact",
+        values=TWIN_RATIOS,
+        run=lambda ratio: Run(
+            scene=partial(falling_rod, ratio),
+            device=partial(SimulatedDevice, path=base.STILL, **NO_LIMITS),
+            coupling=Coupling(1000.0, 0.5, 0.0, 0.0),
+            options=replace(
+                UNGUARDED_OPTIONS,
+                method=TWIN_SETTING.integrator,  # the method of this integrator
+                contact="scene",
+                rate=1 / TWIN_SETTING.timestep,
+            ),
+            duration=0.1,
+        ),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -14,10 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.device import Motion, TrajectoryDevice
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.options import RunSetup
 from hapticbridge.plotting import new_figure
@@ -562,4 +565,28 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
         "The gains of a 'weld' are those of the translation: its torque jumps by up to "
         "{weld:.1g} N m",
         cut["largest_torque_jump"],
+    )
+
+
+TWIN_SPEED = 96.0
+"""Speed in rad/s of the twins' handle: 1.3 times ``cut_speed(SOFT)``; the angle passes π."""
+
+
+def twins() -> Twins:
+    """Returns a handle that turns suddenly and winds the coupling past π, by two methods."""
+    quaternions = turning(TWIN_SPEED, axis=MIDDLE)
+    times = PERIOD * np.arange(len(quaternions))
+    motion = Motion(times, np.zeros((len(times), 3)), quaternions)
+    return Twins(
+        shared=f"A handle turns suddenly at {TWIN_SPEED:g} rad/s with the tool at rest, "
+        f"K_r = {SOFT:g} N m/rad",
+        name="method",
+        values=(UNCORRECTED, "implicit"),
+        run=lambda method: Run(
+            scene=spinning_scene,
+            device=partial(TrajectoryDevice, motion, **NO_LIMITS),
+            coupling=coupling_of(SOFT),
+            options=replace(UNGUARDED_OPTIONS, method=method, contact="scene", rate=1 / PERIOD),
+            duration=0.5,
+        ),
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import mujoco
@@ -18,6 +19,7 @@ from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.closed_loop import LoopOutcome
 from hapticbridge.lab.maps import base
 from hapticbridge.lab.maps.base import Point, Sentences
+from hapticbridge.lab.maps.twins import NO_LIMITS, UNGUARDED_OPTIONS, Run, Twins
 from hapticbridge.lab.methods import METHODS, THEORIES
 from hapticbridge.plotting import new_figure
 from hapticbridge.sweep import Table
@@ -469,3 +471,32 @@ def sentences(boundary: Mapping[str, Any]) -> Sentences:
                 "{disagreements} times",
                 selected.get(what, {}) | {"name": name, "what": what},
             )
+
+
+TWIN_METHOD, TWIN_STIFFNESS = "explicit", 9000.0
+"""Method and K in N/m of the twins; ``min_mass`` is 4.75 g."""
+
+TWIN_MASSES = (0.0045, 0.01)
+"""Masses of the twins' tools in kg."""
+
+TWIN_INERTIA = 1e-5
+"""Moment of inertia of the twins' tools in kg m²; they do not turn."""
+
+
+def twins() -> Twins:
+    """Returns a hand that swings a free tool, lighter and heavier than ``min_mass``."""
+    return Twins(
+        shared=f"A hand swings a free tool, method '{TWIN_METHOD}', K = {TWIN_STIFFNESS:g} N/m and "
+        f"B = {DAMPING:g} N s/m",
+        name="mass of the tool",
+        unit="g",
+        factor=1e3,
+        values=TWIN_MASSES,
+        run=lambda mass: Run(
+            scene=partial(base.scene_of, base.free_body(mass, np.full(3, TWIN_INERTIA))),
+            device=partial(SimulatedDevice, damping=DEVICE_DAMPING, path=PATH, **NO_LIMITS),
+            coupling=coupling_of(TWIN_STIFFNESS),
+            options=replace(UNGUARDED_OPTIONS, method=TWIN_METHOD, rate=1 / PERIOD),
+            duration=0.1,  # a little longer, and the lighter tool is no longer finite
+        ),
+    )
