@@ -101,6 +101,7 @@ DECISIVE = (
     "scene_parameters",
     "grip",
     "method",
+    "contact",
     "period_s",
     "substeps",
     "stiffness",

@@ -67,5 +67,7 @@ class Coupling:
                 )
             if value < 0:
                 raise CouplingError(f"coupling {name} is {value:g}; it must be >= 0")
+            # as a recording stores it: MuJoCo gets −B, and −0 is another bit pattern than −0.0
+            object.__setattr__(self, field.name, float(value))
         if self.stiffness == 0:
             raise CouplingError("coupling stiffness is 0 N/m; it must be > 0")

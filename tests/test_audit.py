@@ -98,6 +98,15 @@ def test_same_motion_under_the_default_integrator_is_strict(tmp_path: Path) -> N
     assert (report.verdict, report.environment) == ("passive", "strict")
 
 
+def test_whole_numbers_and_limits_far_away_are_audited_as_any_others(tmp_path: Path) -> None:
+    path = tmp_path / "whole.mcap"
+    limits = Limits(force=1e12, torque=1e10)
+    device, gains = ScriptedDevice(circling, strength=1e12), Coupling(200, 0, 0, 0)
+    recorded(path, "point_mass", device, gains, duration=0.1, limits=limits, method="implicit")
+    report = audit(path)
+    assert (report.verdict, report.reason.split()[0]) == ("passive", "the")
+
+
 @pytest.mark.filterwarnings("ignore:.*more energy than the coupling's slack:UserWarning")
 def test_stiff_contact_on_a_light_tool_is_active(tmp_path: Path) -> None:
     scene = tmp_path / "wall.xml"

@@ -164,10 +164,10 @@ def test_runs_at_two_rates_are_compared_at_common_ticks(tmp_path: Path, call: Ca
 
 
 def test_what_decided_run_is_told_where_it_differs(tap: Path, tmp_path: Path, call: Called) -> None:
-    meta = {"stiffness": "17.0", "started": "1970-01-01", "versions": "{}"}
+    meta = {"stiffness": "17.0", "contact": "a", "started": "1970-01-01", "versions": "{}"}
     other = changed(tap, tmp_path, lambda rows: None, meta=meta)
     found = compare(tap, other)
-    assert set(found.decisive) == {"stiffness"}
+    assert set(found.decisive) == {"stiffness", "contact"}
     assert set(found.beside) == {"versions"}
     assert not found.is_same
     code, out, _ = call("compare", tap, other, "--json")

@@ -134,9 +134,8 @@ def _newest(is_on: Flags) -> NDArray[np.int64]:
 def _shortened(vector: Array, limit: Array | float) -> Array:
     """Scales vectors (n, 3) down to a largest norm."""
     norm = np.linalg.norm(vector, axis=1)
-    return np.asarray(
-        vector * np.where(norm > limit, limit / np.maximum(norm, 1e-300), 1.0)[:, None]
-    )
+    share = np.divide(limit, norm, out=np.ones_like(norm), where=norm > limit)
+    return np.asarray(vector * share[:, None])
 
 
 def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float) -> Array:
