@@ -479,4 +479,5 @@ def guard_parameters_for(
         energy=limits.energy,
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
+        stated_delay=info.delay or 0.0,
     )

@@ -359,6 +359,7 @@ FORGERIES: dict[str, Forgery] = {
             *("swing_energy", "runaway_speed"),
         )
     },
+    "guard: stated delay": seen(hand, entry("guard", stated_delay=0.05)),
     "guard: idle force": again(hand, guard("idle_force", 2.0)),
     "guard: idle torque": again(hand, guard("idle_torque", 2.0)),
     "guard: hold force out of range": seen(hand, guard("hold_force", -1.0)),

@@ -76,6 +76,25 @@ def test_a_shaken_device_2_ms_late_is_no_alarm(name: str, grip: str) -> None:
     assert not summary.timekeeping.watch
 
 
+@pytest.mark.parametrize(
+    ("delay", "name", "grip", "motion"),
+    [
+        (3, "point_mass", "firm", (8.0, 0.03)),
+        (5, "virtual_wall", "arm", (3.0, 0.03)),
+        (5, "hammer", "arm", (3.0, 0.03)),
+    ],
+)
+def test_a_late_device_is_no_alarm_if_it_states_its_delay(
+    delay: int, name: str, grip: str, motion: tuple[float, float]
+) -> None:
+    device = SimulatedDevice(path=shakes(name, *motion), hand=GRIPS[grip], delay=delay)
+    for stated, is_alarm in ((1e-3 * delay, False), (0.0, True)):
+        device.info = replace(device.info, delay=stated)
+        with hb.Bridge(name, device, clock=hb.SimulatedClock()) as bridge:
+            summary = bridge.run(3.0)
+        assert bool(summary.timekeeping.watch) is is_alarm
+
+
 @pytest.mark.parametrize("name", ["hammer", "virtual_wall", "ratchet", "peg_in_hole"])
 def test_a_scenes_own_task_is_no_alarm(name: str) -> None:
     assert not alarms(name, None, None)

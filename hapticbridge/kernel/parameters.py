@@ -45,6 +45,7 @@ _NOT_NEGATIVE = (
     "max_damping",
     "max_rotational_damping",
     "energy_credit_limit",
+    "stated_delay",
 )
 
 
@@ -90,6 +91,7 @@ class GuardParameters:
         swing_energy: Energy in J that a late force would give within 0.3 s, at a limit of 10 N or
             0.5 N m, above which the watch suspects the device (``kernel.swing_watch``).
         runaway_speed: Speed in m/s gained against a limit of 10 N above which it does.
+        stated_delay: Delay in s that the device states; the watch suspects a longer one.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -120,6 +122,7 @@ class GuardParameters:
     idle_torque: float = math.inf
     swing_energy: float = math.inf
     runaway_speed: float = math.inf
+    stated_delay: float = 0.0
 
     def __post_init__(self) -> None:
         if self.controller not in (OFF, DAMPER, ENVIRONMENT):

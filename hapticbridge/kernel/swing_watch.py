@@ -24,6 +24,9 @@ force that acts τ later gives Σ W·V + τ Σ W·A. Where c >= 0.6, the delay i
 
     τ_0 = (b Σ V² − Σ W·V)/Σ W·A
 
+Of a device that states a delay τ_d, Σ W·V + τ_d Σ W·A stands for Σ W·V in τ_0 and p where c > 0:
+a delay that is known, and for which the coupling was chosen, is no fault.
+
 Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5 N m, in proportion:
     reversed or exchanged: c <= −0.6 with p <= 0.2, or x >= 0.6 with c and p < 0.6, or x >= 0.55
     with E_s >= E, for 12 ms. The force is taken away.
@@ -179,6 +182,7 @@ WATCH_DTYPE = np.dtype(
     [
         ("block_ticks", "<i8"),
         ("block", "<f8"),
+        ("stated_delay", "<f8"),
         ("lags", "<i8", len(LAGS)),
         ("sections", "<f8", 6),
         ("corner", "<f8"),
@@ -237,7 +241,7 @@ WATCH_DTYPE = np.dtype(
 """Sub-record ``watch``, written by this module alone. ``block_ticks`` is 0 without a watch; pairs
 are translation and rotation.
 
-The first fourteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
+The first fifteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
 slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
 N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_share`` the one
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
@@ -259,6 +263,7 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
         return
     watch["block_ticks"] = ticks = max(round(BLOCK / period), 1)
     watch["block"] = block = ticks * period
+    watch["stated_delay"] = limits.stated_delay
     watch["lags"] = [min(max(round(lag / block), 1), RING - 1) for lag in LAGS]
     watch["sections"] = _butterworth(min(FAST * block, 0.2))
     watch["corner"] = 1.0 - math.exp(-2.0 * math.pi * SLOWEST * block)
@@ -575,11 +580,12 @@ def _verdict(s: State, kind: int) -> int:
     power, along, across, delay = 1.0, 1.0, 1.0, 0.0
     if is_known and watch.speed_square[kind] > 0.0:
         scale = math.sqrt(wrench * change)
-        power = watch.power[kind] / math.sqrt(wrench * watch.speed_square[kind])
         along = watch.along[kind] / scale
+        taken = watch.power[kind] + watch.stated_delay * max(watch.along[kind], 0.0)
+        power = taken / math.sqrt(wrench * watch.speed_square[kind])
         if along >= FOLLOWED:
             burnt = _damping(s, kind) * watch.speed_square[kind]
-            delay = (burnt - watch.power[kind]) / watch.along[kind]
+            delay = (burnt - taken) / watch.along[kind]
         x, y, z = watch.across[3 * kind], watch.across[3 * kind + 1], watch.across[3 * kind + 2]
         across = math.sqrt(x * x + y * y + z * z) / scale
     is_working = late >= enough

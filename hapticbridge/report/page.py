@@ -103,6 +103,7 @@ _GUARD = {
     "idle_torque": "N m",
     "swing_energy": "J",
     "runaway_speed": "m/s",
+    "stated_delay": "s",
     "motors": "(mask of axes)",
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",
