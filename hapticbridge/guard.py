@@ -387,6 +387,10 @@ IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
 """Force in N and torque in N m, beyond the tool's weight, to which the coupling relaxes while the
 hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
 
+DELAY_MARGINS = 2.4e-3, 1.3e-3
+"""Time in s by which a delay must exceed the device's to be a finding: of an unknown one and of one
+that is stated (``kernel.swing_watch`` has what honest hands reach)."""
+
 SWING_ENERGY, RUNAWAY_SPEED = 8e-3, 0.1
 """Energy in J and speed in m/s above which the watch suspects a late or reversed force
 (``kernel.swing_watch`` has the reasons)."""
@@ -480,4 +484,5 @@ def guard_parameters_for(
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
         stated_delay=info.delay or 0.0,
+        delay_margin=DELAY_MARGINS[info.delay is not None],
     )

@@ -36,6 +36,7 @@ _POSITIVE = (
     "idle_torque",
     "swing_energy",
     "runaway_speed",
+    "delay_margin",
 )
 _TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
 _NOT_NEGATIVE = (
@@ -91,7 +92,8 @@ class GuardParameters:
         swing_energy: Energy in J that a late force would give within 0.3 s, at a limit of 10 N or
             0.5 N m, above which the watch suspects the device (``kernel.swing_watch``).
         runaway_speed: Speed in m/s gained against a limit of 10 N above which it does.
-        stated_delay: Delay in s that the device states; the watch suspects a longer one.
+        stated_delay: Delay in s that the device states; 0 without a statement.
+        delay_margin: Time in s by which a delay must exceed the stated one to be a finding.
 
     Raises:
         HapticBridgeError: A value is out of range.
@@ -123,6 +125,7 @@ class GuardParameters:
     swing_energy: float = math.inf
     runaway_speed: float = math.inf
     stated_delay: float = 0.0
+    delay_margin: float = math.inf
 
     def __post_init__(self) -> None:
         if self.controller not in (OFF, DAMPER, ENVIRONMENT):

@@ -30,10 +30,10 @@ a delay that is known, and for which the coupling was chosen, is no fault.
 Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5 N m, in proportion:
     reversed or exchanged: c <= −0.6 with p <= 0.2, or x >= 0.6 with c and p < 0.6, or x >= 0.55
     with E_s >= E, for 12 ms. The force is taken away.
-    late: p <= −0.4 with E_s >= E/4, or p <= −0.3 with E_s >= E, for 12 ms; or τ_0 >= 2.4 ms with
-    E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12 ms. The greatest ratio r of the
-    lever between device and handle is halved, hence the stiffness quartered; again for each E_s >=
-    E.
+    late: p <= −0.4 with E_s >= E/4, or p <= −0.3 with E_s >= E, for 12 ms; or τ_0 >= 1.3 ms, 2.4
+    ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
+    ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
+    quartered; again for each E_s >= E.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -71,8 +71,9 @@ that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
 Limits of the method: a motor that holds for 60 ms gives two fingers up to 0.4 J within one hold,
 before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12 to 20 ms
-late gives two fingers up to 0.5 J within the throw in which it is found. A force 2 ms later than
-its device states is not found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s.
+late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms
+later than its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late
+is not found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s.
 A weak hand that follows a reversed force slowly looks like one that pushes. A hand stronger than
 any force, as a robot's, whose speed jumps is taken for a late device. A device with prescribed
 motion is not watched (``guard.guard_parameters_for``).
@@ -131,9 +132,9 @@ p = −0.4 at 33 Hz."""
 LATE_AT_WORK, TURNED_AT_WORK = -0.3, 0.55
 """Bounds of p and x that are enough where E_s >= E; no unit."""
 
-DELAY, DELAY_BLOCKS = 2.4e-3, 10
-"""Least τ_0 in s for a finding, and its blocks in a row. Within 3 blocks an arm that shakes a
-device 2 ms late by 30 mm at 8 Hz shows up to 2.9 ms, within 10 blocks 2.3 ms."""
+DELAY_BLOCKS = 10
+"""Blocks in a row of τ_0 for a finding. Within 3 blocks an arm that shakes a device 2 ms late by 30
+mm at 8 Hz shows up to 2.9 ms, within 10 blocks 2.3 ms."""
 
 BLOCKS = 3
 """Blocks in a row for a finding."""
@@ -183,6 +184,7 @@ WATCH_DTYPE = np.dtype(
         ("block_ticks", "<i8"),
         ("block", "<f8"),
         ("stated_delay", "<f8"),
+        ("delay_margin", "<f8"),
         ("lags", "<i8", len(LAGS)),
         ("sections", "<f8", 6),
         ("corner", "<f8"),
@@ -241,7 +243,7 @@ WATCH_DTYPE = np.dtype(
 """Sub-record ``watch``, written by this module alone. ``block_ticks`` is 0 without a watch; pairs
 are translation and rotation.
 
-The first fifteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
+The first sixteen are thresholds and filters: ``sections`` those of the high-pass, ``corner`` the
 slow filters' gain per block, ``kept`` what the three memories keep of a block, ``limits`` in N and
 N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, ``max_share`` the one
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
@@ -263,7 +265,7 @@ def bind_watch(watch: Part, parameters: RunParameters) -> None:
         return
     watch["block_ticks"] = ticks = max(round(BLOCK / period), 1)
     watch["block"] = block = ticks * period
-    watch["stated_delay"] = limits.stated_delay
+    watch["stated_delay"], watch["delay_margin"] = limits.stated_delay, limits.delay_margin
     watch["lags"] = [min(max(round(lag / block), 1), RING - 1) for lag in LAGS]
     watch["sections"] = _butterworth(min(FAST * block, 0.2))
     watch["corner"] = 1.0 - math.exp(-2.0 * math.pi * SLOWEST * block)
@@ -592,7 +594,7 @@ def _verdict(s: State, kind: int) -> int:
     is_late = power <= LATE and late >= LITTLE * enough
     is_late = is_late or (power <= LATE_AT_WORK and is_working)
     counts[at] = counts[at] + 1 if is_late else 0
-    has_delay = delay >= DELAY and is_working
+    has_delay = delay >= watch.delay_margin and is_working
     counts[at + 4] = counts[at + 4] + 1 if has_delay else 0
     is_reversed = along <= REVERSED and power <= FORWARD
     counts[at + 1] = counts[at + 1] + 1 if is_reversed else 0

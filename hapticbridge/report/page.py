@@ -104,6 +104,7 @@ _GUARD = {
     "swing_energy": "J",
     "runaway_speed": "m/s",
     "stated_delay": "s",
+    "delay_margin": "s",
     "motors": "(mask of axes)",
     "clutch": "(mask of buttons)",
     "dead_man": "(mask of buttons)",

@@ -662,6 +662,7 @@ UNSEEN = (
     unseen("exchanged axes, 5 N", lambda: _exchanged, DEFAULT_HAND, "taken away", 5.0),
     unseen("reversed axis, 5 N", lambda: _reversed_x, FINGERS, "taken away", 5.0),
     unseen("force 20 ms late, 5 N", late(lambda _: 20), FINGERS, limit=5.0),
+    unseen("torque 2 ms late", late(lambda _: 2), TWO_FINGERS_TURN),
     unseen("torque 3 ms late", late(lambda _: 3), TWO_FINGERS_TURN),
     unseen("torque 5 ms late", late(lambda _: 5), TWO_FINGERS_TURN),
     unseen("torque 14 ms late", late(lambda _: 14), TWO_FINGERS_TURN),
