@@ -359,6 +359,7 @@ FORGERIES: dict[str, Forgery] = {
             *("swing_energy", "runaway_speed"),
         )
     },
+    "guard: delay margin": seen(hand, entry("guard", delay_margin=1.0)),
     "guard: stated delay": seen(hand, entry("guard", stated_delay=0.05)),
     "guard: idle force": again(hand, guard("idle_force", 2.0)),
     "guard: idle torque": again(hand, guard("idle_torque", 2.0)),

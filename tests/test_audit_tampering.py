@@ -249,6 +249,16 @@ def test_numpy_alone_finds_what_exceeds_its_tolerance(
     assert report.resimulation == ""
 
 
+def test_a_recording_from_before_the_watch_knew_delays_is_simulated_bit_for_bit(
+    held: Recording, tmp_path: Path
+) -> None:
+    guard = json.loads(held.meta["guard"])
+    assert guard.pop("stated_delay") == 0.0
+    assert guard.pop("delay_margin") > 0.0
+    report = verdict_of(held, tmp_path, meta={"guard": json.dumps(guard)})
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
 def test_a_recording_of_an_earlier_version_is_refused_exported_and_repaired(
     tap: Recording, tmp_path: Path
 ) -> None:

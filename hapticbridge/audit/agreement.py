@@ -7,6 +7,7 @@ others determine must therefore agree.
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
@@ -22,7 +23,7 @@ from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.errors import DeviceError, RecordingError
 from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
-from hapticbridge.kernel.parameters import UNGUARDED
+from hapticbridge.kernel.parameters import UNGUARDED, WITHOUT_DELAY
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rehearsal import start_handle, static_load
@@ -120,7 +121,9 @@ def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
         controller=None if info.is_prescribed else names[guard.controller],
     )
     source = "data sheet, coupling and limits"
-    free = {name: getattr(guard, name) for name in _CHOSEN}
+    # without a margin the run is of before the watch knew delays (``parameters.WITHOUT_DELAY``)
+    chosen = _CHOSEN if math.isfinite(guard.delay_margin) else (*_CHOSEN, *WITHOUT_DELAY)
+    free = {name: getattr(guard, name) for name in chosen}
     for name, value in asdict(replace(derived, **free)).items():
         yield Statement(f"guard parameter '{name}'", getattr(guard, name), value, source)
     load = guard.idle_force - IDLE_FORCE, guard.idle_torque - IDLE_TORQUE

@@ -56,6 +56,10 @@ EARLIER_VERSION = (
 )
 
 
+WITHOUT_DELAY = {"stated_delay": 0.0, "delay_margin": None}
+"""Guard of a recording from before the watch knew delays: it judged none by ``delay_margin``."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardParameters:
     """Limits and thresholds of the guard within a tick; all are off by default.
@@ -174,6 +178,8 @@ class GuardParameters:
         names = {field.name for field in fields(cls)}
         if "controller" in values and "hold_force" not in values:
             raise HapticBridgeError(EARLIER_VERSION)
+        if values and not values.keys() & WITHOUT_DELAY.keys():
+            values |= WITHOUT_DELAY
         if values.keys() != names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
