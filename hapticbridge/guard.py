@@ -388,8 +388,8 @@ IDLE_FORCE, IDLE_TORQUE = 0.1, 0.005
 hand lets go. With more, the force that comes back when the hand takes hold would surprise it."""
 
 DELAY_MARGINS = 2.4e-3, 1.3e-3
-"""Time in s by which a delay must exceed the device's to be a finding: of an unknown one and of one
-that is stated (``kernel.swing_watch`` has what honest hands reach)."""
+"""Excess in s over the device's delay that is a finding: without a stated delay, and with one
+(``kernel.swing_watch`` has what honest hands reach)."""
 
 SWING_ENERGY, RUNAWAY_SPEED = 8e-3, 0.1
 """Energy in J and speed in m/s above which the watch suspects a late or reversed force

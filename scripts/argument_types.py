@@ -1,9 +1,10 @@
-"""Types of the scripts' options: argparse ends with a sentence where a number is out of range."""
+"""Types of the scripts' options: argparse ends with a sentence where one is wrong."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from pathlib import Path
 
 
 def whole(text: str) -> int:
@@ -30,3 +31,15 @@ def positive(text: str) -> float:
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r:.60} is no number above 0")
     return value
+
+
+def new_file(text: str) -> Path:
+    """Returns the path of a file that can be written later.
+
+    Raises:
+        argparse.ArgumentTypeError: Its folder is missing, or it is a folder itself.
+    """
+    path = Path(text)
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r:.60} is no file in an existing folder")
+    return path

@@ -324,6 +324,8 @@ def test_page_says_who_is_ahead_of_the_default_by_how_much_and_what_it_takes() -
     even = [replace(each, score=own[1].score) for each in own]
     assert standing([*even, exact]).endswith("and its error hardly falls with the step.")
     assert standing([own[1], exact]).endswith("at any step that was tried.")
+    lucky = [replace(own[0], score=exact.score), *own[1:]]  # the coarsest alone
+    assert "at any step that was tried; as its error" in standing([*lucky, exact])
     # what is cheaper and worse, or dearer and better, or not passive, or slower is not ahead
     others = [
         made_up(0.005, 0.5),

@@ -13,6 +13,7 @@ from hapticbridge.cli import main
 from hapticbridge.lab.maps import MAPS
 from hapticbridge.lab.maps.twins import ENDINGS, RecordedTwins
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.units import format_energy
 
 PORTS = {
     "coupling": "environment",
@@ -82,7 +83,8 @@ def test_one_twin_fails_at_its_port_and_the_other_one_holds(
     assert (fails.verdict, fails.port, fails.exit_code) == ("active", PORTS[name], 1)
     assert (safe.verdict, safe.certified is False, safe.exit_code) == ("passive", False, 0)
     assert {fails.resimulation, safe.resimulation} == {"bit for bit"}
-    assert f"{fails.words} from tick {fails.tick}; safe twin: " in twins.sentence
+    assert f"{fails.words}, up to {format_energy(twins.excess)} beyond the bound" in twins.sentence
+    assert twins.excess >= fails.joules > 0.0
     assert twins.sentence.endswith(f"all else equal: {safe.words}")
     assert max(report.path.stat().st_size for report in twins.reports) < 1e6
 

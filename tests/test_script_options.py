@@ -1,4 +1,4 @@
-"""Numbers that a script's option refuses in a sentence."""
+"""What a script's option refuses in a sentence."""
 
 from __future__ import annotations
 
@@ -26,3 +26,11 @@ def test_what_is_no_count_is_refused(text: str) -> None:
 def test_what_is_no_positive_number_is_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="no number above 0"):
         TYPES["positive"](text)
+
+
+def test_a_file_to_write_is_refused_before_the_work_if_it_cannot_be(tmp_path: Path) -> None:
+    assert TYPES["new_file"](str(tmp_path / "found.json")) == tmp_path / "found.json"
+    assert TYPES["new_file"]("found.json") == Path("found.json")
+    for path in (tmp_path, tmp_path / "none" / "found.json"):
+        with pytest.raises(argparse.ArgumentTypeError, match="no file in an existing folder"):
+            TYPES["new_file"](str(path))

@@ -175,7 +175,7 @@ def what_ifs(
     in_process: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> list[WhatIf]:
-    """Asks ``what_if`` for several changes; what does not depend on them is simulated once.
+    """Simulates a recorded run with each of several changes, and once with nothing changed.
 
     Arguments and errors are those of ``what_if``, with a mapping for each change.
     """
@@ -195,6 +195,8 @@ def what_ifs(
             )
         file = folder / "run.mcap"
         experiment = _Experiment(hands, report, file, steps, judge, in_process)
+        for changes in alternatives:  # refuses a bad value before anything is simulated
+            experiment.settings_with(changes)
         return [experiment.changed(changes) for changes in alternatives]
 
 
@@ -241,13 +243,17 @@ class _Experiment:
         """True if several hands hold the scene."""
         return len(self.hands) > 1
 
+    def settings_with(self, changes: Mapping[str, Value]) -> tuple[list[Settings], Any]:
+        """Returns the changed settings of each hand, and the changes as ``WhatIf`` has them."""
+        by_grip = {hand.parameters.grip: hand.settings for hand in self.hands}
+        new, changed_values = changed_of_hands(by_grip, changes)
+        return list(new.values()), changed_values
+
     def changed(self, changes: Mapping[str, Value]) -> WhatIf:
         """Runs all repetitions and returns the result."""
         self.concerns = {}
         run, settings = self.run, [hand.settings for hand in self.hands]
-        grips = [hand.parameters.grip for hand in self.hands]
-        by_grip, changed_values = changed_of_hands(dict(zip(grips, settings, strict=True)), changes)
-        new = list(by_grip.values())
+        new, changed_values = self.settings_with(changes)
         is_changed = new != settings
         notes = []
         if not self._is_scene_as_recorded():

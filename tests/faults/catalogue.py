@@ -611,6 +611,11 @@ def _exchanged(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     return wrench
 
 
+def exchanging() -> Change:
+    """Returns motors whose axes x and y are exchanged, one of them reversed."""
+    return _exchanged
+
+
 def _reversed_torque(_tick: int, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     wrench[3:] *= -1.0
     return wrench

@@ -53,7 +53,7 @@ IMPERCEPTIBLE = 0.1
 
 ALONE = " No other time step bears this out, so it may be luck."
 
-LEAST_ORDER = 0.25
+LEAST_ORDER = 0.5
 """Order in the step below which an error is not extrapolated. Methods here have 1 or 2."""
 
 TOLERANCE = 1e-9
@@ -215,20 +215,20 @@ def _period_words(points: Sequence[Measurement], error: float) -> str:
         if replace(each.setting, period=DEFAULT.period) == DEFAULT and 0 < each.score.jnd < math.inf
     )
     name = DEFAULT.method.name
-    reached = [pair for pair in own if pair[1] <= error]
-    is_reached = bool(reached)
-    if is_reached and max(reached) == own[-1]:
+    # where a finer step misses the error, a coarser one meets it by luck
+    reached = next((k for k, (_, jnd) in enumerate(own) if jnd > error), len(own))
+    if reached and reached == len(own):
         return f"'{name}' reaches that error at {1e3 * own[-1][0]:.2g} ms."
-    ends = own[own.index(max(reached)) :][:2] if is_reached else own[:2]
     not_tried = f"'{name}' does not reach that error at any step that was tried"
-    if len(ends) < 2:
+    first = max(reached - 1, 0)
+    if len(own) < 2 or error <= 0.0:
         return f"{not_tried}."
-    (low, below), (high, above) = ends
+    (low, below), (high, above) = own[first : first + 2]
     order = math.log(above / below) / math.log(high / low)
-    if not is_reached and order < LEAST_ORDER:
+    if not reached and order < LEAST_ORDER:
         return f"{not_tried}, and its error hardly falls with the step."
     step = f"{1e3 * low * (error / below) ** (1 / order):.2g} ms"
-    if is_reached:
+    if reached:
         return f"'{name}' reaches that error at a period of {step}."
     return f"{not_tried}; as its error falls with the step, it would take a period of {step}."
 

@@ -500,7 +500,7 @@ TWIN_BETAS = (0.4, 0.6)
 
 
 def twins() -> Twins:
-    """Returns a device that a hand presses on a wall and lets go, locally stable and passive."""
+    """Returns a hand that lets go of a wall, with less device damping than K T/2 and with more."""
     path = base.pressing((0.02, TWIN_FORCE), (0.1, TWIN_FORCE), (0.101, PRESSED * QUANTUM))
 
     def run(damping: float) -> Run:

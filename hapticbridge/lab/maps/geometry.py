@@ -404,7 +404,7 @@ def twins() -> Twins:
         shared=f"A hand turns a peg that fills its hole, method 'direct', "
         f"K_c = {1e-3 * TWIN_STIFFNESS:g} kN/m, device damping "
         f"{1e3 * DEVICE_DAMPING:g} mN m s/rad",
-        name="length",
+        name="length of peg and hole",
         unit="mm",
         factor=1e3,
         values=TWIN_LENGTHS,

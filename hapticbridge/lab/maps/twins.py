@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from signal import Signals
 from typing import Any
 
 from hapticbridge.audit import AuditReport, audit
@@ -13,9 +15,15 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device
+from hapticbridge.files import atomic_write
 from hapticbridge.guard import UNLIMITED
 from hapticbridge.options import BridgeOptions
+from hapticbridge.recording import read_recording
+from hapticbridge.report.cause import excess_of
+from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene import Scene
+from hapticbridge.signals import StopSignal
+from hapticbridge.units import format_energy
 
 ENDINGS = ("fails.mcap", "safe.mcap")
 """Endings of the files of both twins, the one that fails first."""
@@ -72,9 +80,9 @@ class Run:
                 recording=path,
             )
             with bridge:
-                summary = bridge.run(self.duration)
-        if summary.stopped_by == "signal":
-            raise KeyboardInterrupt  # the bridge ended the run, and the map must end too
+                bridge.run(self.duration)
+        if name := bridge.session.signal:  # it ended the run, and must end the map
+            raise StopSignal(Signals[name])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,9 +109,13 @@ class Twins:
         """Records and audits both runs, the one that fails first."""
         reports = []
         for path, value in zip(paths, self.values, strict=True):
-            self.run(value).record(path)
+            with atomic_write(path) as beside:
+                self.run(value).record(beside)
             reports.append(audit(path, in_process=True))
-        return RecordedTwins(self, (reports[0], reports[1]))
+        fails, safe = reports
+        evidence = Evidence.of(read_recording(fails.path, 0))
+        excess = evidence and excess_of(evidence, fails, in_process=True)
+        return RecordedTwins(self, (fails, safe), excess.worst if excess else math.nan)
 
     def named(self, value: Any) -> str:
         """Returns the name with a value, such as ``rate 200 Hz``."""
@@ -119,34 +131,37 @@ class RecordedTwins:
     Attributes:
         twins: The runs.
         reports: Audit of each recording, of the one that fails first.
+        excess: Largest energy in J of the run that fails beyond its bound.
     """
 
     twins: Twins
     reports: tuple[AuditReport, AuditReport]
+    excess: float
 
     @property
     def sentence(self) -> str:
         """Values and verdicts of both runs in a sentence, without a full stop."""
         (fails, safe), names = self.reports, [*map(self.twins.named, self.twins.values)]
         return (
-            f"{self.twins.shared}, {names[0]}: {_verdict(fails)}; safe twin: {names[1]}, all else "
-            f"equal: {_verdict(safe)}"
+            f"{self.twins.shared}, {names[0]}: {fails.words}, up to {format_energy(self.excess)} "
+            f"beyond the bound; safe twin: {names[1]}, all else equal: {safe.words}"
         )
 
     @property
     def facts(self) -> dict[str, Any]:
-        """File, value and verdict of each run, and the sentence, for JSON."""
+        """File, value and verdict of each run, the sentence and the excess, for JSON."""
         each = {
             ending.partition(".")[0]: {
                 "file": report.path.name,
-                self.twins.name: value,
+                "value": value,
                 "verdict": report.words,
                 "tick": report.tick,
             }
             for ending, value, report in zip(ENDINGS, self.twins.values, self.reports, strict=True)
         }
-        return {"sentence": self.sentence, **each}
-
-
-def _verdict(report: AuditReport) -> str:
-    return report.words if report.tick is None else f"{report.words} from tick {report.tick}"
+        return {
+            "sentence": self.sentence,
+            "name": self.twins.name,
+            "excess_j": self.excess,
+            **each,
+        }
