@@ -1,4 +1,4 @@
-"""What a script's option refuses in a sentence."""
+"""Values that a script's option refuses in a sentence."""
 
 from __future__ import annotations
 
