@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.cli import main
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.lab.maps import MAPS
 from hapticbridge.lab.maps.twins import ENDINGS, RecordedTwins
 from hapticbridge.recording import Recording, read_recording
+from hapticbridge.signals import StopSignal
 from hapticbridge.units import format_energy
 
 PORTS = {
@@ -117,3 +123,23 @@ def test_the_command_writes_the_twins_and_names_them(
     (tmp_path / files[1]).mkdir()
     assert main(command) == 2
     assert files[1] in capsys.readouterr().err
+
+
+def test_a_signal_ends_the_recording_of_twins_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, count = SimulatedDevice.read, itertools.count()
+
+    def read_until_stopped(device: SimulatedDevice, sample: NDArray[np.void]) -> int:
+        if next(count) == 20:
+            signal.raise_signal(signal.SIGTERM)
+        return read(device, sample)
+
+    monkeypatch.setattr(SimulatedDevice, "read", read_until_stopped)
+    paths = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    paths[0].write_text("old")
+    with pytest.raises(StopSignal) as stop:
+        MAPS["restitution"].twins().record(paths)
+    assert stop.value.number == signal.SIGTERM
+    assert paths[0].read_text() == "old"
+    assert list(tmp_path.iterdir()) == [paths[0]]
