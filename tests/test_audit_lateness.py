@@ -13,6 +13,7 @@ from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, SimulatedDevice
+from hapticbridge.record import TickFlag, has_flag
 from hapticbridge.recording import read_recording
 
 RETREAT = """t,x,y,z,qw,qx,qy,qz
@@ -63,10 +64,11 @@ def test_a_coupling_that_forgets_the_delay_kicks_and_the_audit_says_so(tmp_path:
     assert report.resimulation == "bit for bit"
 
 
-def test_a_device_that_hides_its_delay_would_be_certified(tmp_path: Path) -> None:
+def test_a_device_that_hides_its_delay_is_found_by_its_swing(tmp_path: Path) -> None:
     report, swing = held_to_an_anvil(tmp_path, 3000.0, delay=0.0)
     assert swing > 3e-3
-    assert (report.verdict, report.certified) == ("passive", True)
+    assert (report.verdict, report.certified) == ("passive", False)
+    assert has_flag(read_recording(tmp_path / "run.mcap").ticks, TickFlag.SWINGING).any()
 
 
 def test_a_quick_retreat_from_a_loaded_spring_is_no_kick(tmp_path: Path) -> None:

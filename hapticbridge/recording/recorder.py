@@ -183,25 +183,23 @@ class Recorder:
         self._is_closed = False
         self.is_disk_full = False
         self.is_left = self._has_failed = False
-        process = None
-        try:
-            with deferring_stops():
-                process = self._process = recorder_process()
-        except BaseException:  # a stop: the caller does not have the process to end it
-            if process is not None:
-                process.kill()
-                process.wait(STANDSTILL)
-                for stream in (process.stdin, process.stdout):
-                    cast(IO[bytes], stream).close()
-            raise
-        self._input = cast(IO[bytes], self._process.stdin)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
         pieces = [json.dumps(configuration).encode() + b"\n"]
         pieces += [each.data for each in attachments]
-        # in a separate thread, because attachments exceed a pipe's buffer
-        self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
-        self._sender.start()
+        is_started = False
+        try:
+            with deferring_stops():
+                self._process = recorder_process()
+                self._input = cast(IO[bytes], self._process.stdin)
+                self._listener = threading.Thread(target=self._listen, daemon=True)
+                # in a separate thread, because attachments exceed a pipe's buffer
+                self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
+                self._listener.start()
+                self._sender.start()
+                is_started = True
+        except BaseException:  # a stop: the caller does not have the recorder to end it
+            if is_started:
+                self.abort()
+            raise
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Waits until the file is open and has its metadata and attachments.
