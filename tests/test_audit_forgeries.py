@@ -360,6 +360,10 @@ FORGERIES: dict[str, Forgery] = {
         )
     },
     "guard: delay margin": seen(hand, entry("guard", delay_margin=1.0)),
+    "guard: a delay and no margin": seen(
+        hand, entry("guard", stated_delay=0.05, delay_margin=None)
+    ),
+    "guard: no margin": hidden(hand, entry("guard", delay_margin=None), LESS),
     "guard: stated delay": seen(hand, entry("guard", stated_delay=0.05)),
     "guard: idle force": again(hand, guard("idle_force", 2.0)),
     "guard: idle torque": again(hand, guard("idle_torque", 2.0)),

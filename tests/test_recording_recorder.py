@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -367,17 +368,27 @@ def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
     assert not path.exists()
 
 
+@pytest.mark.parametrize("in_thread", [False, True], ids=["process", "thread"])
 def test_a_stop_while_the_process_starts_leaves_none(
-    ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    in_thread: bool, ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The stop comes once the process runs, or as the first thread beside it starts."""
     started: list[subprocess.Popen[bytes]] = []
     start = recorder_module.recorder_process
 
     def struck() -> subprocess.Popen[bytes]:
         started.append(start())
-        signal.raise_signal(signal.SIGINT)
+        if not in_thread:
+            signal.raise_signal(signal.SIGINT)
         return started[0]
 
+    class StruckThread(threading.Thread):
+        def start(self) -> None:
+            super().start()
+            if in_thread:
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(threading, "Thread", StruckThread)
     monkeypatch.setattr(recorder_module, "recorder_process", struck)
     with pytest.raises(KeyboardInterrupt):
         Recorder(ring, tmp_path / "run.mcap", META, ())

@@ -121,8 +121,8 @@ def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
         controller=None if info.is_prescribed else names[guard.controller],
     )
     source = "data sheet, coupling and limits"
-    # without a margin the run is of before the watch knew delays (``parameters.WITHOUT_DELAY``)
-    chosen = _CHOSEN if math.isfinite(guard.delay_margin) else (*_CHOSEN, *WITHOUT_DELAY)
+    knows_delays = (guard.stated_delay, guard.delay_margin) != (0.0, math.inf)
+    chosen = _CHOSEN if knows_delays else (*_CHOSEN, *WITHOUT_DELAY)
     free = {name: getattr(guard, name) for name in chosen}
     for name, value in asdict(replace(derived, **free)).items():
         yield Statement(f"guard parameter '{name}'", getattr(guard, name), value, source)

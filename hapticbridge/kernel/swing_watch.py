@@ -74,10 +74,10 @@ before a lower force could reach it, and 0.8 J where two throws were needed. A t
 late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms later than
 its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late is not
 found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s. A weak hand that follows
-a reversed force slowly looks like one that pushes. With exchanged axes and a coupling of 300 N/m
-and less the swing is slower than 20 Hz, and an arm gets up to 5 J. A hand stronger than any force,
-as a robot's, whose speed jumps is taken for a late device. A device with prescribed motion is not
-watched (``guard.guard_parameters_for``).
+a reversed force slowly looks like one that pushes. Exchanged axes and 300 N/m let an arm swing at 2
+Hz, where the watch sees little, and give up to 7.3 J. A hand stronger than any force, as a robot's,
+whose speed jumps is taken for a late device. A device with prescribed motion is not watched
+(``guard.guard_parameters_for``).
 """
 
 from __future__ import annotations

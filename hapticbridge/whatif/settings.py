@@ -134,7 +134,7 @@ class Settings:
 
 def changed_of_hands(
     hands: Mapping[str, Settings], changes: Mapping[str, Value]
-) -> tuple[dict[str, Settings], tuple[tuple[str, str, Value | None, Value | None], ...]]:
+) -> tuple[dict[str, Settings], tuple[Change, ...]]:
     """Returns the changed settings of each hand, and each change with unit, old and new value.
 
     Args:
@@ -231,3 +231,7 @@ def _convert(name: str, value: Value) -> Value:
             raise RecordingError(f"substeps is {value!r:.60}; it must be a whole number")
         return int(number)
     return number
+
+
+Change = tuple[str, str, Value | None, Value | None]
+"""Name and unit of a setting, and its value before and after."""

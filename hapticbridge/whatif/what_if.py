@@ -41,7 +41,7 @@ from hapticbridge.whatif.replayed_hand import (
     load_bridge_code,
     missing_for_closed_loop,
 )
-from hapticbridge.whatif.settings import Settings, Value, changed_of_hands
+from hapticbridge.whatif.settings import Change, Settings, Value, changed_of_hands
 
 # Result of a what-if
 
@@ -103,7 +103,7 @@ class WhatIf:
     """
 
     path: Path
-    changes: tuple[tuple[str, str, Value | None, Value | None], ...]
+    changes: tuple[Change, ...]
     runs: tuple[WhatIfRun, ...]
     hand_error: float
     notes: tuple[str, ...]
@@ -243,7 +243,9 @@ class _Experiment:
         """True if several hands hold the scene."""
         return len(self.hands) > 1
 
-    def settings_with(self, changes: Mapping[str, Value]) -> tuple[list[Settings], Any]:
+    def settings_with(
+        self, changes: Mapping[str, Value]
+    ) -> tuple[list[Settings], tuple[Change, ...]]:
         """Returns the changed settings of each hand, and the changes as ``WhatIf`` has them."""
         by_grip = {hand.parameters.grip: hand.settings for hand in self.hands}
         new, changed_values = changed_of_hands(by_grip, changes)
