@@ -9,6 +9,7 @@ from functools import cache, partial
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
@@ -16,19 +17,26 @@ from hapticbridge.errors import CouplingError
 from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.rendering import Method, default_method
-from hapticbridge.theory.bounds import minimum_damping, stiffest_coupling
+from hapticbridge.theory.bounds import (
+    NEEDED_SHARE,
+    late_minimum_damping,
+    minimum_damping,
+    stiffest_coupling,
+    stiffest_late_coupling,
+)
+from hapticbridge.theory.transfer import delayed_by
 from hapticbridge.units import format_si
 
 Axis = Literal["translation", "rotation"]
 
-# Additional device damping required by the device's own update rate and delay
+# Time in which a device answers
 
 _WHOLE = 1e-9
 """Excess over a whole number of ticks that counts as rounding, in ticks."""
 
 
 def device_period(info: DeviceInfo, period: float) -> float:
-    """Returns the time in s for which a wrench acts: the loop's period, or the device's if longer.
+    """Returns the time in s between two samples: the loop's period, or the device's if longer.
 
     For a prescribed motion it is the loop's period.
     """
@@ -53,9 +61,7 @@ def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
 
 def delay_ticks(info: DeviceInfo, period: float) -> int | None:
     """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
-    if info.delay is None:
-        return None
-    return whole_ticks(info.delay, device_period(info, period))
+    return None if info.delay is None else whole_ticks(info.delay, period)
 
 
 def whole_ticks(delay: float, period: float) -> int:
@@ -63,41 +69,34 @@ def whole_ticks(delay: float, period: float) -> int:
     return max(0, math.ceil(delay / period - _WHOLE))
 
 
-def damping_for_delay(
-    info: DeviceInfo,
-    coupling: Coupling,
-    period: float,
-    axis: Axis = "translation",
-) -> float:
-    """Returns the additional damping required by the delay, in N s/m or N m s/rad.
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """Time in which a device answers, as its condition counts it.
 
-        Δb = max(0, sup_θ [(K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B cos((d + 1)θ)] − (K T/2 + B))
-
-    d is the delay in ticks, T the result of ``device_period``; for B = 0, Δb = K d T. With it the
-    device is passive against a wall, which is necessary. For a general scene no finite damping
-    suffices, so a device with a delay cannot be certified. An unknown delay adds nothing and cannot
-    be certified either.
-
-    Raises:
-        CouplingError: The delay is longer than 50 ticks.
-
-    References:
-        Colgate & Schenkel 1997 (fixed environment).
+    Attributes:
+        ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
+        delay: t_d in s from a sample to its force, >= 0; an unknown delay counts as 0.
     """
-    ticks = delay_ticks(info, period)
-    if not ticks:
-        return 0.0
-    own_period = device_period(info, period)
-    late = minimum_damping(coupling, own_period, delay=ticks, axis=axis)
-    return max(0.0, late - minimum_damping(coupling, own_period, axis=axis))
+
+    ticks_per_sample: int = 1
+    delay: float = 0.0
+
+    @classmethod
+    def of(cls, info: DeviceInfo, period: float) -> Lag:
+        """Returns that of a device on a loop of period T in s."""
+        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
+
+
+IN_TIME = Lag()
+"""A device that gives a sample in each tick and answers it within the tick."""
 
 
 # Device damping required by a coupling
 
 LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
-"""Lowest frequency in rad per tick, and number of frequencies, of the search for the damping that
-substeps need. In all cases tried the maximum lies at one end: at Nyquist, or at the limit towards
-rest, which 3e-3 approximates to 1e-5."""
+"""Lowest frequency in rad per sample, and number of frequencies per ripple, of the search for the
+damping that substeps need. Without a delay the maximum lies at one end in all cases tried: at
+Nyquist, or at the limit towards rest, which 3e-3 approximates to 1e-5."""
 
 
 @cache
@@ -106,72 +105,81 @@ def required_damping(
     period: float,
     law_evaluations: int = 1,
     axis: Axis = "translation",
+    lag: Lag = IN_TIME,
 ) -> float:
     """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
 
     K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
-    evaluation of the law per tick b = K T/2 + B. With n evaluations of the law per tick the handle
-    moves by an n-th of its step for each, and the mean wrench is sent. There is no closed form; b
+    evaluation of the law per tick b = K T/2 + B, and more behind a device that is late
+    (``theory.bounds.late_minimum_damping``). With m evaluations of the law per tick the handle
+    moves by an m-th of its step for each, and the mean wrench is sent. There is no closed form; b
     is the smallest value for which
 
-        Σ_k f̄_k·δh_{k+1} + (b/T) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s (K + nB/T) ‖δx_i‖² >= 0,
-        f_i = K e_i + (nB/T) δe_i,   e = h − x
+        Σ_k f̄_{k−d}·δh_{k+1} + (b/nT) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s (K + mB/T) ‖δx_i‖² >= 0,
+        f_i = K e_i + (mB/T) δe_i,   e = h − x
 
-    for every motion. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one
+    for every motion, with k over samples and i over evaluations; d is the delay in whole sample
+    periods, rounded up. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one
     evaluation it is the whole slack. The search finds b frequency by frequency as the smallest
-    value of a quadratic form over the n deflections e_i. For B = 0, b grows with n (for strict
-    environments it is K T n/2, because the mean comes late); for B > K T it falls towards B.
+    value of a quadratic form over the n m deflections e_i. For B = 0, b grows with m (for strict
+    environments it is K T m/2, because the mean comes late); for B > K T it falls towards B.
 
     The form is sufficient for any environment within its share of the slack; strict environments
-    need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at n = 2, 4, 8. The
+    need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at m = 2, 4, 8. The
     form gives 1.63, 1.90, 2.42 N s/m; a wall needs 1.30, 1.60, 1.75; the worst free tool of 1 to
     0.01 kg needs 1.29, 1.65, 2.03.
 
     Args:
         coupling: K and B of the law.
-        period: T of the device in s.
-        law_evaluations: n, 1 to ``MAX_SUBSTEPS``.
+        period: T of the loop in s.
+        law_evaluations: m, 1 to ``MAX_SUBSTEPS``.
         axis: Kind of axis.
+        lag: n and the delay of the device.
 
     Raises:
-        CouplingError: n or the period is out of range.
+        CouplingError: m or the period is out of range, or the delay is more than 50 n T.
 
     References:
-        Brown & Colgate 1997, eq. (6), for n = 1.
+        Brown & Colgate 1997, eq. (6), for m = 1 and a device in time.
     """
-    if checked_substeps(law_evaluations, CouplingError) == 1:
-        return float(minimum_damping(coupling, period, axis=axis))
     is_linear = axis == "translation"
     k = coupling.stiffness if is_linear else coupling.rotational_stiffness
-    b = (coupling.damping if is_linear else coupling.rotational_damping) * law_evaluations / period
+    damping = coupling.damping if is_linear else coupling.rotational_damping
+    if checked_substeps(law_evaluations, CouplingError) == 1:
+        if lag == IN_TIME:
+            return float(minimum_damping(coupling, period, axis=axis))
+        if k == 0.0:
+            return lag.ticks_per_sample * damping
+        late = late_minimum_damping(k, damping, period, lag.delay, lag.ticks_per_sample)
+        return float(late)
+    count, held = law_evaluations * lag.ticks_per_sample, lag.ticks_per_sample * period
+    b = damping * law_evaluations / period
     if k == 0.0:
-        return float(b * period / law_evaluations)
-    identity, ones = np.eye(law_evaluations), np.full(law_evaluations, 1.0 / law_evaluations)
+        return float(b * held / law_evaluations)
+    delay = delayed_by(whole_ticks(lag.delay, held))
+    identity, means = np.eye(count), np.zeros(count)
+    means[:law_evaluations] = 1.0 / law_evaluations
     most = 0.0
-    for theta in np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES):
+    for theta in _frequencies(delay):
         z = np.exp(1j * theta)
-        difference = identity - np.eye(law_evaluations, k=-1) + 0j
-        difference[0, -1] -= 1 / z  # last deflection of the previous tick
+        difference = identity - np.eye(count, k=-1) + 0j
+        difference[0, -1] -= 1 / z  # last deflection before the sample
         law = k * identity + b * difference
         form = law.conj().T @ difference
         slack = 0.5 * SLACK_SHARE * (k + b)
         form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
-        linear = 0.5 * law.conj().T @ ((z - 1) * ones) + slack * difference.conj().T @ ones
+        linear = 0.5 * law.conj().T @ ((z ** (delay + 1) - 1) * means)
+        linear += slack * difference.conj().T @ means
         gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / law_evaluations
         most = max(most, float(gained))
-    return most * period
+    return most * held
 
 
-def required_damping_with_delay(
-    info: DeviceInfo,
-    coupling: Coupling,
-    period: float,
-    law_evaluations: int,
-    axis: Axis = "translation",
-) -> float:
-    """Returns the damping needed by a device with its own rate and delay."""
-    needed = required_damping(coupling, device_period(info, period), law_evaluations, axis)
-    return needed + damping_for_delay(info, coupling, period, axis)
+def _frequencies(delay: int) -> NDArray[np.float64]:
+    """Returns the frequencies in rad per sample at which substeps may need most."""
+    if delay == 0:
+        return np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES)
+    return np.linspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES * (delay + 1))
 
 
 # Default coupling of a device
@@ -184,11 +192,6 @@ UNKNOWN_REAL_DAMPING, UNKNOWN_REAL_ROTATIONAL_DAMPING = 0.2, 2e-4
 """Damping in N s/m and N m s/rad assumed for a device with motors of unknown damping. It is a tenth
 of ``UNKNOWN_DAMPING``: the low end of estimates for desktop devices, because almost no maker
 publishes it."""
-
-NEEDED_SHARE = 0.85
-"""Share of the device's damping that the default coupling needs, without unit. K T/2 + B at 80 % of
-the bound with B = b/4 is 0.6 b + 0.25 b. A larger share is stiffer and leaves less for an error in
-b."""
 
 
 def assumed_damping(info: DeviceInfo) -> tuple[float, float]:
@@ -216,9 +219,10 @@ def default_coupling(
     """Returns the stiffest coupling that is safe on a device: 80 % of the bound, B' = b / 4.
 
     The result is the requested coupling: K and B = B' + the method's own damping, so that the law
-    uses B' without clipping. It needs 85 % of b. If several evaluations per tick or a delay need
-    more, K and B' are lowered together to meet it, separately for each kind of axis;
-    ``required_damping`` is linear in both.
+    uses B' without clipping. It needs 85 % of b. Behind a device that is late the ratio B'/K is the
+    one with the largest K (``theory.bounds.stiffest_late_coupling``). If several evaluations per
+    tick need more, or friction does not hold the encoder's steps, K and B' are lowered together;
+    both conditions are linear in both.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.
@@ -237,28 +241,110 @@ def default_coupling(
     damping, rotational = assumed_damping(info)
     damping /= scale * force_scale
     rotational *= scale / force_scale
-    coupling = stiffest_coupling(damping, rotational, device_period(info, period))
+    coupling = stiffest_coupling(damping, rotational, period)
     checked_substeps(law_evaluations, CouplingError)
     method = default_method(law_evaluations) if method is None else method
-    if law_evaluations == 1 and not delay_ticks(info, period):
-        return method.requested_coupling(coupling, period)
-    shrink = min(
-        1.0,
-        NEEDED_SHARE
-        * damping
-        / required_damping_with_delay(info, coupling, period, law_evaluations),
-    )
-    needed = required_damping(coupling, period, law_evaluations, "rotation")
-    if info.turns:
-        needed = required_damping_with_delay(info, coupling, period, law_evaluations, "rotation")
-    shrink_rotation = min(1.0, NEEDED_SHARE * rotational / needed)
-    shrunk = Coupling(
-        stiffness=shrink * coupling.stiffness,
-        damping=shrink * coupling.damping,
-        rotational_stiffness=shrink_rotation * coupling.rotational_stiffness,
-        rotational_damping=shrink_rotation * coupling.rotational_damping,
-    )
-    return method.requested_coupling(shrunk, period / law_evaluations)
+    lag = Lag.of(info, period)
+    if lag != IN_TIME:
+        linear = stiffest_late_coupling(damping, period, lag.delay, lag.ticks_per_sample)
+        coupling = replace(coupling, stiffness=linear[0], damping=linear[1])
+        if info.turns:
+            turned = stiffest_late_coupling(rotational, period, lag.delay, lag.ticks_per_sample)
+            coupling = replace(
+                coupling, rotational_stiffness=turned[0], rotational_damping=turned[1]
+            )
+    shrink = turn = 1.0
+    if law_evaluations > 1:
+        needed = required_damping(coupling, period, law_evaluations, lag=lag)
+        shrink = min(1.0, NEEDED_SHARE * damping / needed)
+        felt = lag if info.turns else IN_TIME
+        needed = required_damping(coupling, period, law_evaluations, "rotation", felt)
+        turn = min(1.0, NEEDED_SHARE * rotational / needed)
+    steps = StepCondition.of(info, coupling, period, scale * force_scale)
+    if steps is not None and steps.available and steps.needed:
+        shrink = min(shrink, NEEDED_SHARE * steps.available / steps.needed)
+    if min(shrink, turn) < 1.0:
+        coupling = Coupling(
+            stiffness=shrink * coupling.stiffness,
+            damping=shrink * coupling.damping,
+            rotational_stiffness=turn * coupling.rotational_stiffness,
+            rotational_damping=turn * coupling.rotational_damping,
+        )
+    return method.requested_coupling(coupling, period / law_evaluations)
+
+
+@dataclass(frozen=True, slots=True)
+class StepCondition:
+    """The condition f_c >= s (K Δ/2 + B' Δ/T) on a device that reports its position in steps.
+
+    Without that friction the encoder's steps keep a hand swinging, and give it energy that no meter
+    of positions sees. It is known for a wall; s = scale · force_scale.
+
+    Attributes:
+        needed: Right-hand side in N; None if the step Δ is unknown.
+        available: Coulomb friction f_c in N; None if unknown.
+        resolution: Step Δ of the position in m; None if unknown.
+        remedy: Changes with which it holds with 15 % in reserve; empty if it holds.
+
+    References:
+        Abbott & Okamura 2005.
+    """
+
+    needed: float | None
+    available: float | None
+    resolution: float | None
+    remedy: str = ""
+
+    @classmethod
+    def of(
+        cls, info: DeviceInfo, law: Coupling, period: float, ratio: float
+    ) -> StepCondition | None:
+        """Returns the condition; None if the device has no steps, or nothing of them is stated.
+
+        ``law`` has K and B', ``period`` is T in s, and ``ratio`` is s.
+        """
+        step = info.resolution
+        if step == 0.0 or (step is None and info.friction is None):
+            return None
+        if step is None:
+            return cls(None, info.friction, None)
+        needed = ratio * step * (0.5 * law.stiffness + law.damping / period)
+        return cls(needed, info.friction, step)
+
+    @property
+    def holds(self) -> bool | None:
+        """True if friction holds the steps; None if it is unknown."""
+        if self.needed is None or self.available is None:
+            return None
+        return self.available >= self.needed
+
+    @property
+    def margin(self) -> float:
+        """Share of the friction that is left, 1 − needed/f_c; 1 if unknown."""
+        if self.holds is None:
+            return 1.0
+        return 1.0 - (self.needed or 0.0) / self.available if self.available else -math.inf
+
+    def sentence(self) -> str:
+        """Describes the condition in a clause, with the remedy if it fails."""
+        if self.resolution is None:
+            return "its encoder's steps are not judged: its resolution is unknown"
+        steps = f"steps of {format_si(self.resolution, 'm')}"
+        if self.available is None:
+            return (
+                f"its {steps} are not judged: its friction is unknown ('hapticbridge identify' "
+                f"measures it), {format_si(self.needed or 0.0, 'N')} needed"
+            )
+        relation = ">=" if self.holds else "<"
+        text = (
+            f"friction {format_si(self.available, 'N')} {relation} "
+            f"{format_si(self.needed or 0.0, 'N')} for its {steps}"
+        )
+        return text if self.holds else f"{text}; {self.remedy}"
+
+
+UNPROVED = "no proof is built in yet"
+"""Words for a verdict that is left open: of a device that answers late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,6 +359,8 @@ class DampingCondition:
             holds.
         delay: Ticks from a sample to the wrench that answers it, 0 at best; None if unknown.
         tick: Length of such a tick in s.
+        ticks_per_sample: Ticks for which one force is held, 1 at best.
+        steps: Condition on the encoder's steps along this kind of axis; None without one.
         is_felt: False for axes that are sensed without a motor. The hand puts energy into the scene
             there without work of its own, so no damping bounds what it gets back along the axes
             with a motor (Barbagli & Salisbury 2003).
@@ -284,12 +372,26 @@ class DampingCondition:
     remedy: str = ""
     delay: int | None = 0
     tick: float = 0.0
+    ticks_per_sample: int = 1
+    steps: StepCondition | None = None
     is_felt: bool = True
 
     @property
-    def holds(self) -> bool | None:
+    def is_damped(self) -> bool | None:
         """True if the device has enough damping; None if that is unknown."""
         return None if self.available is None else self.available >= self.needed
+
+    @property
+    def holds(self) -> bool | None:
+        """True if damping and friction suffice; None if the damping is unknown."""
+        has_steps = self.steps is not None and self.steps.holds is False
+        return False if self.is_damped and has_steps else self.is_damped
+
+    @property
+    def margin(self) -> float:
+        """Smallest share of damping and friction that is left, 1 − needed/available."""
+        left = 1.0 - self.needed / self.available if self.available else -math.inf
+        return left if self.steps is None else min(left, self.steps.margin)
 
     def sentence(self) -> str:
         """Describes the condition, with the remedy if it fails."""
@@ -304,17 +406,19 @@ class DampingCondition:
                 f"{self.axis}: device damping unknown, {self.needed:g} {unit} needed; "
                 "'hapticbridge identify' measures it"
             )
-        relation = ">=" if self.holds else "<"
+        relation = ">=" if self.is_damped else "<"
         text = f"{self.axis}: device damping {self.available:g} {relation} {self.needed:g} {unit}"
-        if not self.holds:
+        if self.ticks_per_sample > 1:
+            text = f"{text} with one sample in {self.ticks_per_sample} ticks"
+        if not self.is_damped:
             return f"{text}; {self.remedy}"
         if self.delay is None:
-            return f"{text}, if it answers without delay, which is unknown"
-        if not self.delay:
-            return text
-        late = format_si(self.delay * self.tick, "s")
-        ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
-        return f"{text}, for a wall; with a delay of {late} ({ticks}) none suffices for every scene"
+            text = f"{text}, if it answers without delay, which is unknown"
+        elif self.delay:
+            late = format_si(self.delay * self.tick, "s")
+            ticks = "1 tick" if self.delay == 1 else f"{self.delay} ticks"
+            text = f"{text} with its delay of {late} ({ticks}), for which {UNPROVED}"
+        return text if self.steps is None else f"{text}; {self.steps.sentence()}"
 
 
 def device_conditions(
@@ -334,7 +438,7 @@ def device_conditions(
 
     For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
     not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
-    count (``damping_for_delay``).
+    count (``Lag``).
 
     Args:
         info: The device.
@@ -421,11 +525,13 @@ class _Demand:
 
     def needed(self, axis: Axis) -> float:
         """Returns the damping that the device needs in N s/m or N m s/rad."""
+        ratio, lag = self._ratio(axis), Lag.of(self.info, self.period)
+        return ratio * required_damping(self.law, self.period, self.law_evaluations, axis, lag)
+
+    def _ratio(self, axis: Axis) -> float:
+        """Returns the ratio of the coupling at the device to that in the scene."""
         is_linear = axis == "translation"
-        ratio = self.scale * self.force_scale if is_linear else self.force_scale / self.scale
-        return ratio * required_damping_with_delay(
-            self.info, self.law, self.period, self.law_evaluations, axis
-        )
+        return self.scale * self.force_scale if is_linear else self.force_scale / self.scale
 
     def condition(self, axis: Axis, available: float | None) -> DampingCondition:
         """Returns the condition, with the changes that would meet it if it fails."""
@@ -439,8 +545,26 @@ class _Demand:
             available,
             remedy,
             delay_ticks(self.info, self.period),
-            device_period(self.info, self.period),
+            self.period,
+            Lag.of(self.info, self.period).ticks_per_sample,
+            self._steps() if axis == "translation" else None,
         )
+
+    def _steps(self) -> StepCondition | None:
+        """Returns the condition on encoder steps, with the changes that would meet it."""
+        found = StepCondition.of(self.info, self.law, self.period, self.scale * self.force_scale)
+        if found is None or found.holds is not False:
+            return found
+        return replace(found, remedy=self._remedy_of_steps(found))
+
+    def _remedy_of_steps(self, steps: StepCondition) -> str:
+        finer = "take a device with finer steps or more friction"
+        if not steps.available:
+            return f"without friction no coupling is free of swings by steps: {finer}"
+        less = NEEDED_SHARE * steps.available / (steps.needed or math.inf)
+        gains = (less * gain for gain in self._gains(self._law_as_requested(), "translation"))
+        k, b = (_three_digits(gain) for gain in gains)
+        return f"lower the stiffness to {k} N/m and the damping to {b} N s/m, or {finer}"
 
     def _remedy(self, axis: Axis, available: float) -> str:
         """Returns changes with which the device has damping in reserve (``NEEDED_SHARE``).
@@ -452,6 +576,8 @@ class _Demand:
             return "lower stiffness or damping, or raise the rate"
         if available <= 0.0:
             return "a device without damping bears no coupling"
+        if self.law_evaluations == 1 and Lag.of(self.info, self.period) != IN_TIME:
+            return self._late_remedy(axis, available)
         prefix, spring, damper = _SETTINGS[axis]
         parts: tuple[_Part, ...] = ("stiffness", "damping")
         parts += ("period",) if self._is_rate_free else ()
@@ -477,6 +603,28 @@ class _Demand:
             added = self.method.compensated_share * share["stiffness"] * stiffness * self.h
             at_most = _three_digits(added)
             told += f", with a {prefix}damping of at most {at_most} {damper}"
+        return told
+
+    def _late_remedy(self, axis: Axis, available: float) -> str:
+        """Returns the stiffest coupling that a late device bears, no stiffer than the requested."""
+        prefix, spring, damper = _SETTINGS[axis]
+        lag, slower = Lag.of(self.info, self.period), device_period(self.info, self.period)
+        own = available / self._ratio(axis)
+        stiffness, damping = stiffest_late_coupling(
+            own, self.period, lag.delay, lag.ticks_per_sample
+        )
+        softer = min(1.0, self._gains(self.law, axis)[0] / stiffness)
+        at = prefix.replace(" ", "_")
+        gains = {f"{at}stiffness": softer * stiffness, f"{at}damping": softer * damping}
+        law, method = replace(self.law, **gains), self.method
+        requested = law if method is None else method.requested_coupling(law, self.h)
+        k, b = self._gains(requested, axis)
+        told = (
+            f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
+            f"{_three_digits(b)} {damper}"
+        )
+        if self._bears(axis, available, "period", slower / self.period):
+            told += f", or lower the rate to {_three_digits(1 / slower)} Hz"
         return told
 
     @property
@@ -620,13 +768,9 @@ def worst_verdict(verdicts: Sequence[bool | None]) -> bool | None:
 
 
 def damping_margin(conditions: tuple[DampingCondition, ...]) -> float | None:
-    """Returns the smallest share of the device's damping that is left, 1 − needed / b.
+    """Returns the smallest share of the device's damping or friction that is left, 1 − needed / b.
 
     It is negative if more is needed than available; None if no damping is known.
     """
-    shares = [
-        1.0 - condition.needed / condition.available if condition.available else -math.inf
-        for condition in conditions
-        if condition.available is not None
-    ]
-    return min(shares, default=None)
+    left = [condition.margin for condition in conditions if condition.available is not None]
+    return min(left, default=None)

@@ -21,7 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments, shown
-from hapticbridge.certificate import assumed_damping, delay_ticks, required_axis_damping
+from hapticbridge.certificate import (
+    IN_TIME,
+    Lag,
+    StepCondition,
+    assumed_damping,
+    required_axis_damping,
+)
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import (
@@ -254,7 +260,7 @@ class AxisCouplingLimits:
         """
         run, (linear, angular) = self.run, assumed_damping(self.run.info)
         known = replace(run.info, damping=linear, rotational_damping=angular)
-        is_linear = run.law_evaluations == 1 and not delay_ticks(known, run.period)
+        is_linear = run.law_evaluations == 1 and Lag.of(known, run.period) == IN_TIME
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
         ratios = run.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
@@ -265,10 +271,17 @@ class AxisCouplingLimits:
                 need = required_axis_damping(
                     known, requested, run.period, *scales, run.law_evaluations, run.method
                 )
-                needs.append(need[self.axis == "rotation"])
+                needs.append(max(need[self.axis == "rotation"], self._for_steps(requested)))
             except CouplingError:  # no damping compensates this delay
                 needs.append(math.inf)
         return ratios, np.array(needs)
+
+    def _for_steps(self, law: Coupling) -> float:
+        """Returns the damping b times the share of the friction that encoder steps need."""
+        steps = StepCondition.of(self.run.info, law, self.run.period, self.leverage)
+        if self.axis == "rotation" or steps is None or not steps.available:
+            return 0.0
+        return self.damping * (steps.needed or 0.0) / steps.available
 
     def needed(self, stiffness: float, damping: float) -> float:
         """Returns the device damping b in N s/m or N m s/rad that requested gains need.

@@ -19,7 +19,7 @@ from hapticbridge.rendering import (
     RunCoupling,
     default_method,
 )
-from hapticbridge.theory.bounds import minimum_damping, worst_frequency
+from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping, worst_frequency
 from hapticbridge.theory.spectrum import damping_spectrum
 from hapticbridge.theory.transfer import Discretization, transmission_line_spectrum
 from hapticbridge.theory.z_width import ZWidth
@@ -112,18 +112,34 @@ def alternatives(requested: Coupling, period: float, filter_time: float) -> tupl
     ]
     frequency = _frequencies(period)
     line = transmission_line_spectrum(requested.stiffness * period, period, frequency)
-    # the phase of (1 − z⁻¹)z/C passes through π before Nyquist for any K and B
-    anywhere = Alternative("B_law = B, one tick late, any scene", float("inf"), None, None)
     return (
         *methods,
         way("B_law = B at half the period", step=period / 2),
         way(f"B_law = B, low-pass of {1e3 * filter_time:g} ms on it", low_pass=filter_time),
         way("B_law = B, Tustin's damper", scheme="tustin"),
         way("B_law = B, one tick late, against a wall", delay=1),
-        anywhere,
+        _one_tick_late(requested, period),
         Alternative(
             "transmission line of that stiffness", float(line.max()), None, (frequency, line)
         ),
+    )
+
+
+def _one_tick_late(requested: Coupling, period: float) -> Alternative:
+    """Returns the requirement of a device that answers a tick late, before any scene.
+
+    Its spectrum is that without delay times (1 − cos 2ωT)/(1 − cos ωT).
+    """
+    k, b = requested.stiffness, requested.damping
+    frequency = _frequencies(period)
+    spectrum = damping_spectrum(requested, period, frequency)
+    spectrum = 4.0 * np.cos(0.5 * frequency * period) ** 2 * spectrum
+    top = int(np.argmax(spectrum))
+    return Alternative(
+        "B_law = B, one tick late, any scene",
+        float(late_minimum_damping(k, b, period, delay=period)),
+        float(frequency[top]) if top else 0.0,
+        (frequency, spectrum),
     )
 
 

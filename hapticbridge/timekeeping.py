@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from hapticbridge.certificate import DampingCondition
+from hapticbridge.certificate import UNPROVED, DampingCondition
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
@@ -64,6 +64,10 @@ def motors_pushed(work: float, net: float) -> bool:
         net: Largest energy in J that the hand had got beyond what it put in.
     """
     return min(abs(work), net) > INSTANT
+
+
+STEPS_UNKNOWN = "its encoder's steps are not judged"
+"""Limit of the certificate of a device whose resolution or friction is unknown."""
 
 
 NO_DAMPING = (
@@ -251,13 +255,18 @@ class Timekeeping:
 
         ``has_pushed`` is as returned by ``motors_pushed``.
         """
+        steps = [each.steps for each in self.in_time if each.steps is not None]
         if verdict:
             limit = f", but {MOTORS_PUSHED}" if has_pushed else ""
+            if any(each.holds is None for each in steps):
+                limit = f"; {STEPS_UNKNOWN}{limit}"
             return f"device certified{self.clause}: b >= {self._bound}{limit}"
         if verdict is None:
             return f"device not judged: {self._unproved}{self.slowness}"
         if self.refutation:
             return f"device not certified: {self.refutation}"
+        if all(each.is_damped for each in self.in_time if each.is_felt):
+            return "device not certified: friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
         return f"device not certified: b < {self._bound}"
 
     @property
@@ -269,10 +278,7 @@ class Timekeeping:
         if any(each.delay is None for each in on_hand):
             return "its delay is unknown ('hapticbridge identify' measures it)"
         if any(each.delay for each in on_hand):
-            return (
-                "it answers late; behind a delay there is a bound for walls, and none for a scene "
-                "that moves"
-            )
+            return f"it answers late, and {UNPROVED}"
         return "nothing proves that it bears the coupling"
 
     @property
@@ -287,6 +293,9 @@ class Timekeeping:
 
     @property
     def _bound(self) -> str:
+        samples = max((each.ticks_per_sample for each in self.in_time), default=1)
+        if samples > 1:
+            return f"what one sample in {samples} ticks needs"
         count = self.law_evaluations
         return "KT/2 + B_law" if count == 1 else f"what {count} substeps need"
 

@@ -6,13 +6,10 @@ import dataclasses
 import re
 from typing import Any
 
-import numpy as np
 import pytest
 
 from hapticbridge.certificate import (
-    NEEDED_SHARE,
     DampingCondition,
-    damping_for_delay,
     default_coupling,
     delay_ticks,
     device_conditions,
@@ -23,6 +20,7 @@ from hapticbridge.certificate import (
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.rendering import METHODS, default_method
+from hapticbridge.theory.bounds import NEEDED_SHARE
 
 T = 1e-3
 SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
@@ -56,28 +54,10 @@ def test_a_device_slower_than_the_loop_is_judged_by_its_own_period() -> None:
     assert device_period(info(rate=None), T) == T
     assert device_period(info(rate=500.0, is_prescribed=True), T) == T
     (slow,) = device_conditions(info(rate=500.0), SPRING, T, 1.0, 1.0)
-    assert slow.needed == pytest.approx(SPRING.stiffness * 2e-3 / 2)
-
-
-@pytest.mark.parametrize("ticks", [1, 2, 5])
-def test_a_spring_behind_a_delay_needs_half_a_period_and_the_delay(ticks: int) -> None:
-    late = info(delay=ticks * T)
-    (condition,) = device_conditions(late, SPRING, T, 1.0, 1.0)
-    # Colgate & Schenkel: b > K (T/2 + d T) against a wall
-    assert condition.needed == pytest.approx(SPRING.stiffness * T * (0.5 + ticks), rel=1e-6)
-
-
-def test_a_damper_behind_a_delay_needs_no_less_than_without() -> None:
-    for damping in (0.01, 0.3, 3.0):
-        coupling = dataclasses.replace(SPRING, damping=damping)
-        assert damping_for_delay(info(delay=2e-3), coupling, T) >= 0.0
-        (condition,) = device_conditions(info(delay=2e-3), coupling, T, 1.0, 1.0)
-        # the condition at a frequency of its own, written out: any frequency gives a lower bound
-        theta = np.linspace(1e-3, np.pi, 2000)
-        wall = SPRING.stiffness * T / 2 * np.sin(2.5 * theta) / np.sin(theta / 2)
-        wall -= damping * np.cos(3 * theta)
-        assert condition.needed >= wall.max() - 1e-9
-        assert condition.needed >= SPRING.stiffness * T / 2 + damping - 1e-9
+    # a force held for 2 T while the tool moves in each: n K (n T)/2 for a spring
+    assert slow.needed == pytest.approx(2 * SPRING.stiffness * 2e-3 / 2)
+    (between,) = device_conditions(info(rate=999.0), SPRING, T, 1.0, 1.0)
+    assert between.needed == pytest.approx(slow.needed)
 
 
 def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
@@ -88,7 +68,7 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
     assert is_certified(prompt) is True
     assert is_certified(late) is None
     assert is_certified(unknown) is None
-    assert "for a wall; with a delay of 2 ms (2 ticks) none suffices for every scene" in (
+    assert "with its delay of 2 ms (2 ticks), for which no proof is built in yet" in (
         late[0].sentence()
     )
     assert "without delay, which is unknown" in unknown[0].sentence()
@@ -178,8 +158,10 @@ def test_a_remedy_that_is_followed_leaves_a_reserve_of_15_percent(
         return
     ways = followed(failing.remedy, requested, axis)
     used = [condition(*way).needed / (failing.available or 0.0) for way in ways]
-    assert max(used) <= NEEDED_SHARE * 1.001  # the rate's own damping limit is rounded down
-    assert min(used) > 0.9 * NEEDED_SHARE
+    # numbers are rounded down to three digits, and behind a delay less damping needs more
+    assert max(used) <= NEEDED_SHARE * 1.005
+    # a late device is told the best pair, at most as stiff as the requested one
+    assert min(used) > 0.9 * NEEDED_SHARE or "set the" in failing.remedy
 
 
 def test_less_damping_is_no_remedy_behind_a_delay() -> None:
@@ -188,7 +170,6 @@ def test_less_damping_is_no_remedy_behind_a_delay() -> None:
         method = default_method()
         law = method.law_coupling(Coupling(600.0, damping, 0.0, 0.0), T)
         (found,) = device_conditions(info(delay=3e-3, damping=1.0), law, T, 1.0, 1.0, method=method)
-        assert found.remedy.startswith("lower the stiffness to ")
-        assert "lower the damping" not in found.remedy
+        assert found.remedy == "set the stiffness to 301 N/m and the damping to 0.517 N s/m"
         needed.append(found.needed)
-    assert needed == sorted(needed)  # the damper of the coupling helps at a wall
+    assert needed == sorted(needed)  # the damper of the coupling helps

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from cli_cases import Called, facts_of
 
-from hapticbridge.certificate import NEEDED_SHARE
 from hapticbridge.cli import zwidth
 from hapticbridge.device.simulated.device import SimulatedDevice
+from hapticbridge.theory.bounds import NEEDED_SHARE
 
 
 def test_a_device_at_its_bound_reads_as_true_and_its_limits_agree(call: Called) -> None:
@@ -63,7 +63,7 @@ def test_the_json_is_null_where_none_suffices(
     assert [coupling[name]["damping"] for name in names] == [1.0, 0.0, 1.0]
     assert facts["method"] == "lossless"
     assert [way["needed"] is None for way in facts["alternatives"]] == [
-        *(False, False, False, False, False, True, False, True, False)
+        *(False, False, False, False, False, True, False, False, False)
     ]
 
 
@@ -98,10 +98,10 @@ BORNE = "next: hapticbridge run SCENE --stiffness 2400 --damping 1.7 --device si
         ({}, 0, BORNE),
         ({"damping": 1.0}, 1, "take a device with 2 N s/m"),
         ({"damping": 0.0}, 1, "translation: device damping 0 < 1.7 N s/m"),
-        ({"damping": 9.0, "delay": 1e-3}, 0, "with a delay of 1 ms (1 tick) none suffices"),
+        ({"damping": 9.0, "delay": 1e-3}, 0, "with its delay of 1 ms (1 tick), for which no proof"),
         ({"delay": 1e-3}, 1, "translation: device damping 2 < "),
         ({"delay": None}, 0, "if it answers without delay, which is unknown"),
-        ({"rate": 500.0}, 1, "translation: device damping 2 < 2.9 N s/m"),
+        ({"rate": 500.0}, 1, "device damping 2 < 5.09412 N s/m with one sample in 2 ticks"),
         ({"damping": None}, 2, "its damping is unknown; 'hapticbridge identify' measures it"),
     ],
 )

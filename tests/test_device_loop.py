@@ -131,20 +131,20 @@ def touch() -> Rig:
 
 
 RIGS: dict[str, tuple[Callable[[], Rig], str]] = {
-    "falcon": (falcon, "(2 ticks) none suffices"),
+    "falcon": (falcon, "(2 ticks), for which no proof"),
     # its own period and 1 ms each way on the bus
-    "rawhid": (rawhid, "(3 ticks) none suffices"),
+    "rawhid": (rawhid, "(3 ticks), for which no proof"),
     # a delay of calls that is no whole tick counts as one
     "haply": (haply, "(1 tick)"),
     "omega.3": (force_dimension, "(1 tick)"),
     "sigma.7": (lambda: force_dimension(SIGMA7), "(1 tick)"),
     # up to a servo tick each way
-    "touch": (touch, "(2 ticks) none suffices"),
+    "touch": (touch, "(2 ticks), for which no proof"),
     # what the firmware adds in delay nobody says
     "stick": (stick, "without delay, which is unknown"),
     "odd stick": (lambda: stick("odd"), "without delay, which is unknown"),
 }
-"""Makers of devices, and why no bound holds for each: a late force is bounded at walls."""
+"""Makers of devices, and why none is certified yet."""
 
 
 def rows(recording: Path) -> NDArray[np.void]:

@@ -133,8 +133,9 @@ def print_result(
         out.print(why_none(result))
         return
     out.print(
-        f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness is "
-        f"{z.limit[0]:.4g} N/m at B_law = 0 ({z.corner_limited_by}){_with_more_damping(z)}"
+        f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness "
+        f"{'of a wall ' if z.delay else ''}is {z.limit[0]:.4g} N/m at B_law = 0 "
+        f"({z.corner_limited_by}){_with_more_damping(z)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
     requested = coupling.requested

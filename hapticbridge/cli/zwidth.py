@@ -13,7 +13,6 @@ from rich.table import Table
 
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import (
-    NEEDED_SHARE,
     DampingCondition,
     delay_ticks,
     device_conditions,
@@ -30,7 +29,12 @@ from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, 
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
-from hapticbridge.theory.bounds import STIFFNESS_MARGIN, largest_effective_damping, law_damping
+from hapticbridge.theory.bounds import (
+    NEEDED_SHARE,
+    STIFFNESS_MARGIN,
+    largest_effective_damping,
+    law_damping,
+)
 from hapticbridge.theory.transfer import MAX_DELAY, scalar
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (
@@ -222,7 +226,8 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
-    of = f"{safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    where = "at a wall with" if z.delay else "at"
+    of = f"{safe:.4g} N/m that are safe {where} B_law = {at:.3g} N s/m"
     out.print(f"use {sentence}: 80 % of the {of}")
     if command is None:
         out.print(
@@ -342,7 +347,7 @@ class Bound:
             )
         else:
             self._print(ways, shown, period, b)
-            if condition is not None and b is None:
+            if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:
             title = f"K = {self.stiffness:g} N/m, B = {self.damping:g} N s/m at {self.rate:g} Hz"

@@ -17,10 +17,9 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.certificate import (
-    NEEDED_SHARE,
     DampingCondition,
+    Lag,
     delay_ticks,
-    device_period,
     required_damping,
     run_conditions,
 )
@@ -35,6 +34,7 @@ from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import first_pump
 from hapticbridge.scene.contacts import check_contacts, geom_name
+from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_energy
 
 Kind = Literal[
@@ -100,7 +100,7 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
     if not method.has_law:
         return _method_cause(method)
     conditions = run_conditions(evidence.info, evidence.worst, method)
-    failing = [condition for condition in conditions if condition.holds is False]
+    failing = [condition for condition in conditions if condition.is_damped is False]
     if found := _delay_cause(evidence, failing):
         return found
     if failing:
@@ -108,7 +108,9 @@ def cause_at_device(evidence: Evidence, window: slice) -> Cause:
     if found := _timing_cause(evidence, window):
         return found
     if counts := _quantisation_words(evidence, window):
-        return Cause("quantisation", counts, "take a finer encoder or more friction")
+        steps = [each.steps.remedy for each in conditions if each.steps is not None]
+        usual = "take a finer encoder or more friction"
+        return Cause("quantisation", counts, next(filter(None, steps), usual))
     return _method_cause(method) if method.hazard else _unknown_cause(evidence)
 
 
@@ -136,9 +138,8 @@ def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause |
     worst, info = evidence.worst, evidence.info
     late, own = delay_ticks(info, worst.period) or 0, info.damping or 0.0
     prompt = worst.scale * worst.force_scale
-    prompt *= required_damping(
-        worst.coupling, device_period(info, worst.period), worst.law_evaluations
-    )
+    lag = replace(Lag.of(info, worst.period), delay=0.0)
+    prompt *= required_damping(worst.coupling, worst.period, worst.law_evaluations, lag=lag)
     if not late or not failing or own < prompt:
         return None
     return Cause(

@@ -48,8 +48,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
-from hapticbridge.theory.spectrum import needed_for_fixed_environment, wall_supremum
+from hapticbridge.theory.spectrum import (
+    LOWEST_ANGLE,
+    needed_for_fixed_environment,
+    wall_supremum,
+)
 from hapticbridge.theory.transfer import (
+    MAX_DELAY,
     Axis,
     CouplingGrid,
     Discretization,
@@ -59,6 +64,7 @@ from hapticbridge.theory.transfer import (
     plain,
     scalar,
     together,
+    whole,
 )
 
 # Frequency at which a coupling requires the most device damping
@@ -117,6 +123,14 @@ DAMPING_SHARE = 0.25
 """Damping of a default coupling divided by the device's damping, without unit. A larger value damps
 the tool better against the handle and leaves less stiffness, because K ∝ b − B."""
 
+NEEDED_SHARE = STIFFNESS_MARGIN * (1.0 - DAMPING_SHARE) + DAMPING_SHARE
+"""Share of the device's damping that a default coupling needs, 0.85, without unit. A larger share
+is stiffer and leaves less for an error in b."""
+
+RATIOS = 400
+"""Number of ratios B'/K among which the default coupling of a late device is sought. Its stiffness
+is flat at the best one; more only take longer."""
+
 
 @overload
 def minimum_damping(
@@ -168,8 +182,8 @@ def minimum_damping(
 
         b >= (K T/2) sin((2d + 1)θ/2)/sin(θ/2) − B' cos((d + 1)θ)  for all θ;  B' = 0: K (T/2 + d T)
 
-    The coupling's damper may lower this bound. For a *general* environment behind a delayed
-    coupling no damping suffices, so no bound exists (see ``damping_spectrum_of`` of C z⁻ᵈ).
+    The coupling's damper may lower this bound. ``late_minimum_damping`` has the bound for every
+    environment.
 
     Args:
         coupling: K, B' and their rotational counterparts; a ``CouplingGrid`` has many of them.
@@ -207,6 +221,101 @@ def minimum_damping(
     if unbounded:
         needed = np.where(damping > 0, np.inf, needed)
     return plain(np.asarray(needed))
+
+
+ANGLES_PER_RIPPLE = 400
+"""Number of angles θ at which each ripple of a late device's spectrum is evaluated. The largest
+value is missed by a share of at most (π/400)² = 6e-5."""
+
+
+def late_minimum_damping(
+    stiffness: float,
+    damping: ArrayLike,
+    period: float,
+    delay: float = 0.0,
+    ticks_per_sample: int = 1,
+) -> float | NDArray[np.float64]:
+    """Returns the device damping with which a coupling is passive behind a device that is late.
+
+    The device gives a new sample every n ticks and holds one force until the next. That force acts
+    a time t_d = (d + φ) n T after its sample, d whole and 0 <= φ < 1. The tool gets its force at
+    once. With β = B'/T
+
+        b >= n T max_θ [(1 − φ) sin²((d + 1)θ/2) + φ sin²((d + 2)θ/2)]
+                       · [n K²/(4 sin²(θ/2)) + K β + β²] / (K/2 + β),    0 < θ <= π
+
+    without delay   b >= n T [(n − 1) K² + y²]/(2y),    y = K + 2 B'/T
+    B' = 0, n = 1   b >= K T/2 (1 + d)² for a whole number of ticks
+
+    The returned bound is the larger one for t_d and for its whole part, and so holds for every
+    constant delay up to t_d: a part of a tick may ask less of a damper than none.
+
+    It is sufficient for every passive hand and every discrete-time passive scene, and necessary for
+    a spring alone. A sample that comes sooner needs less.
+
+    **Derivation.** The handle moves in one of n ticks. By (12) and the stored energy of the spring,
+    the hand gets at most
+
+        E <= S_0 + V_0 + Σ_j (f_j − f_{j−1−d})·δh_j − (b/nT) ‖δh_j‖² − Σ_i (K/2 + β) ‖δe_i‖²
+
+    with j over samples and i over ticks. f_j − f_{j−1−d} is K times the sum of the δe_i between
+    them plus β (δe_j − δe_{j−1−d}): a row of n filters. Its squared gain at θ is the bracket above
+    times 4 sin²((d + 1)θ/2), and E <= S_0 + V_0 where that is at most 4 (K/2 + β) b/(nT).
+
+    Args:
+        stiffness: K of the law in N/m, finite and > 0.
+        damping: B' of the law in N s/m, finite and >= 0; an array has many.
+        period: T of the loop in s, finite and > 0.
+        delay: t_d in s, 0 to 50 n T.
+        ticks_per_sample: n, at least 1.
+
+    Returns:
+        The bound on b in N s/m, shaped like the damping; units of rotation alike.
+
+    Raises:
+        CouplingError: An argument is out of range.
+
+    References:
+        Brown & Colgate 1997, eq. (6), for n = 1 without delay.
+    """
+    k = scalar("coupling stiffness", stiffness, "N/m", positive=True)
+    law_damping = checked("coupling damping", damping, "N s/m")
+    period = scalar("period", period, "s", positive=True)
+    n = whole("ticks per sample", ticks_per_sample, least=1)
+    delayed = scalar("delay", delay, "s") / (n * period)
+    if delayed > MAX_DELAY:
+        raise CouplingError(f"delay is {delay:g} s; it must be at most {MAX_DELAY * n * period:g}")
+    samples = int(delayed + SAME)
+    part = max(delayed - samples, 0.0)
+    theta = np.linspace(0.0, np.pi, ANGLES_PER_RIPPLE * (samples + 2) + 1)
+    theta[0] = LOWEST_ANGLE
+    ripples = np.sin(0.5 * np.outer([samples + 1, samples + 2], theta)) ** 2
+    lag = np.array([[1.0, 0.0], [1.0 - part, part]]) @ ripples  # of the whole part, and of t_d
+    slow = lag / np.sin(0.5 * theta) ** 2
+    beta = law_damping[..., None, None] / period
+    gain = (0.25 * n * k**2 * slow + (k * beta + beta**2) * lag).max(axis=(-2, -1))
+    needed = n * period * gain / (0.5 * k + law_damping / period)
+    return plain(np.asarray(needed))
+
+
+def stiffest_late_coupling(
+    device_damping: float, period: float, delay: float, ticks_per_sample: int
+) -> tuple[float, float]:
+    """Returns K in N/m and B' in N s/m of the default coupling behind a device that is late.
+
+    It is the stiffest one that needs ``NEEDED_SHARE`` of b, with B' of at least b/(4 n). For a
+    device in time that is ``stiffest_coupling``. Behind a delay the stiffest one has more damping,
+    because the damper lowers the need at low frequencies. Arguments and errors are those of
+    ``late_minimum_damping``; b in N s/m must be finite and > 0.
+    """
+    b = scalar("device damping", device_damping, "N s/m", positive=True)
+    largest = 1.0 + ticks_per_sample**0.5 + delay / period
+    ratios = np.linspace(0.0, largest, RATIOS) * period  # B'/K in s
+    needed = late_minimum_damping(1.0, ratios, period, delay, ticks_per_sample)
+    stiffness = NEEDED_SHARE * b / np.asarray(needed)
+    is_damped = ratios * stiffness >= DAMPING_SHARE * b / ticks_per_sample * (1.0 - SAME)
+    best = int(np.argmax(np.where(is_damped, stiffness, 0.0)))
+    return float(stiffness[best]), float(ratios[best] * stiffness[best])
 
 
 @overload

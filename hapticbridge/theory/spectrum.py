@@ -76,9 +76,8 @@ def damping_spectrum(
         delay = d:   b(ω) = (T/2) Re{(1 − e^{−jωT}) C e^{−jdωT}} / (1 − cos ωT)        a wall
 
     ``minimum_damping`` is the supremum over 0 < ω <= π/T; its arguments and errors apply here. With
-    a delay the environment is a wall, because behind a delayed coupling no damping suffices for
-    *every* passive environment. Against a wall the coupling's damper can help, so values may be
-    negative.
+    a delay the environment is a wall; ``late_minimum_damping`` has the bound for any environment.
+    Against a wall the coupling's damper can help, so values may be negative.
 
     Returns:
         b in N s/m, shape S + F for couplings of shape S and frequencies ω in

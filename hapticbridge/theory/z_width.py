@@ -362,7 +362,7 @@ MARGIN_OF_RANGE = 1.25
 region that is not passive."""
 
 _CYCLES = "limit cycles, which stay bounded as long as K < 2b/T"
-_DELAYED = "with a delay the bound is that of a wall; no general bound exists, so watch the meter"
+_DELAYED = "with a delay the bound is that of a wall; 'hapticbridge bound' has that of every scene"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,14 @@ from scipy import signal
 from hapticbridge.coupling import Coupling
 from hapticbridge.lab.paper.in_mujoco import HEAVY, ImplicitMass, decays, hold, wall_limit
 from hapticbridge.lab.paper.section import Check, Section, Table, explained, panels
-from hapticbridge.theory.bounds import maximum_stiffness, minimum_damping
+from hapticbridge.theory.bounds import (
+    late_minimum_damping,
+    maximum_stiffness,
+    minimum_damping,
+)
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand, stability_limit
 from hapticbridge.theory.spectrum import (
+    Transfer,
     damping_spectrum,
     damping_spectrum_of,
     needed_for_fixed_environment,
@@ -35,6 +40,7 @@ NYQUIST_HZ = 0.5 / PERIOD
 HERTZ = THETA / np.pi * NYQUIST_HZ
 
 _Complex = NDArray[np.complex128]
+_Real = NDArray[np.float64]
 
 
 def spring_with(damping: float) -> Coupling:
@@ -47,9 +53,15 @@ def low_passed(z: _Complex) -> _Complex:
     return np.asarray(K + B * (1 - 1 / z) / (PERIOD + TAU * (1 - 1 / z)))
 
 
-def delayed(z: _Complex) -> _Complex:
-    """Transfer function C of the spring and damper, delayed by one sample."""
-    return np.asarray((K + B / PERIOD * (1 - 1 / z)) / z)
+def spring_and_damper(z: _Complex) -> _Complex:
+    """Transfer function C of the spring and damper (4), in z."""
+    return np.asarray(K + B / PERIOD * (1 - 1 / z))
+
+
+def one_tick_late(transfer: Transfer) -> _Real:
+    """Returns the damping at each frequency, if the device alone gets its force a tick late."""
+    in_time = np.asarray(damping_spectrum_of(transfer, PERIOD, THETA / PERIOD))
+    return np.asarray((1 - np.cos(2 * THETA)) / (1 - np.cos(THETA)) * in_time)
 
 
 def at_limit(quantity: str, expected: float, loop: SampledLoop, *, route: str = "") -> Check:
@@ -71,25 +83,22 @@ def any_coupling() -> Section:
     must be positive. The condition holds for every passive hand and every discrete-time passive
     environment, so nothing of the scene enters.
 
-    It takes any C. A low-pass behind the damper lowers the need at high frequency. One sample
-    of delay makes the real part negative above some frequency: no device damping is then enough
-    for every environment.
+    It takes any C. A low-pass behind the damper lowers the need at high frequency. A device that
+    gets its force a tick late, while the environment gets it at once, needs (1 − cos 2ωT) in place
+    of (1 − cos ωT): four times as much for a spring.
     """
     omega = THETA / PERIOD
     curves = {
         "spring": damping_spectrum_of(lambda z: np.full_like(z, K), PERIOD, omega),
-        "spring and damper (4)": damping_spectrum_of(lambda z: delayed(z) * z, PERIOD, omega),
+        "spring and damper (4)": damping_spectrum_of(spring_and_damper, PERIOD, omega),
         f"the same, damper low-passed with τ = {TAU * 1e3:g} ms": damping_spectrum_of(
             low_passed, PERIOD, omega
         ),
     }
-    late = np.asarray(damping_spectrum_of(delayed, PERIOD, omega))
     figure, (axes,) = panels(1, height=4.2)
     for name, curve in curves.items():
         axes.plot(HERTZ, curve, label=name)
-    axes.plot(HERTZ, np.where(np.isfinite(late), late, np.nan), label="(4) delayed by one sample")
-    first = HERTZ[np.isinf(late)].min()
-    axes.axvspan(first, NYQUIST_HZ, color="C3", alpha=0.12, label="delayed: none suffices")
+    axes.plot(HERTZ, one_tick_late(spring_and_damper), label="(4), the device one tick late")
     axes.set(xlabel="frequency (Hz)", ylabel="device damping needed (N s/m)", ylim=(0, 8))
     axes.legend(fontsize="small", loc="upper left")
 
@@ -126,12 +135,20 @@ def any_coupling() -> Section:
                 SampledLoop(COUPLING, PERIOD, filter_time=TAU),
             ),
             Check(
-                quantity="one sample late, b for every environment",
+                quantity="spring, the device one tick late, b = 2KT for every environment",
                 route="frequency sweep",
-                expected=np.inf,
-                got=float(late.max()),
+                expected=2 * K * PERIOD,
+                got=float(one_tick_late(lambda z: np.full_like(z, K)).max()),
                 unit="N s/m",
-                tolerance=0.0,
+                tolerance=1e-4,
+            ),
+            Check(
+                quantity="spring and damper, the device one tick late, for every environment",
+                route="frequency sweep",
+                expected=float(late_minimum_damping(K, B, PERIOD, delay=PERIOD)),
+                got=float(one_tick_late(spring_and_damper).max()),
+                unit="N s/m",
+                tolerance=1e-4,
             ),
         ),
     )

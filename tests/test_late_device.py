@@ -1,0 +1,315 @@
+"""Devices that answer late or in steps: their conditions, against loops and energies of their own.
+
+The ledger here is exact and shares nothing with the package: hand and device are solved between
+two samples by matrix exponentials, and the hand's energy is what it stores and burns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from hapticbridge.audit import audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.certificate import default_coupling, device_conditions
+from hapticbridge.clock import SimulatedClock
+from hapticbridge.coupling import Coupling
+from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
+from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.rendering import default_method
+from hapticbridge.summary import Summary
+from hapticbridge.theory.bounds import (
+    NEEDED_SHARE,
+    late_minimum_damping,
+    minimum_damping,
+    stiffest_late_coupling,
+)
+
+T = 1e-3
+
+# The bound, against loops of hand, device, coupling and tool
+
+
+def test_without_a_delay_it_is_the_bound_of_brown_and_colgate() -> None:
+    for stiffness, damping in ((1000.0, 0.0), (2400.0, 0.5), (10.0, 3.0)):
+        law = Coupling(stiffness, damping, 0.0, 0.0)
+        found = late_minimum_damping(stiffness, damping, T)
+        assert found == pytest.approx(minimum_damping(law, T), rel=1e-9)
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 3, 8])
+def test_its_closed_forms_hold(ticks: int) -> None:
+    spring = late_minimum_damping(1000.0, 0.0, T, delay=ticks * T)
+    assert spring == pytest.approx(0.5 * (1 + ticks) ** 2, rel=1e-6)
+    y = 300.0 + 2 * 0.5 / T
+    held = ticks * T * ((ticks - 1) * 300.0**2 + y**2) / (2 * y)
+    assert late_minimum_damping(300.0, 0.5, T, 0.0, ticks) == pytest.approx(held, rel=1e-9)
+
+
+def test_a_part_of_a_tick_asks_a_spring_for_three_halves_of_it() -> None:
+    found = late_minimum_damping(1000.0, 0.0, T, delay=0.3 * T)
+    assert found == pytest.approx(1000.0 * (T / 2 + 1.5 * 0.3 * T), rel=1e-6)
+
+
+def test_a_shorter_delay_never_needs_more() -> None:
+    delays = (np.linspace(0.0, 4.0, 33) * T).tolist()
+    for damping in (0.0, 0.3, 3.0):
+        for count in (1, 3):
+            needed = [late_minimum_damping(500.0, damping, T, each, count) for each in delays]
+            assert needed == sorted(needed)
+
+
+def growth(
+    law: tuple[float, float],
+    hand: tuple[float, float],
+    tool: tuple[float, float],
+    lag: tuple[float, int],
+    b: float,
+) -> float:
+    """Returns the largest eigenvalue over a sample period; above 1 the loop is unstable.
+
+    Pairs are K and B', mass and stiffness of the hand with the device, of the tool, and the delay
+    in ticks with the ticks per sample. The tool is lossless (midpoint rule).
+    """
+    (k, damping), (delay, count) = law, lag
+    motion = np.array([[0, 1, 0], [-hand[1] / hand[0], -b / hand[0], 1 / hand[0]], [0, 0, 0]])
+    whole = int(delay)
+    first, second = expm(motion * (delay - whole) * T), expm(motion * (whole + 1 - delay) * T)
+    step = np.array(
+        [
+            [1, -T / 2, 0],
+            [tool[1] * T / (2 * tool[0]), 1, -T / tool[0]],
+            [k + damping / T, 0, 1],
+        ]
+    )
+    solve = np.linalg.inv(step)
+
+    def period(s: NDArray[np.float64]) -> NDArray[np.float64]:
+        for i in range(count):
+            p, v, x, w, before = s[:5]
+            handle = p if i == 0 else before
+            known = [
+                x + T / 2 * w,
+                w - tool[1] * T * x / (2 * tool[0]),
+                k * handle + damping / T * (handle - before + x),
+            ]
+            x, w, force = solve @ known
+            queue = np.concatenate([[force if i == 0 else s[5]], s[5:-1]])
+            p, v, _ = second @ [*(first @ [p, v, -queue[whole + 1]])[:2], -queue[whole]]
+            s = np.concatenate([[p, v, x, w, handle], queue])
+        return s
+
+    size = 5 + whole + 2 + count
+    columns = [period(each) for each in np.eye(size)]
+    return float(np.abs(np.linalg.eigvals(np.column_stack(columns))).max())
+
+
+LAGS = [(1.0, 1), (1.5, 1), (3.0, 1), (0.0, 2), (0.0, 8), (2.0, 2)]
+"""Delay in ticks, and ticks per sample."""
+
+
+@pytest.mark.parametrize("lag", LAGS)
+def test_no_hand_and_tool_swing_at_the_bound_and_some_do_above(lag: tuple[float, int]) -> None:
+    rng, b = np.random.default_rng(0), 2.0
+    at_bound = above = 0.0
+    for _ in range(150):
+        ratio = T * (10 ** rng.uniform(-2, 1) if rng.random() < 0.7 else 0.0)
+        most = b / float(late_minimum_damping(1.0, ratio, T, lag[0] * T, lag[1]))
+        hand = 10 ** rng.uniform(-2.5, 0.5), 10 ** rng.uniform(-1, 5.3)
+        tool = 10 ** rng.uniform(-3.5, 1.5), 10 ** rng.uniform(0, 5) * (rng.random() < 0.5)
+        k = most / 1.001
+        at_bound = max(at_bound, growth((k, ratio * k), hand, tool, lag, b))
+        k = 1.3 * most
+        above = max(above, growth((k, ratio * k), hand, tool, lag, b))
+    assert at_bound <= 1 + 1e-9
+    assert above > 1 + 1e-5
+
+
+def test_the_default_coupling_of_a_late_device_is_stiffer_than_a_walls_rule() -> None:
+    for delay in (1e-3, 1.5e-3, 2e-3, 5e-3):
+        stiffness, damping = stiffest_late_coupling(2.0, T, delay, 1)
+        needed = late_minimum_damping(stiffness, damping, T, delay)
+        assert needed == pytest.approx(NEEDED_SHARE * 2.0, rel=1e-6)
+        assert stiffness > 1.15 * NEEDED_SHARE * 2.0 / (T / 2 + delay)
+    # in time it is the usual one: 80 % of the bound with b/4 of damping
+    assert stiffest_late_coupling(2.0, T, 0.0, 1) == pytest.approx((2400.0, 0.5), rel=1e-2)
+
+
+# In the product: a device that gives a sample every n ticks and holds the force of that tick
+
+
+class SlowDevice:
+    """A device of 1 axis in a hand of spring and damper, solved exactly between two ticks.
+
+    ``gained`` is the largest energy in J that the hand stored and burned beyond its start's.
+    """
+
+    def __init__(self, every: int, stiffness: float, damping: float, *, rate: float) -> None:
+        self.info = DeviceInfo(
+            name="slow",
+            axes=("x", "y", "z"),
+            mass=0.1,
+            damping=2.0,
+            force_limit=10.0,
+            rate=rate,
+            delay=0.0,
+            is_real=False,
+        )
+        self.every, self.stiffness, self.damping = every, stiffness, damping
+        self.gained = 0.0
+
+    def start(self, period: float) -> NDArray[np.void]:
+        mass, b = 0.1, 2.0 + self.damping
+        motion = np.array([[0, 1, 0], [-self.stiffness / mass, -b / mass, 1 / mass], [0, 0, 0]])
+        self._step = expm(motion * period)
+        # ∫ v² dt over a tick is a quadratic form in the state (Van Loan 1978)
+        square = np.diag([0.0, 1.0, 0.0])
+        block = expm(period * np.block([[-motion.T, square], [np.zeros((3, 3)), motion]]))
+        self._square = block[3:, 3:].T @ block[:3, 3:]
+        self._state = np.array([1e-3, 0.05, 0.0])  # displaced and moving
+        self._start = self._stored()
+        self._burned, self._ticks = 0.0, 0
+        self._next = np.zeros(3)
+        self._sample = np.zeros(1, SAMPLE_DTYPE)
+        self._sample["quaternion"][0, 0] = 1.0
+        self._sample["position"][0, 0] = self._state[0]
+        return self._sample
+
+    def _stored(self) -> float:
+        x, v, _ = self._state
+        return 0.5 * 0.1 * float(v) ** 2 + 0.5 * self.stiffness * float(x) ** 2
+
+    def read(self, sample: NDArray[np.void]) -> int:
+        self._burned += self.damping * float(self._state @ self._square @ self._state)
+        self._state = self._step @ self._state
+        self.gained = max(self.gained, self._stored() + self._burned - self._start)
+        self._ticks += 1
+        is_new = self._ticks % self.every == 0
+        if is_new:
+            self._sample["position"][0, 0] = self._state[0]
+        sample[:] = self._sample
+        return 0 if is_new else int(TickFlag.STALE_SAMPLE)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        if self._ticks % self.every == 0:
+            self._state[2] = wrench[0]
+
+    def close(self) -> None:
+        pass
+
+
+def run(device: SlowDevice, coupling: Coupling | None, file: Path | None = None) -> Summary:
+    options = {"clock": SimulatedClock(), "recording": file}
+    with Bridge("virtual_wall", device, coupling, **options) as bridge:  # type: ignore[arg-type]
+        return bridge.run(2.0)
+
+
+HANDS = [(200.0, 0.05), (3000.0, 0.2), (15_421.0, 0.2), (60_000.0, 0.2), (200_000.0, 0.5)]
+"""Stiffness in N/m and damping in N s/m of hands around 0.1 kg."""
+
+
+@pytest.mark.parametrize("every", [2, 4, 8])
+@pytest.mark.parametrize("hand", HANDS)
+def test_a_slow_device_that_is_certified_gives_no_energy(
+    every: int, hand: tuple[float, float]
+) -> None:
+    device = SlowDevice(every, *hand, rate=1000.0 / every)
+    summary = run(device, None)
+    assert summary.is_certified is True
+    assert device.gained < 1e-6
+
+
+def test_the_condition_of_a_shorter_tick_fails_on_it(tmp_path: Path) -> None:
+    # b >= K/(2 rate) + B' took this coupling for one that needs 1.7 of 2 N s/m
+    device = SlowDevice(8, *HANDS[2], rate=125.0)
+    usual = default_method().requested_coupling(Coupling(300.0, 0.5, 0.3, 5e-4), T)
+    summary = run(device, usual, tmp_path / "slow.mcap")
+    assert device.gained > 0.1
+    assert summary.is_certified is False
+    report = audit(tmp_path / "slow.mcap")
+    assert report.certified is False
+    assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in report.conditions[0]
+    assert "device damping 2 < 7.13846 N s/m with one sample in 8 ticks" in summary.conditions[0]
+
+
+def test_the_rate_of_a_slow_device_is_proposed() -> None:
+    info = SlowDevice(8, 1.0, 0.0, rate=125.0).info
+    usual = default_coupling(info, 1 / 125)
+    law = default_method().law_coupling(usual, T)
+    (condition,) = device_conditions(info, law, T, 1.0, 1.0, method=default_method())
+    assert condition.holds is False
+    assert condition.remedy.endswith("or lower the rate to 125 Hz")
+    assert usual.stiffness > 3 * default_coupling(info, T).stiffness
+
+
+# Encoder steps
+
+
+STEP = 5e-5
+
+
+class Noted(SimulatedDevice):
+    """A simulated device that keeps the forces along x that it was sent, in N."""
+
+    def start(self, period: float, parts: int = 1) -> NDArray[np.void]:
+        self.forces: list[float] = []
+        return super().start(period, parts)
+
+    def write(self, wrench: NDArray[np.float64]) -> None:
+        self.forces.append(float(wrench[0]))
+        super().write(wrench)
+
+
+def pressed(friction: float | None, coupling: Coupling | None) -> tuple[Summary, float]:
+    """Pushes a device with encoder steps at a wall for 3 s; returns the force's last swing in N."""
+    push = Motion([0.0, 0.5, 3.0], np.array([[0.0, 0, 0], [0.2, 0, 0], [0.2, 0, 0]]))
+    hand = Hand(mass=0.05, stiffness=10.0, damping=0.5)
+    device = Noted(resolution=STEP, friction=friction or 0.0, hand=hand, path=push, dof=3)
+    device.info = replace(device.info, friction=friction)
+    with Bridge("virtual_wall", device, coupling, clock=SimulatedClock()) as bridge:
+        summary = bridge.run(3.0)
+    return summary, float(np.ptp(device.forces[-502:-2]))
+
+
+COUPLING = Coupling(2400.0, 1.7, 2.4, 1.7e-3)
+NEEDED = STEP * (2400.0 / 2 + 0.5 / T)
+
+
+def test_friction_that_holds_the_steps_is_part_of_the_certificate() -> None:
+    held, swing = pressed(1.001 * NEEDED, COUPLING)
+    assert held.is_certified is True
+    assert swing < 1e-9
+    shaken, swing = pressed(0.0, COUPLING)
+    assert shaken.is_certified is False
+    assert swing > 0.1
+    assert "friction < K Δ/2 + B_law Δ/T" in str(shaken)
+    half, _ = pressed(0.5 * NEEDED, COUPLING)
+    assert half.is_certified is False
+    assert "friction 42.5 mN < 85 mN for its steps of 50 µm" in half.conditions[0]
+
+
+def test_the_default_coupling_needs_no_more_friction_than_there_is() -> None:
+    held, swing = pressed(0.3 * NEEDED, None)
+    assert held.is_certified is True
+    assert swing < 1e-9
+    law = held.coupling.law
+    assert law is not None
+    needed = STEP * (law.stiffness / 2 + law.damping / T)
+    assert needed == pytest.approx(NEEDED_SHARE * 0.3 * NEEDED)
+
+
+def test_steps_that_are_not_known_are_not_judged() -> None:
+    summary, _ = pressed(None, COUPLING)
+    assert summary.is_certified is True
+    assert "its encoder's steps are not judged" in str(summary)
+    assert "its friction is unknown" in summary.conditions[0]
+    info = replace(SimulatedDevice().info, resolution=None, friction=0.05)
+    law = default_method().law_coupling(COUPLING, T)
+    condition = device_conditions(info, law, T, 1.0, 1.0)[0]
+    assert condition.holds is True
+    assert "its resolution is unknown" in condition.sentence()
