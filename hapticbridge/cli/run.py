@@ -17,7 +17,12 @@ import tyro
 from rich.markup import escape
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import device_conditions, run_conditions
+from hapticbridge.certificate import (
+    default_coupling,
+    device_conditions,
+    device_period,
+    run_conditions,
+)
 from hapticbridge.check.case import DEFAULT_SECONDS
 from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
@@ -104,6 +109,7 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
     if setup.scene_ticks:
         _announce_slow(setup)
     _announce_damping(setup, given)
+    _announce_own_rate(setup)
     for sentence in _without_motor(setup):
         err.print(f"  {sentence}")
     reach = setup.guard.reach
@@ -140,6 +146,20 @@ def _announce_damping(setup: RunSetup, given: Mapping[str, float]) -> None:
                 f"  requested {symbol} = {given[name]:g} {unit}: method {setup.method.name} has "
                 f"at least {least:.4g} at this stiffness and rate"
             )
+
+
+def _announce_own_rate(setup: RunSetup) -> None:
+    """Says what stiffness a device slower than the loop would bear at a rate of its own."""
+    info, own = setup.info, device_period(setup.info, setup.period)
+    if own == setup.period or not setup.method.has_law or info.damping is None:
+        return
+    scales, method = setup.workspace.scales, setup.method
+    usual = default_coupling(info, own, *scales, setup.law_evaluations, method)
+    if usual.stiffness > setup.coupling.stiffness:
+        err.print(
+            f"  the device gives {1 / own:.4g} new samples per second, and each force is held: "
+            f"--rate {1 / own:.4g} would allow {usual.stiffness:.3g} N/m"
+        )
 
 
 def _announce_slow(setup: RunSetup) -> None:

@@ -346,7 +346,7 @@ class Bound:
                 }
             )
         else:
-            self._print(ways, shown, period, b)
+            self._print(ways, shown, period, b, holds=holds)
             if condition is not None and (b is None or condition.steps is not None):
                 out.print(plain(condition.sentence()))
         if self.plot is not None:
@@ -381,7 +381,13 @@ class Bound:
         return 2 * b / period if self.damping <= b else 0.0
 
     def _print(
-        self, ways: tuple[Alternative, ...], shown: RunCoupling, period: float, b: float | None
+        self,
+        ways: tuple[Alternative, ...],
+        shown: RunCoupling,
+        period: float,
+        b: float | None,
+        *,
+        holds: bool | None,
     ) -> None:
         method = default_method()
         (sentence,) = shown.sentences()
@@ -409,7 +415,10 @@ class Bound:
             return
         needed = ways[0].needed
         if b >= needed:
-            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand")
+            but = "" if holds else " but for its encoder's steps"
+            out.print(f"device damping {b:g} >= {needed:g} N s/m: passive in any hand{but}")
+            if not holds:
+                return
             out.print(
                 f"method {method.name} needs the larger of KT/2 and B: any K up to "
                 f"{2 * b / period:g} N/m beside any B up to {b:g} N s/m"
