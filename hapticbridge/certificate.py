@@ -5,182 +5,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.ledger import SLACK_SHARE
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.loop_setting import (
+    IN_TIME,
+    Axis,
+    Lag,
+    LoopSetting,
+    delay_ticks,
+    device_period,
+    required_damping,
+)
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
-    late_minimum_damping,
-    minimum_damping,
     stiffest_coupling,
     stiffest_late_coupling,
 )
-from hapticbridge.theory.transfer import delayed_by
 from hapticbridge.units import format_si
-
-Axis = Literal["translation", "rotation"]
-
-# Time in which a device answers
-
-_WHOLE = 1e-9
-"""Excess over a whole number of ticks that counts as rounding, in ticks."""
-
-
-def device_period(info: DeviceInfo, period: float) -> float:
-    """Returns the time in s between two samples: the loop's period, or the device's if longer.
-
-    For a prescribed motion it is the loop's period.
-    """
-    if info.rate is None or info.is_prescribed:
-        return period
-    own = 1.0 / info.rate
-    return own if own > period * (1.0 + _WHOLE) else period
-
-
-def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
-    """Returns the share of the device's samples due that were new, 0 to 1.
-
-    Args:
-        info: The device; with a rate of its own it owes fewer samples than there are deadlines.
-        period: T in s.
-        fresh: Number of ticks with a new sample.
-        due: Number of deadlines.
-    """
-    owed = due * (period / device_period(info, period))
-    return min(fresh / owed, 1.0) if owed else 1.0
-
-
-def delay_ticks(info: DeviceInfo, period: float) -> int | None:
-    """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
-    return None if info.delay is None else whole_ticks(info.delay, period)
-
-
-def whole_ticks(delay: float, period: float) -> int:
-    """Returns the whole ticks in which a delay in s ends; ticks of ``period`` in s."""
-    return max(0, math.ceil(delay / period - _WHOLE))
-
-
-@dataclass(frozen=True, slots=True)
-class Lag:
-    """Time in which a device answers, as its condition counts it.
-
-    Attributes:
-        ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
-        delay: t_d in s from a sample to its force, >= 0; an unknown delay counts as 0.
-    """
-
-    ticks_per_sample: int = 1
-    delay: float = 0.0
-
-    @classmethod
-    def of(cls, info: DeviceInfo, period: float) -> Lag:
-        """Returns that of a device on a loop of period T in s."""
-        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
-
-
-IN_TIME = Lag()
-"""A device that gives a sample in each tick and answers it within the tick."""
-
-
-# Device damping required by a coupling
-
-LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
-"""Lowest frequency in rad per sample, and number of frequencies per ripple, of the search for the
-damping that substeps need. Without a delay the maximum lies at one end in all cases tried: at
-Nyquist, or at the limit towards rest, which 3e-3 approximates to 1e-5."""
-
-
-@cache
-def required_damping(
-    coupling: Coupling,
-    period: float,
-    law_evaluations: int = 1,
-    axis: Axis = "translation",
-    lag: Lag = IN_TIME,
-) -> float:
-    """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
-
-    K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
-    evaluation of the law per tick b = K T/2 + B, and more behind a device that is late
-    (``theory.bounds.late_minimum_damping``). With m evaluations of the law per tick the handle
-    moves by an m-th of its step for each, and the mean wrench is sent. There is no closed form; b
-    is the smallest value for which
-
-        Σ_k f̄_{k−d}·δh_{k+1} + (b/nT) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s (K + mB/T) ‖δx_i‖² >= 0,
-        f_i = K e_i + (mB/T) δe_i,   e = h − x
-
-    for every motion, with k over samples and i over evaluations; d is the delay in whole sample
-    periods, rounded up. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one
-    evaluation it is the whole slack. The search finds b frequency by frequency as the smallest
-    value of a quadratic form over the n m deflections e_i. For B = 0, b grows with m (for strict
-    environments it is K T m/2, because the mean comes late); for B > K T it falls towards B.
-
-    The form is sufficient for any environment within its share of the slack; strict environments
-    need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at m = 2, 4, 8. The
-    form gives 1.63, 1.90, 2.42 N s/m; a wall needs 1.30, 1.60, 1.75; the worst free tool of 1 to
-    0.01 kg needs 1.29, 1.65, 2.03.
-
-    Args:
-        coupling: K and B of the law.
-        period: T of the loop in s.
-        law_evaluations: m, 1 to ``MAX_SUBSTEPS``.
-        axis: Kind of axis.
-        lag: n and the delay of the device.
-
-    Raises:
-        CouplingError: m or the period is out of range, or the delay is more than 50 n T.
-
-    References:
-        Brown & Colgate 1997, eq. (6), for m = 1 and a device in time.
-    """
-    is_linear = axis == "translation"
-    k = coupling.stiffness if is_linear else coupling.rotational_stiffness
-    damping = coupling.damping if is_linear else coupling.rotational_damping
-    if checked_substeps(law_evaluations, CouplingError) == 1:
-        if lag == IN_TIME:
-            return float(minimum_damping(coupling, period, axis=axis))
-        if k == 0.0:
-            return lag.ticks_per_sample * damping
-        late = late_minimum_damping(k, damping, period, lag.delay, lag.ticks_per_sample)
-        return float(late)
-    count, held = law_evaluations * lag.ticks_per_sample, lag.ticks_per_sample * period
-    b = damping * law_evaluations / period
-    if k == 0.0:
-        return float(b * held / law_evaluations)
-    delay = delayed_by(whole_ticks(lag.delay, held))
-    identity, means = np.eye(count), np.zeros(count)
-    means[:law_evaluations] = 1.0 / law_evaluations
-    most = 0.0
-    for theta in _frequencies(delay):
-        z = np.exp(1j * theta)
-        difference = identity - np.eye(count, k=-1) + 0j
-        difference[0, -1] -= 1 / z  # last deflection before the sample
-        law = k * identity + b * difference
-        form = law.conj().T @ difference
-        slack = 0.5 * SLACK_SHARE * (k + b)
-        form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
-        linear = 0.5 * law.conj().T @ ((z ** (delay + 1) - 1) * means)
-        linear += slack * difference.conj().T @ means
-        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / law_evaluations
-        most = max(most, float(gained))
-    return most * held
-
-
-def _frequencies(delay: int) -> NDArray[np.float64]:
-    """Returns the frequencies in rad per sample at which substeps may need most."""
-    if delay == 0:
-        return np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES)
-    return np.linspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES * (delay + 1))
-
 
 # Default coupling of a device
 
@@ -260,7 +107,8 @@ def default_coupling(
         felt = lag if info.turns else IN_TIME
         needed = required_damping(coupling, period, law_evaluations, "rotation", felt)
         turn = min(1.0, NEEDED_SHARE * rotational / needed)
-    steps = StepCondition.of(info, coupling, period, scale * force_scale)
+    loop = LoopSetting(info=info, law=coupling, period=period, scale=scale, force_scale=force_scale)
+    steps = StepCondition.of(loop)
     if steps is not None and steps.available and steps.needed:
         shrink = min(shrink, NEEDED_SHARE * steps.available / steps.needed)
     if min(shrink, turn) < 1.0:
@@ -296,19 +144,16 @@ class StepCondition:
     remedy: str = ""
 
     @classmethod
-    def of(
-        cls, info: DeviceInfo, law: Coupling, period: float, ratio: float
-    ) -> StepCondition | None:
-        """Returns the condition; None if the device has no steps, or nothing of them is stated.
-
-        ``law`` has K and B', ``period`` is T in s, and ``ratio`` is s.
-        """
+    def of(cls, loop: LoopSetting) -> StepCondition | None:
+        """Returns the condition; None if the device has no steps, or nothing of them is stated."""
+        info, law = loop.info, loop.law
         step = info.resolution
         if step == 0.0 or (step is None and info.friction is None):
             return None
         if step is None:
             return cls(None, info.friction, None)
-        needed = ratio * step * (0.5 * law.stiffness + law.damping / period)
+        needed = loop.ratio("translation") * step
+        needed *= 0.5 * law.stiffness + law.damping / loop.period
         return cls(needed, info.friction, step)
 
     @property
@@ -421,71 +266,39 @@ class DampingCondition:
         return text if self.steps is None else f"{text}; {self.steps.sentence()}"
 
 
-def device_conditions(
-    info: DeviceInfo,
-    coupling: Coupling,
-    period: float,
-    scale: float,
-    force_scale: float,
-    law_evaluations: int = 1,
-    method: Method | None = None,
-    timestep: float | None = None,
-) -> tuple[DampingCondition, ...]:
+def conditions_of(loop: LoopSetting) -> tuple[DampingCondition, ...]:
     """Returns the condition for each kind of axis of a device with known translational damping.
 
     A device that only turns needs no translational damping. One more condition, of unknown outcome,
     is for axes that it senses without a motor.
 
-    For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
-    not scaled, so the factor for rotation is force_scale / scale. The device's own rate and delay
-    count (``Lag``).
-
-    Args:
-        info: The device.
-        coupling: K and B' of the law, not the effective coupling.
-        period: T in s.
-        scale: Handle motion per device motion.
-        force_scale: Force on the device per force on the tool.
-        law_evaluations: Evaluations of the wrench per tick (substeps).
-        method: Rendering method, which decides the remedy; None for one that uses the damping as
-            requested.
-        timestep: MuJoCo's h in s, for the remedy; None for ``period`` / ``law_evaluations``.
-
     References:
         Brown & Colgate 1997, eq. (6); sufficient for any environment that satisfies (14).
     """
-    is_known = info.damping is not None or not info.moves
-    demand = _Demand(info, coupling, period, scale, force_scale, law_evaluations, method, timestep)
-    conditions = []
+    info, conditions = loop.info, []
     if info.moves and info.damping is not None:
-        conditions.append(demand.condition("translation", info.damping))
-    if info.turns and is_known:
-        conditions.append(demand.condition("rotation", info.rotational_damping))
-    if info.sensed and is_known:
+        conditions.append(_condition(loop, "translation", info.damping))
+    if info.turns and loop.is_judged:
+        conditions.append(_condition(loop, "rotation", info.rotational_damping))
+    if info.sensed and loop.is_judged:
         conditions.append(DampingCondition(", ".join(info.sensed), 0.0, None, is_felt=False))
     return tuple(conditions)
 
 
-def required_axis_damping(
-    info: DeviceInfo,
-    coupling: Coupling,
-    period: float,
-    scale: float,
-    force_scale: float,
-    law_evaluations: int,
-    method: Method,
-) -> tuple[float, float]:
-    """Returns the damping that a coupling needs, in N s/m and N m s/rad; 0 without a condition.
-
-    Arguments are those of ``device_conditions``.
-    """
-    is_known = info.damping is not None or not info.moves
-    if not method.has_coupling or not is_known:
-        return 0.0, 0.0
-    demand = _Demand(info, coupling, period, scale, force_scale, law_evaluations, method)
-    return (
-        demand.needed("translation") if info.moves else 0.0,
-        demand.needed("rotation") if info.turns else 0.0,
+def _condition(loop: LoopSetting, axis: Axis, available: float | None) -> DampingCondition:
+    """Returns the condition along one kind of axis, with the changes that would meet it."""
+    needed, remedy = loop.needed(axis), ""
+    if available is not None and available < needed:
+        remedy = _remedy(loop, axis, available)
+    return DampingCondition(
+        axis,
+        needed,
+        available,
+        remedy,
+        delay_ticks(loop.info, loop.period),
+        loop.period,
+        loop.lag.ticks_per_sample,
+        _steps(loop) if axis == "translation" else None,
     )
 
 
@@ -502,172 +315,118 @@ _ROUNDING = 1e-6  # relative; keeps a limit found by bisection from losing a dig
 _Part = Literal["stiffness", "damping", "period"]
 
 
-@dataclass(frozen=True, slots=True)
-class _Demand:
-    """Damping that a coupling asks of a device, and what would ask for less.
+def _steps(loop: LoopSetting) -> StepCondition | None:
+    """Returns the condition on encoder steps, with the changes that would meet it."""
+    found = StepCondition.of(loop)
+    if found is None or found.holds is not False:
+        return found
+    finer = "take a device with finer steps or more friction"
+    if not found.available:
+        told = f"without friction no coupling is free of swings by steps: {finer}"
+        return replace(found, remedy=told)
+    less = NEEDED_SHARE * found.available / (found.needed or math.inf)
+    told = _both_lowered(loop, "translation", less)
+    return replace(found, remedy=f"{told}, or {finer}")
 
-    Attributes are the arguments of ``device_conditions``.
+
+def _both_lowered(loop: LoopSetting, axis: Axis, share: float) -> str:
+    """Returns the words for a share of the law's stiffness and damping, as requested."""
+    prefix, spring, damper = _SETTINGS[axis]
+    gains = (share * gain for gain in _gains(loop.requested(loop.law), axis))
+    k, b = (_three_digits(gain) for gain in gains)
+    return f"lower the {prefix}stiffness to {k} {spring} and the damping to {b} {damper}"
+
+
+def _remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
+    """Returns changes with which the device has damping in reserve (``NEEDED_SHARE``).
+
+    Stiffness and damping are the requested ones. Each quantity is changed alone; if none suffices
+    alone, stiffness and damping are lowered together.
     """
+    if not loop.method.has_law:
+        return "lower stiffness or damping, or raise the rate"
+    if available <= 0.0:
+        return "a device without damping bears no coupling"
+    if loop.law_evaluations == 1 and loop.lag != IN_TIME:
+        return _late_remedy(loop, axis, available)
+    prefix, spring, damper = _SETTINGS[axis]
+    parts: tuple[_Part, ...] = ("stiffness", "damping")
+    # a faster loop shortens all that a device in time waits for
+    is_rate_free = math.isclose(loop.h * loop.law_evaluations, loop.period)
+    parts += ("period",) if is_rate_free and loop.lag == IN_TIME else ()
+    share = {part: _largest(partial(_bears, loop, axis, available, part)) for part in parts}
+    stiffness, damping = _gains(_requested(loop), axis)
+    found = []
+    if share["stiffness"]:
+        limit = _three_digits(share["stiffness"] * stiffness)
+        found.append(f"lower the {prefix}stiffness to {limit} {spring}")
+    if share["damping"]:
+        limit = _three_digits(share["damping"] * damping)
+        found.append(f"lower the {prefix}damping to {limit} {damper}")
+    if share.get("period", 0.0) * FASTEST * loop.period > 1:
+        limit = _three_digits(1 / (share["period"] * loop.period), math.ceil)
+        found.append(f"raise the rate to {limit} Hz")
+    if not found:
+        return _both_lowered(loop, axis, NEEDED_SHARE * available / loop.needed(axis))
+    told = ", or ".join(found)
+    if _is_hidden(loop, axis):
+        added = loop.method.compensated_share * share["stiffness"] * stiffness * loop.h
+        at_most = _three_digits(added)
+        told += f", with a {prefix}damping of at most {at_most} {damper}"
+    return told
 
-    info: DeviceInfo
-    law: Coupling
-    period: float
-    scale: float
-    force_scale: float
-    law_evaluations: int
-    method: Method | None
-    timestep: float | None = None
 
-    @property
-    def h(self) -> float:
-        """MuJoCo's time step in s."""
-        return self.timestep or self.period / self.law_evaluations
+def _late_remedy(loop: LoopSetting, axis: Axis, available: float) -> str:
+    """Returns the stiffest coupling that a late device bears, no stiffer than the requested."""
+    prefix, spring, damper = _SETTINGS[axis]
+    lag, slower = loop.lag, device_period(loop.info, loop.period)
+    stiffness, damping = stiffest_late_coupling(
+        available / loop.ratio(axis), loop.period, lag.delay, lag.ticks_per_sample
+    )
+    softer = min(1.0, _gains(loop.law, axis)[0] / stiffness)
+    at = prefix.replace(" ", "_")
+    gains = {f"{at}stiffness": softer * stiffness, f"{at}damping": softer * damping}
+    k, b = _gains(loop.requested(replace(loop.law, **gains)), axis)
+    told = (
+        f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
+        f"{_three_digits(b)} {damper}"
+    )
+    if _bears(loop, axis, available, "period", slower / loop.period):
+        told += f", or lower the rate to {_three_digits(1 / slower)} Hz"
+    return told
 
-    def needed(self, axis: Axis) -> float:
-        """Returns the damping that the device needs in N s/m or N m s/rad."""
-        ratio, lag = self._ratio(axis), Lag.of(self.info, self.period)
-        return ratio * required_damping(self.law, self.period, self.law_evaluations, axis, lag)
 
-    def _ratio(self, axis: Axis) -> float:
-        """Returns the ratio of the coupling at the device to that in the scene."""
-        is_linear = axis == "translation"
-        return self.scale * self.force_scale if is_linear else self.force_scale / self.scale
+def _gains(coupling: Coupling, axis: Axis) -> tuple[float, float]:
+    if axis == "translation":
+        return coupling.stiffness, coupling.damping
+    return coupling.rotational_stiffness, coupling.rotational_damping
 
-    def condition(self, axis: Axis, available: float | None) -> DampingCondition:
-        """Returns the condition, with the changes that would meet it if it fails."""
-        needed = self.needed(axis)
-        remedy = ""
-        if available is not None and available < needed:
-            remedy = self._remedy(axis, available)
-        return DampingCondition(
-            axis,
-            needed,
-            available,
-            remedy,
-            delay_ticks(self.info, self.period),
-            self.period,
-            Lag.of(self.info, self.period).ticks_per_sample,
-            self._steps() if axis == "translation" else None,
-        )
 
-    def _steps(self) -> StepCondition | None:
-        """Returns the condition on encoder steps, with the changes that would meet it."""
-        found = StepCondition.of(self.info, self.law, self.period, self.scale * self.force_scale)
-        if found is None or found.holds is not False:
-            return found
-        return replace(found, remedy=self._remedy_of_steps(found))
+def _is_hidden(loop: LoopSetting, axis: Axis) -> bool:
+    """Returns True if the method took off all requested damping, which may have had any value."""
+    return loop.method.compensated_share > 0.0 and _gains(loop.law, axis)[1] == 0.0
 
-    def _remedy_of_steps(self, steps: StepCondition) -> str:
-        finer = "take a device with finer steps or more friction"
-        if not steps.available:
-            return f"without friction no coupling is free of swings by steps: {finer}"
-        less = NEEDED_SHARE * steps.available / (steps.needed or math.inf)
-        gains = (less * gain for gain in self._gains(self._law_as_requested(), "translation"))
-        k, b = (_three_digits(gain) for gain in gains)
-        return f"lower the stiffness to {k} N/m and the damping to {b} N s/m, or {finer}"
 
-    def _remedy(self, axis: Axis, available: float) -> str:
-        """Returns changes with which the device has damping in reserve (``NEEDED_SHARE``).
+def _requested(loop: LoopSetting) -> Coupling:
+    """Returns the smallest requested coupling of this law; hidden damping counts as 0."""
+    found = loop.requested(loop.law)
+    return replace(
+        found,
+        damping=0.0 if _is_hidden(loop, "translation") else found.damping,
+        rotational_damping=0.0 if _is_hidden(loop, "rotation") else found.rotational_damping,
+    )
 
-        Stiffness and damping are the requested ones. Each quantity is changed alone; if none
-        suffices alone, stiffness and damping are lowered together.
-        """
-        if self.method is not None and not self.method.has_law:
-            return "lower stiffness or damping, or raise the rate"
-        if available <= 0.0:
-            return "a device without damping bears no coupling"
-        if self.law_evaluations == 1 and Lag.of(self.info, self.period) != IN_TIME:
-            return self._late_remedy(axis, available)
-        prefix, spring, damper = _SETTINGS[axis]
-        parts: tuple[_Part, ...] = ("stiffness", "damping")
-        parts += ("period",) if self._is_rate_free else ()
-        share = {part: _largest(partial(self._bears, axis, available, part)) for part in parts}
-        stiffness, damping = self._gains(self._requested(), axis)
-        found = []
-        if share["stiffness"]:
-            limit = _three_digits(share["stiffness"] * stiffness)
-            found.append(f"lower the {prefix}stiffness to {limit} {spring}")
-        if share["damping"]:
-            limit = _three_digits(share["damping"] * damping)
-            found.append(f"lower the {prefix}damping to {limit} {damper}")
-        if share.get("period", 0.0) * FASTEST * self.period > 1:
-            limit = _three_digits(1 / (share["period"] * self.period), math.ceil)
-            found.append(f"raise the rate to {limit} Hz")
-        if not found:
-            less = NEEDED_SHARE * available / self.needed(axis)
-            gains = (less * gain for gain in self._gains(self._law_as_requested(), axis))
-            k, b = (_three_digits(gain) for gain in gains)
-            return f"lower the {prefix}stiffness to {k} {spring} and the damping to {b} {damper}"
-        told = ", or ".join(found)
-        if self.method is not None and self._is_hidden(axis):
-            added = self.method.compensated_share * share["stiffness"] * stiffness * self.h
-            at_most = _three_digits(added)
-            told += f", with a {prefix}damping of at most {at_most} {damper}"
-        return told
 
-    def _late_remedy(self, axis: Axis, available: float) -> str:
-        """Returns the stiffest coupling that a late device bears, no stiffer than the requested."""
-        prefix, spring, damper = _SETTINGS[axis]
-        lag, slower = Lag.of(self.info, self.period), device_period(self.info, self.period)
-        own = available / self._ratio(axis)
-        stiffness, damping = stiffest_late_coupling(
-            own, self.period, lag.delay, lag.ticks_per_sample
-        )
-        softer = min(1.0, self._gains(self.law, axis)[0] / stiffness)
-        at = prefix.replace(" ", "_")
-        gains = {f"{at}stiffness": softer * stiffness, f"{at}damping": softer * damping}
-        law, method = replace(self.law, **gains), self.method
-        requested = law if method is None else method.requested_coupling(law, self.h)
-        k, b = self._gains(requested, axis)
-        told = (
-            f"set the {prefix}stiffness to {_three_digits(k)} {spring} and the {prefix}damping to "
-            f"{_three_digits(b)} {damper}"
-        )
-        if self._bears(axis, available, "period", slower / self.period):
-            told += f", or lower the rate to {_three_digits(1 / slower)} Hz"
-        return told
-
-    @property
-    def _is_rate_free(self) -> bool:
-        """True if a faster loop shortens all that the device waits for."""
-        is_prompt = self.info.rate is None and not delay_ticks(self.info, self.period)
-        return is_prompt and math.isclose(self.h * self.law_evaluations, self.period)
-
-    def _gains(self, coupling: Coupling, axis: Axis) -> tuple[float, float]:
-        if axis == "translation":
-            return coupling.stiffness, coupling.damping
-        return coupling.rotational_stiffness, coupling.rotational_damping
-
-    def _is_hidden(self, axis: Axis) -> bool:
-        """True if the method took off all requested damping, which may have had any value."""
-        share = 0.0 if self.method is None else self.method.compensated_share
-        return share > 0.0 and self._gains(self.law, axis)[1] == 0.0
-
-    def _law_as_requested(self) -> Coupling:
-        method = self.method
-        return self.law if method is None else method.requested_coupling(self.law, self.h)
-
-    def _requested(self) -> Coupling:
-        """Smallest requested coupling of this law; hidden damping counts as 0."""
-        found = self._law_as_requested()
-        return replace(
-            found,
-            damping=0.0 if self._is_hidden("translation") else found.damping,
-            rotational_damping=0.0 if self._is_hidden("rotation") else found.rotational_damping,
-        )
-
-    def _bears(self, axis: Axis, available: float, part: _Part, share: float) -> bool:
-        """Returns True if the device has reserve after one quantity is reduced to a share."""
-        requested, faster = self._requested(), 1.0
-        if part == "period":
-            faster = share
-        else:
-            name = part if axis == "translation" else f"rotational_{part}"
-            requested = replace(requested, **{name: share * getattr(requested, name)})
-        step = self.h * faster
-        law = requested if self.method is None else self.method.law_coupling(requested, step)
-        changed = replace(self, law=law, period=faster * self.period, timestep=step)
-        return changed.needed(axis) <= NEEDED_SHARE * available * (1 + _ROUNDING)
+def _bears(loop: LoopSetting, axis: Axis, available: float, part: _Part, share: float) -> bool:
+    """Returns True if the device has reserve after one quantity is reduced to a share."""
+    requested, faster = _requested(loop), 1.0
+    if part == "period":
+        faster = share
+    else:
+        name = part if axis == "translation" else f"rotational_{part}"
+        requested = replace(requested, **{name: share * getattr(requested, name)})
+    needed = loop.requesting(requested, faster).needed(axis)
+    return needed <= NEEDED_SHARE * available * (1 + _ROUNDING)
 
 
 _SETTINGS: dict[Axis, tuple[str, str, str]] = {
@@ -705,16 +464,7 @@ def run_conditions(
     """
     if info.is_prescribed or not method.has_coupling:
         return ()
-    return device_conditions(
-        info,
-        parameters.effective or parameters.coupling,
-        parameters.period,
-        parameters.scale,
-        parameters.force_scale,
-        parameters.law_evaluations,
-        method,
-        parameters.timestep,
-    )
+    return conditions_of(LoopSetting.of_run(info, parameters, method))
 
 
 def condition_sentences(

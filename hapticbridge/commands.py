@@ -21,15 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import Arguments, shown
-from hapticbridge.certificate import (
-    IN_TIME,
-    Lag,
-    StepCondition,
-    assumed_damping,
-    required_axis_damping,
-)
+from hapticbridge.certificate import StepCondition, assumed_damping
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import (
     CommandError,
     CouplingError,
@@ -43,6 +36,7 @@ from hapticbridge.inputs import applied_writes
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.loop_setting import IN_TIME, LoopSetting
 from hapticbridge.rendering import Method
 from hapticbridge.run_description import restore_state
 from hapticbridge.slow_scene import SlowScene
@@ -233,14 +227,12 @@ class AxisCouplingLimits:
     @property
     def leverage(self) -> float:
         """Factor s from the tool's to the device's coupling."""
-        if self.axis == "translation":
-            return self.run.scale * self.run.force_scale
-        return self.run.force_scale / self.run.scale
+        return self.run.loop.ratio(self.axis)
 
     @property
     def damping(self) -> float:
         """Device damping b in N s/m or N m s/rad, or the assumed one."""
-        return assumed_damping(self.run.info)[self.axis == "rotation"]
+        return assumed_damping(self.run.loop.info)[self.axis == "rotation"]
 
     def gains(self, coupling: Coupling) -> tuple[float, float]:
         """Returns the stiffness and damping of a coupling along these axes."""
@@ -258,27 +250,24 @@ class AxisCouplingLimits:
         The requirement is convex and homogeneous in (K, B'), so linear interpolation never
         underestimates it.
         """
-        run, (linear, angular) = self.run, assumed_damping(self.run.info)
-        known = replace(run.info, damping=linear, rotational_damping=angular)
-        is_linear = run.law_evaluations == 1 and Lag.of(known, run.period) == IN_TIME
+        linear, angular = assumed_damping(self.run.loop.info)
+        known = replace(self.run.loop.info, damping=linear, rotational_damping=angular)
+        loop = replace(self.run.loop, info=known)
+        is_linear = loop.law_evaluations == 1 and loop.lag == IN_TIME
         inner = () if is_linear else np.geomspace(0.02, 50.0, _POINTS)
-        ratios = run.period * np.array([0.0, *inner, _HIGHEST])
+        ratios = loop.period * np.array([0.0, *inner, _HIGHEST])
         needs = []
         for ratio in ratios.tolist():
-            requested = self.put(run.start, 1.0, ratio)
-            scales = run.scale, run.force_scale
+            at = replace(loop, law=self.put(self.run.start, 1.0, ratio))
             try:
-                need = required_axis_damping(
-                    known, requested, run.period, *scales, run.law_evaluations, run.method
-                )
-                needs.append(max(need[self.axis == "rotation"], self._for_steps(requested)))
-            except CouplingError:  # no damping compensates this delay
+                needs.append(max(at.needs()[self.axis == "rotation"], self._for_steps(at)))
+            except CouplingError:  # the delay is beyond what the theory takes
                 needs.append(math.inf)
         return ratios, np.array(needs)
 
-    def _for_steps(self, law: Coupling) -> float:
+    def _for_steps(self, loop: LoopSetting) -> float:
         """Returns the damping b times the share of the friction that encoder steps need."""
-        steps = StepCondition.of(self.run.info, law, self.run.period, self.leverage)
+        steps = StepCondition.of(loop)
         if self.axis == "rotation" or steps is None or not steps.available:
             return 0.0
         return self.damping * (steps.needed or 0.0) / steps.available
@@ -300,7 +289,7 @@ class AxisCouplingLimits:
 
     def max_stiffness(self, damping: float) -> float:
         """Returns the largest stiffness for a damping; 0 if there is none."""
-        most = 4.0 * self.damping / (self.run.period * self.leverage)
+        most = 4.0 * self.damping / (self.run.loop.period * self.leverage)
         return _largest(most, lambda stiffness: self.needed(stiffness, damping), self.damping)
 
     def max_damping(self, stiffness: float) -> float:
@@ -361,26 +350,19 @@ class CouplingLimits:
     """Limits of stiffness and damping on a device, in translation and rotation.
 
     Attributes:
-        info: The device.
-        method: The rendering method.
+        loop: Loop of the run.
         start: Requested coupling at the start of the run.
-        period: T in s.
-        scale: s_h, handle motion per device motion.
-        force_scale: s_f, force on the device per force on the tool.
-        timestep: MuJoCo's h in s.
-        law_evaluations: Evaluations of the law per tick.
         limits: Limits of the run.
     """
 
-    info: DeviceInfo
-    method: Method
+    loop: LoopSetting
     start: Coupling
-    period: float
-    scale: float
-    force_scale: float
-    timestep: float
-    law_evaluations: int
     limits: Limits
+
+    @property
+    def method(self) -> Method:
+        """The rendering method."""
+        return self.loop.method
 
     @cached_property
     def translation(self) -> AxisCouplingLimits:
@@ -390,7 +372,7 @@ class CouplingLimits:
     @cached_property
     def rotation(self) -> AxisCouplingLimits | None:
         """Limits in rotation; None for a device without torque."""
-        return AxisCouplingLimits("rotation", self) if self.info.turns else None
+        return AxisCouplingLimits("rotation", self) if self.loop.info.turns else None
 
     @property
     def spans(self) -> tuple[AxisCouplingLimits, ...]:
@@ -407,14 +389,15 @@ class CouplingLimits:
 
     def law(self, requested: Coupling) -> Coupling:
         """Returns the law's coupling for a requested one."""
-        return self.method.law_coupling(requested, self.timestep)
+        return self.loop.requesting(requested).law
 
     def reason(self) -> str:
         """Returns the reason of the slider limits, in a sentence."""
-        is_known = self.info.damping and (self.info.rotational_damping or not self.info.turns)
+        info = self.loop.info
+        is_known = info.damping and (info.rotational_damping or not info.turns)
         known = "" if is_known else " (assumed; it is unknown)"
         dampings = " and ".join(f"{span.damping:.3g} {UNITS[span.axis][1]}" for span in self.spans)
-        if self.info.is_prescribed:
+        if info.is_prescribed:
             return f"They end where a device with a damping of {dampings} would just suffice."
         return (
             f"They end where the device's damping of {dampings}{known} just suffices. Beyond, the "
@@ -437,7 +420,8 @@ class CouplingLimits:
             return
         if self.rotation is None:
             raise CommandError(
-                f"device '{self.info.name}' feels no torque; its coupling's rotation stays as it is"
+                f"device '{self.loop.info.name}' feels no torque; its coupling's rotation stays as "
+                "it is"
             )
         self.rotation.check(stiffness, damping)
 
@@ -697,7 +681,7 @@ class CommandExecutor:
             limits = self._queue.limits
             self.requested = limits.requested(command, self.requested)
             law = asdict(limits.law(self.requested))
-            ticks = tuning_ticks(limits.period)
+            ticks = tuning_ticks(limits.loop.period)
             self._apply({"event": "coupling", **law, "ticks": ticks, "by": by})
         elif isinstance(command, Switch):
             if command.force is not None:

@@ -434,7 +434,7 @@ def guard_parameters_for(
         limits: Limits of the run.
         period: T in s.
         needed: Damping in N s/m and N m s/rad that the coupling needs
-            (``certificate.device_conditions``). A device that has it counts with all its
+            (``loop_setting.LoopSetting.needs``). A device that has it counts with all its
             dissipation, so its energy account stays balanced and the controller idle.
         scale: Handle motion per device motion.
         controller: One of ``CONTROLLERS``. None selects ``damper`` for a device with less damping

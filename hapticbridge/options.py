@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import is_number, shown
-from hapticbridge.certificate import default_coupling, required_axis_damping
+from hapticbridge.certificate import default_coupling
 from hapticbridge.check.physics import site_inertia
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
@@ -53,6 +53,7 @@ from hapticbridge.kernel.parameters import (
     refuse_substeps,
     rotation_numbers,
 )
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
 from hapticbridge.rehearsal import TIPPED, holding_force, start_handle, static_load, toppling_force
@@ -483,23 +484,8 @@ class RunSetup:
         else:
             usual = _usual_coupling(scene, info, options, ticks, evaluations)
             requested = replace(usual, **(coupling or {}))
-        law = method.law_coupling(requested, max(ticks, 1) * period / substeps)
-        limits, scales = limits_for(info, options.limits), options.workspace.scales
-        guard = guard_parameters_for(
-            info,
-            limits,
-            period,
-            needed=required_axis_damping(info, law, period, *scales, evaluations, method),
-            scale=scales[0],
-            controller=options.controller,
-        )
-        guard = replace(
-            guard,
-            clutch=button_mask(options.clutch, "clutch"),
-            dead_man=button_mask(options.dead_man, "dead-man"),
-        )
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
-        return cls(
+        setup = cls(
             scene=scene,
             info=info,
             coupling=requested,
@@ -508,8 +494,7 @@ class RunSetup:
             substeps=substeps,
             scene_ticks=ticks,
             workspace=options.workspace,
-            limits=limits,
-            guard=guard,
+            limits=limits_for(info, options.limits),
             contact_stiffness=resolve_contact_stiffness(
                 method, requested, options.contact_stiffness
             ),
@@ -518,6 +503,20 @@ class RunSetup:
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
         )
+        guard = guard_parameters_for(
+            info,
+            setup.limits,
+            period,
+            needed=setup.loop.needs(),
+            scale=options.workspace.scale,
+            controller=options.controller,
+        )
+        guard = replace(
+            guard,
+            clutch=button_mask(options.clutch, "clutch"),
+            dead_man=button_mask(options.dead_man, "dead-man"),
+        )
+        return replace(setup, guard=guard)
 
     @property
     def scene_period(self) -> float:
@@ -545,20 +544,24 @@ class RunSetup:
         return 1 if self.scene_ticks else self.method.law_evaluations(self.substeps)
 
     @property
-    def coupling_limits(self) -> CouplingLimits:
-        """Couplings that may be selected during the run."""
+    def loop(self) -> LoopSetting:
+        """The loop as the device condition sees it."""
         scale, force_scale = self.workspace.scales
-        return CouplingLimits(
+        return LoopSetting(
             info=self.info,
-            method=self.method,
-            start=self.attainable,
+            law=self.law,
             period=self.period,
             scale=scale,
             force_scale=force_scale,
-            timestep=self.timestep,
             law_evaluations=self.law_evaluations,
-            limits=self.limits,
+            method=self.method,
+            timestep=self.timestep,
         )
+
+    @property
+    def coupling_limits(self) -> CouplingLimits:
+        """Couplings that may be selected during the run."""
+        return CouplingLimits(loop=self.loop, start=self.attainable, limits=self.limits)
 
     def holding(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
         """Returns the parameters of a run that starts now and whose device can hold the tool.

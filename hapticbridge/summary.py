@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.certificate import (
     condition_sentences,
-    fresh_share,
     is_run_certified,
     run_conditions,
     worst_verdict,
@@ -25,6 +24,7 @@ from hapticbridge.device import DeviceInfo
 from hapticbridge.kernel.codes import JOINT, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
 from hapticbridge.timekeeping import (

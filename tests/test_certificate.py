@@ -10,15 +10,14 @@ import pytest
 
 from hapticbridge.certificate import (
     DampingCondition,
+    conditions_of,
     default_coupling,
-    delay_ticks,
-    device_conditions,
-    device_period,
     is_certified,
     worst_verdict,
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
+from hapticbridge.loop_setting import LoopSetting, delay_ticks, device_period
 from hapticbridge.rendering import METHODS, default_method
 from hapticbridge.theory.bounds import NEEDED_SHARE
 
@@ -29,6 +28,19 @@ SPRING = Coupling(1000.0, 0.0, 2.0, 0.0)
 def info(**changes: Any) -> DeviceInfo:
     real = {"axes": ("x", "y", "z"), "is_real": True, "rate": 1000.0, "delay": 0.0}
     return dataclasses.replace(SimulatedDevice(damping=2.0).info, **{**real, **changes})
+
+
+def loop_of(
+    sheet: DeviceInfo,
+    law: Coupling,
+    period: float = T,
+    scales: tuple[float, float] = (1.0, 1.0),
+    **changes: Any,
+) -> LoopSetting:
+    scale, force_scale = scales
+    return LoopSetting(
+        info=sheet, law=law, period=period, scale=scale, force_scale=force_scale, **changes
+    )
 
 
 def test_one_false_or_unknown_verdict_decides_over_all() -> None:
@@ -53,17 +65,17 @@ def test_a_device_slower_than_the_loop_is_judged_by_its_own_period() -> None:
     assert device_period(info(rate=4000.0), T) == T
     assert device_period(info(rate=None), T) == T
     assert device_period(info(rate=500.0, is_prescribed=True), T) == T
-    (slow,) = device_conditions(info(rate=500.0), SPRING, T, 1.0, 1.0)
+    (slow,) = conditions_of(loop_of(info(rate=500.0), SPRING))
     # a force held for 2 T while the tool moves in each: n K (n T)/2 for a spring
     assert slow.needed == pytest.approx(2 * SPRING.stiffness * 2e-3 / 2)
-    (between,) = device_conditions(info(rate=999.0), SPRING, T, 1.0, 1.0)
+    (between,) = conditions_of(loop_of(info(rate=999.0), SPRING))
     assert between.needed == pytest.approx(slow.needed)
 
 
 def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
     soft = dataclasses.replace(SPRING, stiffness=100.0)
     prompt, late, unknown = (
-        device_conditions(info(delay=delay), soft, T, 1.0, 1.0) for delay in (0.0, 2e-3, None)
+        conditions_of(loop_of(info(delay=delay), soft)) for delay in (0.0, 2e-3, None)
     )
     assert is_certified(prompt) is True
     assert is_certified(late) is None
@@ -72,7 +84,7 @@ def test_no_delayed_device_is_certified_and_a_prompt_one_is() -> None:
         late[0].sentence()
     )
     assert "without delay, which is unknown" in unknown[0].sentence()
-    stiff = device_conditions(info(delay=2e-3), SPRING, T, 1.0, 1.0)
+    stiff = conditions_of(loop_of(info(delay=2e-3), SPRING))
     assert is_certified(stiff) is False
 
 
@@ -87,7 +99,7 @@ def test_the_default_coupling_meets_the_condition_with_margin(
     late = info(delay=delay)
     felt = default_coupling(late, period, *scales, laws)
     coupling = default_method(laws).law_coupling(felt, period / laws)
-    conditions = device_conditions(late, coupling, period, *scales, laws)
+    conditions = conditions_of(loop_of(late, coupling, period, scales, law_evaluations=laws))
     for condition in conditions:
         assert condition.needed <= NEEDED_SHARE * (condition.available or 0.0) * (1 + 1e-6)
     assert conditions[0].needed > 0.7 * 2.0
@@ -149,7 +161,9 @@ def test_a_remedy_that_is_followed_leaves_a_reserve_of_15_percent(
 
     def condition(coupling: Coupling, period: float) -> DampingCondition:
         law = chosen.law_coupling(coupling, period / laws)
-        found = device_conditions(device, law, period, 1.2, 0.9, laws, chosen)
+        found = conditions_of(
+            loop_of(device, law, period, (1.2, 0.9), law_evaluations=laws, method=chosen)
+        )
         return next(each for each in found if each.axis == axis)
 
     failing = condition(requested, T)
@@ -169,7 +183,7 @@ def test_less_damping_is_no_remedy_behind_a_delay() -> None:
     for damping in (0.6, 0.4, 0.3):
         method = default_method()
         law = method.law_coupling(Coupling(600.0, damping, 0.0, 0.0), T)
-        (found,) = device_conditions(info(delay=3e-3, damping=1.0), law, T, 1.0, 1.0, method=method)
+        (found,) = conditions_of(loop_of(info(delay=3e-3, damping=1.0), law, method=method))
         assert found.remedy == "set the stiffness to 301 N/m and the damping to 0.517 N s/m"
         needed.append(found.needed)
     assert needed == sorted(needed)  # the damper of the coupling helps

@@ -11,7 +11,6 @@ from audit_cases import COUPLING, ScriptedDevice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.certificate import required_axis_damping
 from hapticbridge.commands import (
     INTERVAL,
     LONGEST_LINE,
@@ -28,8 +27,10 @@ from hapticbridge.commands import (
     command_of,
     line_of,
 )
+from hapticbridge.device import AXES
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.rendering import method_named
 
 T = 1e-3
@@ -40,17 +41,15 @@ INFO = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0)).info
 def allowance(
     method: str = "implicit", scale: float = 1.0, **changes: float | None
 ) -> CouplingLimits:
-    return CouplingLimits(
+    loop = LoopSetting(
         info=replace(INFO, **changes),  # type: ignore[arg-type] # numbers of a device alone
-        method=method_named(method),
-        start=COUPLING,
+        law=COUPLING,
         period=T,
         scale=scale,
         force_scale=scale,
-        timestep=T,
-        law_evaluations=1,
-        limits=Limits(force=10.0, torque=0.5),
+        method=method_named(method),
     )
+    return CouplingLimits(loop=loop, start=COUPLING, limits=Limits(force=10.0, torque=0.5))
 
 
 @pytest.mark.parametrize(
@@ -79,7 +78,8 @@ def test_the_sliders_end_where_the_bound_does(method: str, spent: int, back: flo
 def test_bounds_scale_with_motion_and_force_and_angles_do_not() -> None:
     assert allowance(scale=2.0).translation.max_stiffness(0.0) == pytest.approx(4000 / 4, rel=1e-9)
     for scales in ((2.0, 2.0), (2.0, 1.0), (1.0, 2.0)):
-        scaled = replace(allowance(), scale=scales[0], force_scale=scales[1]).rotation
+        loop = replace(allowance().loop, scale=scales[0], force_scale=scales[1])
+        scaled = replace(allowance(), loop=loop).rotation
         assert scaled is not None
         most = 2 * 2e-3 / T * scales[0] / scales[1]
         assert scaled.max_stiffness(0.0) == pytest.approx(most, rel=1e-9)
@@ -104,7 +104,7 @@ def test_the_softest_coupling_shows_the_whole_force_unless_the_run_began_softer(
             allowed.translation.check(0.999 * least, 0.0)
 
 
-FLAT = replace(allowance(), info=replace(INFO, axes=("x", "y", "z")))
+FLAT = replace(allowance(), loop=replace(allowance().loop, info=replace(INFO, axes=AXES[:3])))
 
 
 @pytest.mark.parametrize(
@@ -230,10 +230,11 @@ def test_a_command_reads_back_as_it_was_written(command: Command) -> None:
 @pytest.mark.parametrize("delay", [0.0, 1e-3])
 def test_what_is_needed_is_what_the_certificate_says(substeps: int, delay: float) -> None:
     laws = method_named("implicit").law_evaluations(substeps)
-    allowed = replace(allowance(delay=delay), timestep=T / substeps, law_evaluations=laws)
+    allowed = allowance(delay=delay)
+    allowed = replace(allowed, loop=replace(allowed.loop, law_evaluations=laws))
     for stiffness, damping in ((200.0, 0.0), (1000.0, 0.7), (3000.0, 0.1)):
         used = allowed.law(allowed.requested(Couple(stiffness, damping), COUPLING))
-        said = required_axis_damping(allowed.info, used, T, 1.0, 1.0, laws, allowed.method)[0]
+        said = replace(allowed.loop, law=used).needed("translation")
         need = allowed.translation.needed(stiffness, damping)
         if substeps == 1 and not delay:
             assert need == pytest.approx(said, rel=1e-9)

@@ -12,7 +12,7 @@ import pytest
 from random_hands import random_hand
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions, is_certified
+from hapticbridge.certificate import conditions_of, default_coupling, is_certified
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
@@ -20,6 +20,7 @@ from hapticbridge.errors import DeviceError, StudyError
 from hapticbridge.guard import Limits
 from hapticbridge.lab.closed_loop import PARTS, ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE
 from hapticbridge.scene import load_scene
 
@@ -230,7 +231,8 @@ def test_no_random_passive_hand_turns_a_certified_coupling_unstable_or_active(
 ) -> None:
     info, method = SimulatedDevice().info, METHODS[name]
     coupling = default_coupling(info, T, method=method)
-    assert is_certified(device_conditions(info, method.law_coupling(coupling, T), T, 1.0, 1.0))
+    law = method.law_coupling(coupling, T)
+    assert is_certified(conditions_of(LoopSetting(info=info, law=law, period=T)))
     for seed in range(20):
         outcome = point_mass.run(
             SimulatedDevice(hand=random_hand(seed), path=STILL),

@@ -16,10 +16,11 @@ from scipy.linalg import expm
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, device_conditions
+from hapticbridge.certificate import conditions_of, default_coupling
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.rendering import default_method
 from hapticbridge.summary import Summary
@@ -241,7 +242,7 @@ def test_the_rate_of_a_slow_device_is_proposed() -> None:
     info = SlowDevice(8, 1.0, 0.0, rate=125.0).info
     usual = default_coupling(info, 1 / 125)
     law = default_method().law_coupling(usual, T)
-    (condition,) = device_conditions(info, law, T, 1.0, 1.0, method=default_method())
+    (condition,) = conditions_of(LoopSetting(info=info, law=law, period=T, method=default_method()))
     assert condition.holds is False
     assert condition.remedy.endswith("or lower the rate to 125 Hz")
     assert usual.stiffness > 3 * default_coupling(info, T).stiffness
@@ -310,6 +311,6 @@ def test_steps_that_are_not_known_are_not_judged() -> None:
     assert "its friction is unknown" in summary.conditions[0]
     info = replace(SimulatedDevice().info, resolution=None, friction=0.05)
     law = default_method().law_coupling(COUPLING, T)
-    condition = device_conditions(info, law, T, 1.0, 1.0)[0]
+    condition = conditions_of(LoopSetting(info=info, law=law, period=T))[0]
     assert condition.holds is True
     assert "its resolution is unknown" in condition.sentence()

@@ -22,6 +22,7 @@ ORDER = (
     ("scene", "inputs"),
     ("rendering", "device"),
     (
+        "loop_setting",
         "certificate",
         "identify",
         "realtime",

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge.audit import audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, required_damping, run_conditions
+from hapticbridge.certificate import default_coupling, run_conditions
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion, SimulatedDevice
@@ -40,6 +40,7 @@ from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome, Timing
 from hapticbridge.lab.methods import METHODS
+from hapticbridge.loop_setting import required_damping
 from hapticbridge.options import Workspace
 from hapticbridge.recording import read_recording
 from hapticbridge.rendering import IMPLICIT, check_prepared, method_named, prepare

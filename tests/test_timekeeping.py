@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from hapticbridge import timekeeping
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, fresh_share, is_certified
+from hapticbridge.certificate import default_coupling, is_certified
 from hapticbridge.check.cost import Cost, Growth, TimingStats
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.timing import DELAY_PRICE
+from hapticbridge.loop_setting import fresh_share
 from hapticbridge.recording import read_recording
 from hapticbridge.summary import Summary
 from hapticbridge.timekeeping import INSTANT

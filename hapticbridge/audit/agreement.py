@@ -19,11 +19,11 @@ import numpy as np
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.structure import Fault
 from hapticbridge.audit.timing import TimingTally
-from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.errors import DeviceError, RecordingError
 from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED, WITHOUT_DELAY
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rehearsal import start_handle, static_load
@@ -92,15 +92,7 @@ def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
     guard = parameters.guarding
     if guard == UNGUARDED:  # a study runs without
         return
-    needed = required_axis_damping(
-        info,
-        parameters.coupling,
-        parameters.period,
-        parameters.scale,
-        parameters.force_scale,
-        parameters.law_evaluations,
-        run.method,
-    )
+    needed = LoopSetting.of_run(info, replace(parameters, effective=None), run.method).needs()
     try:
         limits = Limits(
             force=parameters.force_limit,

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import delay_ticks, required_axis_damping
 from hapticbridge.commands import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.parameters import EARLIER_VERSION, RunParameters
+from hapticbridge.loop_setting import LoopSetting, delay_ticks
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import STARTS, meta_start, method_of, parameters_of
@@ -178,18 +178,8 @@ class AuditedRun:
         run, couplings = self.parameters, self.events.couplings
         if len(couplings) == 1:
             return run
-        needs = [
-            required_axis_damping(
-                self.info,
-                coupling,
-                run.period,
-                run.scale,
-                run.force_scale,
-                run.law_evaluations,
-                self.method,
-            )
-            for coupling in couplings
-        ]
+        loop = LoopSetting.of_run(self.info, run, self.method)
+        needs = [replace(loop, law=coupling).needs() for coupling in couplings]
         linear, angular = (
             couplings[int(np.argmax([need[axis] for need in needs]))] for axis in (0, 1)
         )

@@ -33,7 +33,6 @@ from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
 from hapticbridge.certificate import (
     condition_sentences,
     damping_margin,
-    fresh_share,
     is_run_certified,
     run_conditions,
     worst_verdict,
@@ -41,6 +40,7 @@ from hapticbridge.certificate import (
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
+from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands

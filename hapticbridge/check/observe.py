@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import required_damping
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
@@ -21,6 +20,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step, simulate
+from hapticbridge.loop_setting import required_damping
 from hapticbridge.record import TICK_DTYPE
 from hapticbridge.rendering import RIGID, default_method, unguarded_parameters
 from hapticbridge.scene import Scene

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from hapticbridge.certificate import default_coupling, delay_ticks, whole_ticks
+from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
@@ -31,6 +31,7 @@ from hapticbridge.identify.identify import (
     duration_at,
     measured_profile,
 )
+from hapticbridge.loop_setting import delay_ticks, whole_ticks
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals

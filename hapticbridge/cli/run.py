@@ -18,9 +18,8 @@ from rich.markup import escape
 
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
+    conditions_of,
     default_coupling,
-    device_conditions,
-    device_period,
     run_conditions,
 )
 from hapticbridge.check.case import DEFAULT_SECONDS
@@ -43,6 +42,7 @@ from hapticbridge.guard import (
 )
 from hapticbridge.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.loop_setting import device_period
 from hapticbridge.options import (
     AUTO,
     SAME_FRAME,
@@ -120,16 +120,7 @@ def announce(setup: RunSetup, given: Mapping[str, float], *, is_method_chosen: b
         )
     if not method.has_law:
         return  # printed once the weld is measured: ``announce_measured``
-    conditions = device_conditions(
-        setup.info,
-        setup.law,
-        setup.period,
-        *scales,
-        setup.law_evaluations,
-        method,
-        setup.timestep,
-    )
-    for condition in conditions:
+    for condition in conditions_of(setup.loop):
         if not condition.holds:
             err.print(f"[yellow]warning:[/yellow] {condition.sentence()}")
 

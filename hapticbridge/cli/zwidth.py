@@ -14,10 +14,7 @@ from rich.table import Table
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import (
     DampingCondition,
-    delay_ticks,
-    device_conditions,
-    device_period,
-    whole_ticks,
+    conditions_of,
 )
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress, write_figure
 from hapticbridge.clock import RealClock, SimulatedClock, period_of
@@ -26,6 +23,13 @@ from hapticbridge.device import AXES, Device, DeviceInfo, open_device
 from hapticbridge.device.base import checked_close
 from hapticbridge.errors import HapticBridgeError, choices
 from hapticbridge.identify.z_width import SHARES, MeasuredWidth, measure_width, measured_points
+from hapticbridge.loop_setting import (
+    IN_TIME,
+    Lag,
+    LoopSetting,
+    delay_ticks,
+    whole_ticks,
+)
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
@@ -455,15 +459,13 @@ def _condition(info: DeviceInfo, coupling: Coupling, period: float) -> DampingCo
     """Returns the condition for translation that a run with scale 1 would print."""
     method = default_method()
     law = method.law_coupling(coupling, period)
-    found = device_conditions(info, law, period, 1.0, 1.0, method=method)
+    found = conditions_of(LoopSetting(info=info, law=law, period=period, method=method))
     return next(condition for condition in found if condition.axis == "translation")
 
 
 def _is_prompt(info: DeviceInfo, period: float) -> bool:
     """Returns True if neither a delay nor a rate of its own makes a device need more damping."""
-    return bool(
-        info.damping and delay_ticks(info, period) == 0 and device_period(info, period) == period
-    )
+    return bool(info.damping and info.delay is not None and Lag.of(info, period) == IN_TIME)
 
 
 def _device_facts(info: DeviceInfo, condition: DampingCondition | None) -> dict[str, object]:

@@ -16,16 +16,11 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.replay import Resimulator
-from hapticbridge.certificate import (
-    DampingCondition,
-    Lag,
-    delay_ticks,
-    required_damping,
-    run_conditions,
-)
+from hapticbridge.certificate import DampingCondition, run_conditions
 from hapticbridge.confinement import Worker, in_bounds
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import may_be_pumped
+from hapticbridge.loop_setting import Lag, delay_ticks, required_damping
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded
 from hapticbridge.recording import Recording

@@ -37,6 +37,7 @@ from hapticbridge.device.mouse import REST, Pose, line_of_pose
 from hapticbridge.errors import CommandError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.pose import (
     conjugate,
     product,
@@ -81,14 +82,8 @@ def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
         angle=guarding.angle,
     )
     return CouplingLimits(
-        info=info,
-        method=method,
+        loop=LoopSetting.of_run(info, parameters, method),
         start=method.requested_coupling(parameters.coupling, parameters.timestep),
-        period=parameters.period,
-        scale=parameters.scale,
-        force_scale=parameters.force_scale,
-        timestep=parameters.timestep,
-        law_evaluations=parameters.law_evaluations,
         limits=limits,
     )
 
@@ -302,13 +297,13 @@ class Controls:
     def _take_coupling(self, event: Mapping[str, Any]) -> None:
         method, allowance = self._allowance.method, self._allowance
         law = {field.name: float(event[field.name]) for field in fields(Coupling)}
-        requested = method.requested_coupling(Coupling(**law), allowance.timestep)
+        requested = allowance.loop.requested(Coupling(**law))
         self._gains = [sliders.span.gains(requested) for sliders in self._sliders]
         is_still = time.monotonic() - self._touched > STILL
         for sliders, pair in zip(self._sliders, self._gains, strict=True):
             (sliders.show if is_still else sliders.bound)(*pair)
         self._bounds.content = self._ends()
-        sentences = RunCoupling.of(method, allowance.timestep, law=Coupling(**law)).sentences()
+        sentences = RunCoupling.of(method, allowance.loop.h, law=Coupling(**law)).sentences()
         self._say("answer", f"goes to {'; '.join(sentences[: len(self._sliders)])}")
 
     def _refuse(self, reason: str) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import required_axis_damping
 from hapticbridge.clock import period_of
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -22,6 +21,7 @@ from hapticbridge.guard import (
     guard_parameters_for,
 )
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import (
@@ -195,8 +195,7 @@ def _requested_hold(hold: float, load: float) -> float:
 def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
     """Returns the run's passivity controller; None if it is the bridge's default."""
     p = parameters
-    scales = p.scale, p.force_scale
-    needed = required_axis_damping(info, p.coupling, p.period, *scales, p.law_evaluations, method)
+    needed = LoopSetting.of_run(info, replace(p, effective=None), method).needs()
     limits = Limits(force=p.force_limit, torque=p.torque_limit)
     usual = guard_parameters_for(info, limits, p.period, needed=needed, scale=p.scale)
     if usual.controller == p.guarding.controller:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import delay_ticks
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import coupling_in, tuning_ticks
@@ -29,6 +28,7 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import trip_reason
 from hapticbridge.hands import Grasp
 from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
+from hapticbridge.loop_setting import delay_ticks
 from hapticbridge.options import Workspace
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 from hapticbridge.whatif.recorded import RecordedRun, scene_of

@@ -1,0 +1,263 @@
+"""Haptic loop as the theory sees it: device, coupling law, period, scales and their demand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticbridge.coupling import Coupling
+from hapticbridge.device.base import DeviceInfo
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.ledger import SLACK_SHARE
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
+from hapticbridge.rendering import IMPLICIT, Method
+from hapticbridge.theory.bounds import late_minimum_damping, minimum_damping
+from hapticbridge.theory.transfer import delayed_by
+
+Axis = Literal["translation", "rotation"]
+
+# Time in which a device answers
+
+_WHOLE = 1e-9
+"""Excess over a whole number of ticks that counts as rounding, in ticks."""
+
+
+def device_period(info: DeviceInfo, period: float) -> float:
+    """Returns the time in s between two samples: the loop's period, or the device's if longer.
+
+    For a prescribed motion it is the loop's period.
+    """
+    if info.rate is None or info.is_prescribed:
+        return period
+    own = 1.0 / info.rate
+    return own if own > period * (1.0 + _WHOLE) else period
+
+
+def fresh_share(info: DeviceInfo, period: float, fresh: int, due: int) -> float:
+    """Returns the share of the device's samples due that were new, 0 to 1.
+
+    Args:
+        info: The device; with a rate of its own it owes fewer samples than there are deadlines.
+        period: T in s.
+        fresh: Number of ticks with a new sample.
+        due: Number of deadlines.
+    """
+    owed = due * (period / device_period(info, period))
+    return min(fresh / owed, 1.0) if owed else 1.0
+
+
+def delay_ticks(info: DeviceInfo, period: float) -> int | None:
+    """Returns the whole ticks from a sample to the resulting wrench; None if unknown."""
+    return None if info.delay is None else whole_ticks(info.delay, period)
+
+
+def whole_ticks(delay: float, period: float) -> int:
+    """Returns the whole ticks in which a delay in s ends; ticks of ``period`` in s."""
+    return max(0, math.ceil(delay / period - _WHOLE))
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """Time in which a device answers, as its condition counts it.
+
+    Attributes:
+        ticks_per_sample: n, ticks of the loop for which one force is held; at least 1.
+        delay: t_d in s from a sample to its force, >= 0; an unknown delay counts as 0.
+    """
+
+    ticks_per_sample: int = 1
+    delay: float = 0.0
+
+    @classmethod
+    def of(cls, info: DeviceInfo, period: float) -> Lag:
+        """Returns that of a device on a loop of period T in s."""
+        return cls(whole_ticks(device_period(info, period), period), info.delay or 0.0)
+
+
+IN_TIME = Lag()
+"""A device that gives a sample in each tick and answers it within the tick."""
+
+
+# Device damping required by a coupling
+
+LOWEST_FREQUENCY, FREQUENCIES = 3e-3, 60
+"""Lowest frequency in rad per sample, and number of frequencies per ripple, of the search for the
+damping that substeps need. Without a delay the maximum lies at one end in all cases tried: at
+Nyquist, or at the limit towards rest, which 3e-3 approximates to 1e-5."""
+
+
+@cache
+def required_damping(
+    coupling: Coupling,
+    period: float,
+    law_evaluations: int = 1,
+    axis: Axis = "translation",
+    lag: Lag = IN_TIME,
+) -> float:
+    """Returns the damping b that a device needs behind a coupling, in N s/m or N m s/rad.
+
+    K and B are those of the law (``Method.law_coupling``), not the effective ones. With one
+    evaluation of the law per tick b = K T/2 + B, and more behind a device that is late
+    (``theory.bounds.late_minimum_damping``). With m evaluations of the law per tick the handle
+    moves by an m-th of its step for each, and the mean wrench is sent. There is no closed form; b
+    is the smallest value for which
+
+        Σ_k f̄_{k−d}·δh_{k+1} + (b/nT) ‖δh_k‖² − Σ_i f_i·δx_i − ½ s (K + mB/T) ‖δx_i‖² >= 0,
+        f_i = K e_i + (mB/T) δe_i,   e = h − x
+
+    for every motion, with k over samples and i over evaluations; d is the delay in whole sample
+    periods, rounded up. The share s = ``SLACK_SHARE`` = ½ of the slack may be used; with one
+    evaluation it is the whole slack. The search finds b frequency by frequency as the smallest
+    value of a quadratic form over the n m deflections e_i. For B = 0, b grows with m (for strict
+    environments it is K T m/2, because the mean comes late); for B > K T it falls towards B.
+
+    The form is sufficient for any environment within its share of the slack; strict environments
+    need less. Example: default coupling (K = 2400 N/m, B = 0.5 N s/m, 1 kHz) at m = 2, 4, 8. The
+    form gives 1.63, 1.90, 2.42 N s/m; a wall needs 1.30, 1.60, 1.75; the worst free tool of 1 to
+    0.01 kg needs 1.29, 1.65, 2.03.
+
+    Args:
+        coupling: K and B of the law.
+        period: T of the loop in s.
+        law_evaluations: m, 1 to ``MAX_SUBSTEPS``.
+        axis: Kind of axis.
+        lag: n and the delay of the device.
+
+    Raises:
+        CouplingError: m or the period is out of range, or the delay is more than 50 n T.
+
+    References:
+        Brown & Colgate 1997, eq. (6), for m = 1 and a device in time.
+    """
+    is_linear = axis == "translation"
+    k = coupling.stiffness if is_linear else coupling.rotational_stiffness
+    damping = coupling.damping if is_linear else coupling.rotational_damping
+    if checked_substeps(law_evaluations, CouplingError) == 1:
+        if lag == IN_TIME:
+            return float(minimum_damping(coupling, period, axis=axis))
+        if k == 0.0:
+            return lag.ticks_per_sample * damping
+        late = late_minimum_damping(k, damping, period, lag.delay, lag.ticks_per_sample)
+        return float(late)
+    count, held = law_evaluations * lag.ticks_per_sample, lag.ticks_per_sample * period
+    b = damping * law_evaluations / period
+    if k == 0.0:
+        return float(b * held / law_evaluations)
+    delay = delayed_by(whole_ticks(lag.delay, held))
+    identity, means = np.eye(count), np.zeros(count)
+    means[:law_evaluations] = 1.0 / law_evaluations
+    most = 0.0
+    for theta in _frequencies(delay):
+        z = np.exp(1j * theta)
+        difference = identity - np.eye(count, k=-1) + 0j
+        difference[0, -1] -= 1 / z  # last deflection before the sample
+        law = k * identity + b * difference
+        form = law.conj().T @ difference
+        slack = 0.5 * SLACK_SHARE * (k + b)
+        form = 0.5 * (form + form.conj().T) - slack * difference.conj().T @ difference
+        linear = 0.5 * law.conj().T @ ((z ** (delay + 1) - 1) * means)
+        linear += slack * difference.conj().T @ means
+        gained = np.vdot(linear, np.linalg.solve(form, linear)).real + slack / law_evaluations
+        most = max(most, float(gained))
+    return most * held
+
+
+def _frequencies(delay: int) -> NDArray[np.float64]:
+    """Returns the frequencies in rad per sample at which substeps may need most."""
+    if delay == 0:
+        return np.geomspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES)
+    return np.linspace(LOWEST_FREQUENCY, np.pi, FREQUENCIES * (delay + 1))
+
+
+# The loop
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopSetting:
+    """Device, coupling law, period and scales: all that the device condition depends on.
+
+    For the device, the coupling is scale · force_scale times as stiff in translation. Angles are
+    not scaled, so the factor for rotation is force_scale / scale.
+
+    Attributes:
+        info: The device.
+        law: K and B' of the law, not the effective coupling.
+        period: T in s.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool.
+        law_evaluations: Evaluations of the law per tick (substeps).
+        method: Rendering method, which makes the law of the requested coupling.
+        timestep: MuJoCo's h in s; None for ``period`` / ``law_evaluations``.
+    """
+
+    info: DeviceInfo
+    law: Coupling
+    period: float
+    scale: float = 1.0
+    force_scale: float = 1.0
+    law_evaluations: int = 1
+    method: Method = IMPLICIT
+    timestep: float | None = None
+
+    @classmethod
+    def of_run(cls, info: DeviceInfo, run: RunParameters, method: Method) -> LoopSetting:
+        """Returns the loop of a run; a weld counts by its measured stiffness and damping."""
+        return cls(
+            info=info,
+            law=run.effective or run.coupling,
+            period=run.period,
+            scale=run.scale,
+            force_scale=run.force_scale,
+            law_evaluations=run.law_evaluations,
+            method=method,
+            timestep=run.timestep,
+        )
+
+    @property
+    def h(self) -> float:
+        """MuJoCo's time step in s."""
+        return self.timestep or self.period / self.law_evaluations
+
+    @property
+    def lag(self) -> Lag:
+        """Time in which the device answers."""
+        return Lag.of(self.info, self.period)
+
+    @property
+    def is_judged(self) -> bool:
+        """True if the device has a condition: its damping along what it moves is known."""
+        return self.info.damping is not None or not self.info.moves
+
+    def ratio(self, axis: Axis) -> float:
+        """Returns the ratio of the coupling at the device to that in the scene."""
+        is_linear = axis == "translation"
+        return self.scale * self.force_scale if is_linear else self.force_scale / self.scale
+
+    def needed(self, axis: Axis) -> float:
+        """Returns the damping that the device needs in N s/m or N m s/rad."""
+        needed = required_damping(self.law, self.period, self.law_evaluations, axis, self.lag)
+        return self.ratio(axis) * needed
+
+    def needs(self) -> tuple[float, float]:
+        """Returns the damping in N s/m and N m s/rad of both kinds; 0 without a condition."""
+        if not self.method.has_coupling or not self.is_judged:
+            return 0.0, 0.0
+        return (
+            self.needed("translation") if self.info.moves else 0.0,
+            self.needed("rotation") if self.info.turns else 0.0,
+        )
+
+    def requested(self, law: Coupling) -> Coupling:
+        """Returns the requested coupling of which the method makes a law."""
+        return self.method.requested_coupling(law, self.h)
+
+    def requesting(self, requested: Coupling, faster: float = 1.0) -> LoopSetting:
+        """Returns the loop with another requested coupling, and its period times a factor."""
+        step = self.h * faster
+        law = self.method.law_coupling(requested, step)
+        return replace(self, law=law, period=faster * self.period, timestep=step)
