@@ -36,7 +36,6 @@ from hapticbridge.hands import (
     DeviceGroup,
     Grasp,
     devices_for_run,
-    resolve_hands,
     scene_of_grasps,
 )
 from hapticbridge.inputs import Write, input_writes
@@ -53,6 +52,7 @@ from hapticbridge.options import (
 from hapticbridge.realtime import real_time
 from hapticbridge.recording.recorder import RingObserver
 from hapticbridge.recording.seal import Signer
+from hapticbridge.request import RunRequest
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.session import RecordOutput, Session, StopRequest
 from hapticbridge.signals import stopping_on_signals
@@ -100,6 +100,7 @@ class Bridge:
         **changes: Fields of ``BridgeOptions`` that differ from ``options``.
 
     Attributes:
+        request: What was asked for.
         setup: The resolved setup: scene, coupling, method, guard; of several hands, the first's.
         device: The device; of several hands, all of them as one.
         clock: Clock of the run.
@@ -137,12 +138,12 @@ class Bridge:
                 f"{self.clock.__name__}()"
             )
         self.device: Device
-        self.setup: RunSetup
-        self._others: tuple[RunSetup, ...] = ()
         if isinstance(device, Sequence) and not isinstance(device, str):
-            self._resolve_hands(scene, device, coupling, options)
+            setups = self._resolve_hands(scene, device, coupling, options)
         else:
-            self._resolve(scene, device, coupling, options)
+            setups = self._resolve(scene, device, coupling, options)
+        self.setup, *others = setups
+        self._others = tuple(others)
         self._stop = StopRequest()
         self._session: Session | None = None
 
@@ -152,7 +153,7 @@ class Bridge:
         device: Device | str,
         coupling: Coupling | Mapping[str, float] | None,
         options: BridgeOptions,
-    ) -> None:
+    ) -> tuple[RunSetup, ...]:
         loaded = scene if isinstance(scene, Scene) else load_scene(scene)
         if loaded.has_several_hands:
             grips = choices((loaded.grip, *loaded.other_grips))
@@ -160,11 +161,9 @@ class Bridge:
                 f"scene '{loaded.name}' was loaded with {1 + len(loaded.other_grips)} grips, and "
                 f"one device holds one; name a Grasp per hand, or load it with one of {grips}"
             )
+        grasp = Grasp(loaded.grip, device, coupling=coupling)
         with device_for_run(loaded, device, self.clock) as self.device:
-            is_recorded = self.output.path is not None
-            self.setup = RunSetup.resolve(
-                loaded, self.device.info, coupling, options, self.clock, is_recorded=is_recorded
-            )
+            return self._requested(loaded, [grasp], [self.device], options)
 
     def _resolve_hands(
         self,
@@ -172,28 +171,35 @@ class Bridge:
         grasps: Sequence[Grasp],
         coupling: Coupling | Mapping[str, float] | None,
         options: BridgeOptions,
-    ) -> None:
+    ) -> tuple[RunSetup, ...]:
         if not all(isinstance(grasp, Grasp) for grasp in grasps):
             raise HapticBridgeError("several hands are named by a Grasp each: Grasp(GRIP, DEVICE)")
         if coupling is not None:
             raise HapticBridgeError("each of several hands has a coupling of its own: Grasp(…)")
         loaded = scene_of_grasps(scene, grasps)
         with devices_for_run(loaded, grasps, self.clock) as devices:
-            self.setup, *others = resolve_hands(
-                loaded,
-                grasps,
-                [device.info for device in devices],
-                options,
-                self.clock,
-                is_recorded=self.output.path is not None,
-            )
+            setups = self._requested(loaded, grasps, devices, options)
         self.device = DeviceGroup(devices, [len(grasp.grips) for grasp in grasps])
-        self._others = tuple(others)
+        return setups
+
+    def _requested(
+        self,
+        scene: Scene,
+        grasps: Sequence[Grasp],
+        devices: Sequence[Device],
+        options: BridgeOptions,
+    ) -> tuple[RunSetup, ...]:
+        infos = [device.info for device in devices]
+        self.request = RunRequest.of(scene, grasps, infos, options, self.clock)
+        is_recorded = self.output.path is not None
+        return self.request.resolve(scene, self.clock, is_recorded=is_recorded)
 
     def __enter__(self) -> Self:
         if self._session is not None:
             raise HapticBridgeError("a bridge is opened once; make a new one for another run")
-        self._session = Session(self.setups, self.device, self.clock, self.output, self._stop)
+        self._session = Session(
+            self.request, self.setups, self.device, self.clock, self.output, self._stop
+        )
         return self
 
     def __exit__(

@@ -206,7 +206,7 @@ class _Found:
     def add_all(self, files: tuple[RecordingFile, RecordingFile]) -> None:
         """Compares all records with equal due times, block by block."""
         streams = self._due(files, 0), self._due(files, 1)
-        nothing = [(np.zeros(0, file.record), np.zeros(0, np.int64)) for file in files]
+        nothing = [(np.zeros(0, TICK_DTYPE), np.zeros(0, np.int64)) for file in files]
         waiting = [*nothing]
         while True:
             for side in (0, 1):
@@ -324,8 +324,5 @@ def _notes(file: RecordingFile) -> Iterator[str]:
         yield f"{file.path}: {file.cut_sentence}; the rest is compared"
     if file.seal_fault:
         yield f"{file.path}: {file.seal_fault}"
-    missing = [name for name in TICK_DTYPE.names or () if name not in (file.record.names or ())]
-    if missing:
-        yield f"{file.path} is of an earlier version, without {', '.join(missing)}"
     if file.problems:
         yield f"{file.path} is damaged: {'; '.join(file.problems)}"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 
 from hapticbridge.arguments import is_number, shown
-from hapticbridge.errors import CouplingError
+from hapticbridge.errors import CouplingError, choices
 
 SQUARED_LEVER = 1e-3
 """Squared lever arm ℓ² in m² from translational to rotational gains: ℓ = 32 mm, about half the
@@ -71,3 +72,16 @@ class Coupling:
             object.__setattr__(self, field.name, float(value))
         if self.stiffness == 0:
             raise CouplingError("coupling stiffness is 0 N/m; it must be > 0")
+
+    def with_gains(self, gains: Mapping[str, float]) -> Coupling:
+        """Returns the coupling with other gains by name.
+
+        Raises:
+            CouplingError: A name is no gain, or a value out of range.
+        """
+        names = [field.name for field in fields(self)]
+        if unknown := gains.keys() - names:
+            raise CouplingError(
+                f"a coupling has no gain {choices(unknown)}; its gains: {choices(names)}"
+            )
+        return replace(self, **gains)

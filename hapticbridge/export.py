@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.files import import_extra, reason_of
-from hapticbridge.record import FLAG_LEGEND, TableColumns, Timeline, due_times, force_on_hand
+from hapticbridge.record import (
+    FLAG_LEGEND,
+    TICK_DTYPE,
+    TableColumns,
+    Timeline,
+    due_times,
+    force_on_hand,
+)
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.recording.reader import CUTTING_EVENTS, hand_named
 from hapticbridge.recording.ros_messages import HANDLE, TOOL, axes_of
@@ -55,7 +62,7 @@ class CsvSink:
     """
 
     def __init__(self, path: Path, recording: RecordingFile) -> None:
-        self._columns = TableColumns(recording.record, recording.period)
+        self._columns = TableColumns(TICK_DTYPE, recording.period)
         about = {
             "units": self._columns.units,
             "flags": FLAG_LEGEND,
@@ -112,7 +119,7 @@ class Hdf5Sink:
         self._file.create_dataset("events", (len(events),), text, data=events)
         ticks = self._file.create_group("ticks")
         self._count = 0
-        self._columns, self._sets = TableColumns(recording.record, recording.period), []
+        self._columns, self._sets = TableColumns(TICK_DTYPE, recording.period), []
         for (name, unit), kind in zip(
             self._columns.units.items(), self._columns.kinds, strict=True
         ):
@@ -153,7 +160,7 @@ class ParquetSink:
     def __init__(self, path: Path, recording: RecordingFile) -> None:
         self._arrow = import_extra("pyarrow", "Parquet", "tables", RecordingError)
         parquet = import_extra("pyarrow.parquet", "Parquet", "tables", RecordingError)
-        self._columns = TableColumns(recording.record, recording.period)
+        self._columns = TableColumns(TICK_DTYPE, recording.period)
         kinds = {"i": self._arrow.int64(), "f": self._arrow.float64()}
         fields = [
             self._arrow.field(name, kinds[kind], nullable=False, metadata={"unit": unit})

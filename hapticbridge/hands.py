@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +105,7 @@ class Grasp:
     """
 
     grip: str
-    device: Device | str = "simulated"
+    device: Annotated[Device | str, str] = "simulated"
     _: KW_ONLY
     coupling: Coupling | Mapping[str, float] | None = None
     workspace: Workspace | None = None

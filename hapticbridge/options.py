@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, cast
+from typing import Annotated, Any, Literal, TypedDict, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,7 +92,7 @@ class Workspace:
 
     scale: float = 1.0
     force_scale: float | None = None
-    axes: ArrayLike = SAME_AXES
+    axes: Annotated[ArrayLike, tuple[float, ...]] = SAME_AXES
     absolute: bool = False
 
     def __post_init__(self) -> None:
@@ -186,7 +186,7 @@ class BridgeOptions:
 
     rate: float = 1000.0
     substeps: int = 1
-    scene_rate: float | str = AUTO
+    scene_rate: float | Literal["auto"] = AUTO
     method: str | None = None
     contact: str | None = None
     contact_stiffness: float | None = None
@@ -262,7 +262,7 @@ class OptionChanges(TypedDict, total=False):
 
     rate: float
     substeps: int
-    scene_rate: float | str
+    scene_rate: float | Literal["auto"]
     method: str | None
     contact: str | None
     contact_stiffness: float | None
@@ -483,7 +483,7 @@ class RunSetup:
             requested = coupling
         else:
             usual = _usual_coupling(scene, info, options, ticks, evaluations)
-            requested = replace(usual, **(coupling or {}))
+            requested = usual.with_gains(coupling or {})
         require_hazard_consent(method, is_real=info.is_real, i_know=options.i_know)
         setup = cls(
             scene=scene,
@@ -633,13 +633,18 @@ class RunSetup:
         Raises:
             HapticBridgeError: A value is out of range.
         """
+        unloaded = self.unloaded(start, effective)
+        return self._loaded(unloaded) if self.method.has_law else unloaded
+
+    def unloaded(self, start: NDArray[np.void], effective: Coupling | None) -> RunParameters:
+        """Returns the parameters of a run whose tool pulls at nothing; as ``parameters``."""
         pose = tuple(float(v) for v in (*start["position"][0], *start["quaternion"][0]))
         if self.scene.joint >= 0:  # which the device's x axis moves
             pose = (pose[0], *IDENTITY_POSE[1:])
         damping, rotational_damping = self.info.dissipating_damping
         scale, force_scale = self.workspace.scales
         is_absolute = self.workspace.absolute
-        unloaded = RunParameters(
+        return RunParameters(
             grip=self.scene.grip,
             period=self.period,
             substeps=self.substeps,
@@ -662,7 +667,6 @@ class RunSetup:
             device_rotational_damping=rotational_damping,
             guarding=self.guard,
         )
-        return self._loaded(unloaded) if self.method.has_law else unloaded
 
     def _loaded(self, parameters: RunParameters) -> RunParameters:
         """Returns parameters with which the coupling holds the tool at rest at the start."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class TickFlag(IntFlag):
-    """Bits of the record's ``flags``; 8 is in recordings of earlier versions only.
+    """Bits of the record's ``flags``; 8 is unused.
 
     Attributes:
         OVERRUN: The tick started a period or more after its deadline; deadlines were skipped.
@@ -103,13 +103,14 @@ the wrench that was sent, and of the device's motion to the next sample that the
 than the loop, and ``scene_tank`` is the energy in J that the hand has given and that scene has not
 yet got; both are 0 for a scene that steps in every tick (``kernel.shown_tool``)."""
 
-LATER_FIELDS = ("share", "contact_tank", "scene_step", "scene_tank")
-"""Fields that recordings of earlier versions lack; such a recording is read without them.
+FORMAT = "1"
+"""Format of a recording: its fields, and its metadata with the numbers that follow from a request.
+A recording of another format is refused.
 
 To add a field:
 
-1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; its name in
-   ``LATER_FIELDS``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
+1. here: the field in ``TICK_DTYPE``, 8 bytes wide, with a sentence below it; the next
+   ``FORMAT``; its unit in ``UNITS``, or for a vector its parts and unit in ``_PARTS``;
 2. in ``kernel.tick``: a line of ``_record`` that writes it, after the module that computes it has
    put it into the tick's state (``kernel.state`` has the table of writers). What the sample alone
    gives is written by ``_record_sample``;
@@ -204,7 +205,7 @@ COLUMNS = tuple(_columns())
 
 
 def columns_of(record: np.dtype[np.void]) -> tuple[Column, ...]:
-    """Returns the columns of a record, which an earlier version may have written."""
+    """Returns the columns of some fields of a record."""
     return tuple(column for column in COLUMNS if column.field in (record.names or ()))
 
 
@@ -278,7 +279,7 @@ class TableColumns:
     """Columns of a table of ticks: ``SECONDS``, then one per number of a record.
 
     Args:
-        record: Fields of a record, ``TICK_DTYPE`` or those of an earlier version.
+        record: Fields of a record.
         period: T in s.
 
     Attributes:

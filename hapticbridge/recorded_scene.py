@@ -8,7 +8,6 @@ which hands over numbers and texts.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -20,7 +19,6 @@ import numpy as np
 from hapticbridge import jit
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.files import read_json
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.hands import simulate_hands
 from hapticbridge.kernel.parameters import RunParameters
@@ -28,7 +26,6 @@ from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.recording.format import further_hands
 from hapticbridge.rehearsal import static_load
 from hapticbridge.rendering import (
     check_prepared,
@@ -37,11 +34,14 @@ from hapticbridge.rendering import (
     prepare_hands,
     unguarded_parameters,
 )
+from hapticbridge.request import RunRequest, request_of
 from hapticbridge.run_description import (
     CARRIED,
     SOURCE_PREFIX,
+    metas_of,
     method_of,
     model_digest,
+    parameters_of,
     requested_of,
 )
 from hapticbridge.scene import Scene, load_scene, scene_parameters
@@ -169,65 +169,47 @@ def unpack_scene(recording: RecordingFile, folder: Path) -> Path:
     return main
 
 
-def recorded_values(meta: Mapping[str, str]) -> dict[str, float]:
-    """Returns the values of the scene's parameters in a recorded run.
+def load_unpacked(main: Path, request: RunRequest, *, is_carried: bool) -> Scene:
+    """Loads an unpacked scene as requested, with its tool carried or felt.
 
     Raises:
-        RecordingError: They are not numbers by name.
-    """
-    try:
-        values = dict(read_json(meta.get("scene_parameters", "{}")))
-        return {str(name): float(value) for name, value in values.items()}
-    except (ValueError, TypeError, OverflowError) as error:
-        raise RecordingError(f"metadata 'scene_parameters' are not numbers: {error}") from None
-
-
-def load_unpacked(
-    main: Path, grip: str | tuple[str, ...], values: Mapping[str, float], meta: Mapping[str, str]
-) -> Scene:
-    """Loads an unpacked scene with these values of its parameters, its tool carried as recorded.
-
-    Raises:
-        SceneError: A value is out of range, or the scene cannot be loaded.
+        SceneError: A parameter is out of range, or the scene cannot be loaded.
     """
     defaults = {each.name: each.default for each in scene_parameters(main)}
     # a default that is set may differ from the file's number in its last digit
-    changed = {name: value for name, value in values.items() if defaults.get(name) != value}
+    values = request.parameters.items()
+    changed = {name: value for name, value in values if defaults.get(name) != value}
+    grips = request.grips if len(request.grips) > 1 else request.grips[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # reported during the recorded run
-        scene = load_scene(main, grip, as_is=False, **changed)
-    if meta.get("tool_weight") == CARRIED:
+        scene = load_scene(main, grips, as_is=request.as_is, **changed)
+    if is_carried:
         scene.carry_tool("as recorded")
     return scene
 
 
-def compile_recorded(
-    recording: RecordingFile, parameters: RunParameters, *others: RunParameters
-) -> Scene:
+def compile_recorded(recording: RecordingFile) -> Scene:
     """Compiles the attached sources, and prepares the scene for the recorded method.
-
-    ``others`` are the parameters of further hands.
 
     It belongs into a child process with limits (``confinement``), unless the recording is trusted.
 
     Raises:
         RecordingError: The recording carries no scene, or it cannot be compiled or prepared.
     """
-    home = ""
+    home, meta = "", recording.meta
     try:
         with TemporaryDirectory(prefix="hapticbridge-") as folder:
             main = unpack_scene(recording, Path(folder))
-            home, meta = f"{main.parent}/", recording.meta
-            grips = parameters.grip, *(each.grip for each in others)
-            grip = grips if others else parameters.grip
-            scene = load_unpacked(main, grip, recorded_values(meta), meta)
-            requested, method = requested_of(meta), method_of(meta)
-            steps = parameters.scene_period, parameters.substeps
-            if others:
-                couplings = [requested, *(requested_of(meta | own) for own in further_hands(meta))]
+            home = f"{main.parent}/"
+            is_carried = meta.get("tool_weight") == CARRIED
+            scene = load_unpacked(main, request_of(meta), is_carried=is_carried)
+            parameters, method = parameters_of(meta), method_of(meta)
+            couplings = [requested_of(own) for own in metas_of(meta)]
+            if scene.has_several_hands:
                 prepare_hands(scene, couplings, parameters.period, method, warns=False)
             else:
-                prepare(scene, requested, *steps, method, warns=False)
+                steps = parameters.scene_period, parameters.substeps
+                prepare(scene, couplings[0], *steps, method, warns=False)
             check_prepared(scene.model, parameters, method)
     except RecordingError:
         raise

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
-from hapticbridge.errors import HapticBridgeError, RecordingError
+from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.kernel.parameters import UNGUARDED, GuardParameters, RunParameters
+from hapticbridge.kernel.parameters import GuardParameters, RunParameters
+from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.recording import Attachment
-from hapticbridge.recording.format import HANDS_KEY
+from hapticbridge.recording.format import HANDS_KEY, further_hands
 from hapticbridge.rendering import RIGID, SCENE, Method, method_named
 from hapticbridge.scene import Scene
 
@@ -76,6 +77,13 @@ def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: bytes) -> N
     mujoco.mj_forward(model, data)
     # mj_forward runs the solver and changes the warm start, so the state is set again
     mujoco.mj_setState(model, data, np.frombuffer(state, dtype="<f8").astype(np.float64), _STATE)
+
+
+def sample_at(pose: tuple[float, ...]) -> NDArray[np.void]:
+    """Returns a device's sample at a pose (x, y, z, qw, qx, qy, qz), without buttons."""
+    sample = np.zeros(1, SAMPLE_DTYPE)
+    sample["position"][0], sample["quaternion"][0] = pose[:3], pose[3:]
+    return sample
 
 
 def start_of(state: NDArray[np.void], name: str) -> list[float]:
@@ -183,9 +191,6 @@ SOURCE_PREFIX = "scene/"
 CARRIED = "carried"
 """Value of ``tool_weight`` in the metadata if the scene compensates the tool's weight."""
 
-_MID_RUN = "mid-run"
-"""Value of metadata ``began`` in recordings of earlier versions that begin during a run."""
-
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
 _GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
@@ -207,48 +212,48 @@ def attachments(scene: Scene) -> list[Attachment]:
     return kept
 
 
-def describe_run(
-    scene: Scene,
-    parameters: RunParameters,
-    state: NDArray[np.void],
-    *,
-    requested: Coupling,
-    method: str,
-    device: DeviceInfo,
-    clock: str,
-) -> dict[str, str]:
-    """Returns the metadata of a hand's records; ``parameters_of`` is the inverse.
-
-    ``state`` is the kernel's before the first tick.
-    """
+def describe_parameters(parameters: RunParameters) -> dict[str, str]:
+    """Returns the parameters of a hand's run as metadata; ``parameters_of`` is the inverse."""
     coupling = parameters.coupling
     effective = parameters.effective
-    meta = {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
-    meta |= {name: repr(float(getattr(coupling, name))) for name in _GAINS}
-    meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
-    for name, count in STARTS.items():
-        start = start_of(state, name)
-        meta[name] = json.dumps(start if count > 1 else start[0])
-    return meta | {
+    meta = {
+        "grip": parameters.grip,
         "period_s": repr(parameters.period),
         "substeps": str(parameters.substeps),
         "scene_ticks": str(parameters.scene_ticks),
         "ramp_ticks": str(parameters.ramp_ticks),
-        "guard": parameters.guarding.to_json(),
-        "method": method,
         "contact": RIGID if parameters.is_rigid else SCENE,
-        "requested": json.dumps([getattr(requested, name) for name in _GAINS]),
+    }
+    meta |= {name: repr(float(getattr(parameters, name))) for name in _FLOATS}
+    meta |= {name: json.dumps(getattr(parameters, name)) for name in (*_POSES, "axes")}
+    return meta | {
+        "guard": parameters.guarding.to_json(),
+        **{name: repr(float(getattr(coupling, name))) for name in _GAINS},
         "effective": json.dumps(effective and [getattr(effective, name) for name in _GAINS]),
-        "discretization": method_named(method).discretization,
-        "grip": parameters.grip,
-        "clock": clock,
-        "device": device.to_json(),
-        "scene": scene.name,
-        "scene_file": scene.path.name,
+    }
+
+
+def describe_scene(scene: Scene) -> dict[str, str]:
+    """Returns the metadata of a prepared scene."""
+    return {
         "tool_weight": CARRIED if scene.is_carried else "felt",
         "scene_changes": json.dumps(scene.changes, ensure_ascii=False),
         "scene_parameters": json.dumps(scene.parameters),
         "scene_sha256": model_digest(scene.model),
+    }
+
+
+def describe_start(state: NDArray[np.void]) -> dict[str, str]:
+    """Returns the metadata of a hand's start, from the kernel's state before the first tick."""
+    starts = {name: start_of(state, name) for name in STARTS}
+    return {
+        name: json.dumps(start if STARTS[name] > 1 else start[0]) for name, start in starts.items()
+    }
+
+
+def describe_machine() -> dict[str, str]:
+    """Returns the metadata of program, machine and time."""
+    return {
         "versions": json.dumps(versions(), sort_keys=True),
         "host": json.dumps(
             {"system": platform.system(), "machine": platform.machine(), "processor": processor()}
@@ -271,13 +276,22 @@ def describe_hands(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
     return {**first, HANDS_KEY: json.dumps(differing)}
 
 
+def metas_of(meta: Mapping[str, str]) -> list[Mapping[str, str]]:
+    """Returns the metadata of every hand, from those of the first.
+
+    Raises:
+        RecordingError: Those of further hands are damaged.
+    """
+    return [meta, *({**meta, **own} for own in further_hands(meta))]
+
+
 def method_of(meta: Mapping[str, str]) -> Method:
-    """Returns the method of a recorded run, with its contact; earlier recordings have the scene's.
+    """Returns the method of a recorded run, with its contact.
 
     Raises:
         SceneError: Method or contact is unknown, or they exclude each other.
     """
-    return method_named(meta.get("method", "")).with_contact(meta.get("contact", SCENE))
+    return method_named(meta.get("method", "")).with_contact(meta.get("contact", ""))
 
 
 def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
@@ -288,24 +302,15 @@ def _effective(meta: Mapping[str, str], method: Method) -> Coupling | None:
 
 
 def requested_of(meta: Mapping[str, str]) -> Coupling:
-    """Returns the requested coupling of a recorded run; its law follows from it.
+    """Returns the requested coupling of a recorded run.
 
     Raises:
-        RecordingError: It is missing or out of range, or the method makes another law of it.
+        RecordingError: It is missing or out of range.
     """
-    numbers = meta_numbers(meta, "requested", len(_GAINS))
-    parameters, method = parameters_of(meta), method_of(meta)
     try:
-        requested = Coupling(*numbers)
-        law = method.law_coupling(requested, parameters.timestep)
-    except HapticBridgeError as error:
+        return Coupling(*meta_numbers(meta, "requested", len(_GAINS)))
+    except CouplingError as error:
         raise RecordingError(f"metadata 'requested' is out of range: {error}") from None
-    if law != parameters.coupling:
-        raise RecordingError(
-            f"metadata 'requested' is {meta['requested']!r:.80}, of which method '{method.name}' "
-            "makes another law than the recorded one"
-        )
-    return requested
 
 
 def parameters_of(meta: Mapping[str, str]) -> RunParameters:
@@ -314,11 +319,6 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
     Raises:
         RecordingError: A value is missing or out of range.
     """
-    if meta.get("began") == _MID_RUN:
-        raise RecordingError(
-            "the recording begins in mid-run, which only earlier versions of hapticbridge recorded "
-            "and judged; 'hapticbridge export' still reads its ticks"
-        )
     try:
         method = method_of(meta)
         device = None if method.has_law else DeviceInfo.from_json(meta.get("device", ""))
@@ -329,7 +329,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             grip=meta.get("grip", ""),
             period=meta_float(meta, "period_s"),
             substeps=meta_count(meta, "substeps"),
-            scene_ticks=meta_count(meta, "scene_ticks") if "scene_ticks" in meta else 0,
+            scene_ticks=meta_count(meta, "scene_ticks"),
             coupling=Coupling(**{name: meta_float(meta, name) for name in _GAINS}),
             ramp_ticks=meta_count(meta, "ramp_ticks"),
             axes=meta_numbers(meta, "axes", 9),
@@ -339,7 +339,7 @@ def parameters_of(meta: Mapping[str, str]) -> RunParameters:
             **numbers,
             device_damping=damping,
             device_rotational_damping=rotational,
-            guarding=GuardParameters.from_json(meta["guard"]) if "guard" in meta else UNGUARDED,
+            guarding=GuardParameters.from_json(meta.get("guard", "")),
         )
     except RecordingError:
         raise

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from hapticbridge.clock import Clock, RealClock, slept_ns
 from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.coupling import Coupling
+from hapticbridge.dataclass_json import to_json
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_close, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
@@ -60,7 +61,15 @@ from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.ring import Snapshot
 from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import prepare, prepare_hands
-from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
+from hapticbridge.request import RunRequest
+from hapticbridge.run_description import (
+    attachments,
+    describe_hands,
+    describe_machine,
+    describe_scene,
+    describe_start,
+    start_state,
+)
 from hapticbridge.scene.checks import first_pump, strongest_actuator
 from hapticbridge.signals import deferring_stops
 from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
@@ -256,7 +265,8 @@ class Session:
     started last, because from then on it is held. ``close`` releases in reverse order.
 
     Args:
-        setups: The resolved setup of each hand.
+        request: What the user asked for.
+        setups: The setup of each hand that it resolves to.
         device: The device, open but not started; a ``DeviceGroup`` for several hands.
         clock: Clock of the run.
         output: Destinations of the records.
@@ -286,13 +296,14 @@ class Session:
 
     def __init__(
         self,
+        request: RunRequest,
         setups: Sequence[RunSetup],
         device: Device,
         clock: Clock,
         output: RecordOutput,
         stop: StopRequest,
     ) -> None:
-        self._setups = tuple(setups)
+        self._request, self._setups = request, tuple(setups)
         setup = self.setup = setups[0]
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
@@ -434,19 +445,17 @@ class Session:
                 refuse_stretched_start(state, own, each.limits, grip)
 
     def _description(self) -> dict[str, str]:
-        found: list[dict[str, str]] = []
-        for hand, each in enumerate(self._setups):
-            meta = describe_run(
-                each.scene,
-                self.hand_parameters[hand],
-                self.kernel.state[hand : hand + 1],
-                requested=each.coupling,
-                method=each.method.name,
-                device=each.info,
-                clock=self.clock.name,
-            )
-            found.append(meta)
-        return describe_hands(found)
+        found = [
+            self._request.description(each, self.hand_parameters[hand])
+            | describe_start(self.kernel.state[hand : hand + 1])
+            for hand, each in enumerate(self._setups)
+        ]
+        return {
+            **describe_hands(found),
+            **describe_scene(self.setup.scene),
+            **describe_machine(),
+            "request": to_json(self._request),
+        }
 
     def close(self, error: BaseException | None) -> None:
         """Records the end, commands zero force, and closes recording, scene and device.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
-from hapticbridge.record import LATER_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
 from hapticbridge.recording.seal import KEY, SIGNATURE
 from hapticbridge.run_description import SOURCE_PREFIX
@@ -112,7 +113,6 @@ def rewritten(
         {**recording.meta, **(meta or {})},
         [Attachment(name, "application/octet-stream", data) for name, data in files.items()],
         int(recording.meta["epoch_ns"]),
-        record=(recording.ticks if ticks is None else ticks).dtype,
     )
     rows, start = recording.ticks if ticks is None else ticks, 0
     for event in recording.events if events is None else events:
@@ -165,14 +165,27 @@ def without_model(recording: Recording) -> Recording:
     return Recording(**{**vars(recording), "attachments": files})
 
 
-def without_share(recording: Recording, later: Sequence[str] = LATER_FIELDS) -> NDArray[np.void]:
-    """Returns the records as an earlier version wrote them, without some later fields."""
-    names = [name for name in recording.ticks.dtype.names or () if name not in later]
-    record = np.dtype([(name, recording.ticks.dtype[name]) for name in names])
-    ticks = np.zeros(len(recording.ticks), record)
-    for name in names:
-        ticks[name] = recording.ticks[name]
-    return ticks
+def other_request(recording: Recording, change: Callable[[dict[str, Any]], Any]) -> dict[str, str]:
+    """Returns the metadata of a changed request."""
+    asked = json.loads(recording.meta["request"])
+    change(asked)
+    return {"request": json.dumps(asked)}
+
+
+def other_sheet(recording: Recording, **values: Any) -> dict[str, str]:
+    """Returns the metadata of another data sheet of the device, stated and requested.
+
+    The coupling is requested in numbers, which no data sheet changes.
+    """
+    sheet = json.loads(recording.meta["device"]) | values
+    gains = (each.name for each in fields(Coupling))
+    coupling = dict(zip(gains, json.loads(recording.meta["requested"]), strict=True))
+
+    def change(request: dict[str, Any]) -> None:
+        request["devices"] = [sheet]
+        request["grasps"][0]["coupling"] = coupling
+
+    return {"device": json.dumps(sheet)} | other_request(recording, change)
 
 
 SHEET = DeviceInfo(

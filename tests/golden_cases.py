@@ -538,7 +538,7 @@ def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Pa
         numbers[0] += 1e-9
         yield f"metadata {name}", rewritten(recording, path, meta={name: json.dumps(numbers)})
     for name, number in json.loads(meta["guard"]).items():
-        changed = json.loads(meta["guard"]) | {name: (number or 0.0) + 1}
+        changed = json.loads(meta["guard"]) | {name: 1.0 if number == "inf" else number + 1}
         yield f"guard {name}", rewritten(recording, path, meta={"guard": json.dumps(changed)})
     for name, text in TEXTS.items():
         yield f"metadata {name} {text!r}", rewritten(recording, path, meta={name: text})

@@ -24,11 +24,12 @@ from audit_cases import (
     ScriptedDevice,
     SlowClock,
     key_pair,
+    other_request,
     recorded,
     rewritten,
     verdict_of,
-    without_share,
 )
+from audit_cases import other_sheet as requested_sheet
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
@@ -36,7 +37,7 @@ from hapticbridge.commands import Couple, Reset
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, SimulatedDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.guard import Limits, guard_parameters_for
+from hapticbridge.guard import IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
 from hapticbridge.kernel.parameters import UNGUARDED
 from hapticbridge.record import CLOCK_FIELDS, TickFlag
 from hapticbridge.recording import Recording, read_recording
@@ -162,9 +163,28 @@ def guard(name: str, factor: float) -> Change:
         value = old[name]
         if isinstance(value, int):
             return old | {name: int(value + factor)}
-        return old | {name: 1.0 if value is None else value * factor}
+        return old | {name: 1.0 if value == "inf" else value * factor}
 
     return meta("guard", change)
+
+
+def sheet(**values: Any) -> Change:
+    """Changes the data sheet where it stands and in the request."""
+    return lambda recording: {"meta": requested_sheet(recording, **values)}
+
+
+def limit(name: str) -> Change:
+    """Changes a limit in the request, and the guard parameter that follows from it."""
+
+    def parts(recording: Recording) -> Parts:
+        asked, guard = (json.loads(recording.meta[key]) for key in ("request", "guard"))
+        old = asked["options"]["limits"][name]
+        load = guard[f"idle_{name.removeprefix('hold_')}"] if name.startswith("hold_") else 0.0
+        assert load in (0.0, IDLE_FORCE, IDLE_TORQUE)  # the tool weighs nothing
+        asked["options"]["limits"][name] = guard[name] = 1.1 * old
+        return {"meta": {"request": json.dumps(asked), "guard": json.dumps(guard)}}
+
+    return parts
 
 
 def ticks(name: str, change: Callable[[Any], Any]) -> Change:
@@ -231,14 +251,14 @@ def other_law(recording: Recording) -> Parts:
 
 def other_sheet(recording: Recording, **values: Any) -> Parts:
     """Changes the data sheet, and all guard parameters that follow from it."""
-    sheet = json.loads(recording.meta["device"]) | values
-    info = DeviceInfo.from_json(json.dumps(sheet))
+    changed = requested_sheet(recording, **values)
+    info = DeviceInfo.from_json(changed["device"])
     old = json.loads(recording.meta["guard"])
     limits = Limits(force=10.0, torque=0.5)
     new = guard_parameters_for(info, limits, float(recording.meta["period_s"]), controller="off")
     names = ("assumed_damping", "assumed_rotational_damping", "max_damping")
-    changed = {name: getattr(new, name) for name in (*names, "max_rotational_damping")}
-    return {"meta": {"device": json.dumps(sheet), "guard": json.dumps(old | changed)}}
+    own = {name: getattr(new, name) for name in (*names, "max_rotational_damping")}
+    return {"meta": changed | {"guard": json.dumps(old | own)}}
 
 
 def no_trip(recording: Recording) -> Parts:
@@ -313,9 +333,10 @@ FORGERIES: dict[str, Forgery] = {
     "effective coupling": seen(hand, text(effective="[1, 1, 1, 1]")),
     "method": seen(hand, text(method="implicit")),
     "contact": seen(hand, text(contact="scene")),
-    "discretization": seen(hand, text(discretization="forward")),
     "contact stiffness": seen(hand, text(contact_stiffness="1000.0")),
-    "grip": again(hand, text(grip="elsewhere")),
+    "grip": seen(hand, text(grip="elsewhere")),
+    "request": seen(hand, lambda r: {"meta": other_request(r, lambda q: q.update(clock="real"))}),
+    "no request": seen(hand, text(request="")),
     # workspace and time
     "period": seen(hand, times("period_s")),
     "substeps": seen(hand, text(substeps="2")),
@@ -325,7 +346,7 @@ FORGERIES: dict[str, Forgery] = {
     "ramp": seen(hand, times("ramp_ticks", 2)),
     "device origin": seen(hand, component("device_origin", 0)),
     "handle origin": again(hand, component("handle_origin", 0)),
-    "device start": again(hand, component("device_start", 0)),
+    "device start": seen(hand, component("device_start", 0)),
     "handle start": seen(hand, component("handle_start", 1)),
     "tool start": seen(hand, component("tool_start", 2)),
     "start kinetic": seen(hand, times("start_kinetic")),
@@ -340,10 +361,11 @@ FORGERIES: dict[str, Forgery] = {
     "device rate": seen(hand, entry("device", rate=100.0)),
     "speed limit": seen(hand, entry("device", speed_limit=0.9)),
     "axes of the device": seen(hand, entry("device", axes=["x", "y", "z"])),
-    "real device": hidden(hand, entry("device", is_real=True), OWN_WORD),
+    "real device": hidden(hand, sheet(is_real=True), OWN_WORD),
     "prescribed motion": seen(hand, entry("device", is_prescribed=True)),
-    "unknown damping": hidden(hand, entry("device", damping=None), LESS),
-    "device name": hidden(hand, entry("device", name="other"), OWN_WORD),
+    "unknown damping": hidden(hand, sheet(damping=None), LESS),
+    "device name": hidden(hand, sheet(name="other"), OWN_WORD),
+    "device name beside the request": seen(hand, entry("device", name="other")),
     "damping and all that follows from it": hidden(
         swung, partial(other_sheet, damping=50.0, rotational_damping=1.0), OWN_WORD
     ),
@@ -361,16 +383,20 @@ FORGERIES: dict[str, Forgery] = {
     },
     "guard: delay margin": seen(hand, entry("guard", delay_margin=1.0)),
     "guard: a delay and no margin": seen(
-        hand, entry("guard", stated_delay=0.05, delay_margin=None)
+        hand, entry("guard", stated_delay=0.05, delay_margin="inf")
     ),
-    "guard: no margin": hidden(hand, entry("guard", delay_margin=None), LESS),
+    "guard: no margin": seen(hand, entry("guard", delay_margin="inf")),
     "guard: stated delay": seen(hand, entry("guard", stated_delay=0.05)),
-    "guard: idle force": again(hand, guard("idle_force", 2.0)),
-    "guard: idle torque": again(hand, guard("idle_torque", 2.0)),
+    "guard: idle force": seen(hand, guard("idle_force", 2.0)),
+    "guard: idle torque": seen(hand, guard("idle_torque", 2.0)),
     "guard: hold force out of range": seen(hand, guard("hold_force", -1.0)),
     "guard: hold force below the load": seen(weighed, guard("hold_force", 0.2)),
     **{
-        f"guard: {name}": hidden(hand, guard(name, 1.1), UNREACHED)
+        f"guard: {name}": seen(hand, guard(name, 1.1))
+        for name in ("stretch", "angle", "energy", "hold_force", "hold_torque")
+    },
+    **{
+        f"requested limit and guard: {name}": hidden(hand, limit(name), UNREACHED)
         for name in ("stretch", "angle", "energy", "hold_force", "hold_torque")
     },
     "guard: all off": hidden(hand, text(guard=UNGUARDED.to_json()), LESS),
@@ -428,7 +454,6 @@ FORGERIES: dict[str, Forgery] = {
     "wrench on the device": seen(hand, ticks("wrench_on_device", lambda v: 0.9 * v)),
     "wrench on the tool": seen(hand, ticks("wrench_on_tool", lambda v: 0.9 * v)),
     "tank": seen(hand, ticks("contact_tank", lambda v: 0.9 * v)),
-    "no tank": seen(hand, lambda r: {"ticks": without_share(r, ("contact_tank",))}),
     "work of the coupling": seen(hand, ticks("coupling_work", lambda v: 0.9 * v)),
     "kinetic energy": seen(hand, ticks("kinetic", lambda v: 0.9 * v)),
     "environment energy": seen(hand, ticks("environment_energy", lambda v: v - 1e-3)),

@@ -8,14 +8,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from audit_cases import COMPONENTS, rewritten, verdict_of, without_model, without_share
+from audit_cases import COMPONENTS, other_request, other_sheet, rewritten, verdict_of, without_model
 from golden_cases import LISTS, NUMBERS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
-from hapticbridge.export import export
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.seal import Digest
 from hapticbridge.run_description import (
@@ -176,9 +175,9 @@ def test_the_scene_is_compiled_from_what_is_attached(tap: Recording, folder: Pat
         assert report.verdict == ("invalid" if words else "passive")
     sheet = {SCENE.replace(".xml", ".toml"): b""}
     assert verdict_of(tap, folder, attachments=sheet).verdict == "invalid"
-    heavier = {
-        "scene_parameters": json.dumps(json.loads(tap.meta["scene_parameters"]) | {"mass": 0.12})
-    }
+    values = json.loads(tap.meta["scene_parameters"]) | {"mass": 0.12}
+    heavier = other_request(tap, lambda request: request.update(parameters=values))
+    heavier |= {"scene_parameters": json.dumps(values)}
     assert "scene_sha256" in verdict_of(tap, folder, meta=heavier).reason
 
 
@@ -219,11 +218,11 @@ def test_gain_that_would_overflow_is_out_of_range(tap: Recording, folder: Path) 
 def test_device_that_no_force_moves_is_not_certified_whatever_damping_it_claims(
     tap: Recording, folder: Path
 ) -> None:
-    claimed = json.loads(tap.meta["device"]) | {"damping": 100.0, "rotational_damping": 1.0}
-    report = verdict_of(tap, folder, meta={"device": json.dumps(claimed)})
+    claimed = {"damping": 100.0, "rotational_damping": 1.0}
+    report = verdict_of(tap, folder, meta=other_sheet(tap, **claimed))
     assert (report.verdict, report.certified, report.conditions) == ("passive", None, ())
-    free = claimed | {"is_prescribed": False}
-    assert verdict_of(tap, folder, meta={"device": json.dumps(free)}).certified is True
+    free = other_sheet(tap, **claimed, is_prescribed=False)
+    assert verdict_of(tap, folder, meta=free).certified is True
 
 
 @settings(
@@ -247,29 +246,6 @@ def test_numpy_alone_finds_what_exceeds_its_tolerance(
     report = verdict_of(held, folder, ticks=ticks, meta=meta)
     assert report.verdict == "invalid", (component, tick, exponent)
     assert report.resimulation == ""
-
-
-def test_a_recording_from_before_the_watch_knew_delays_is_simulated_bit_for_bit(
-    held: Recording, tmp_path: Path
-) -> None:
-    guard = json.loads(held.meta["guard"])
-    assert guard.pop("stated_delay") == 0.0
-    assert guard.pop("delay_margin") > 0.0
-    report = verdict_of(held, tmp_path, meta={"guard": json.dumps(guard)})
-    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-
-
-def test_a_recording_of_an_earlier_version_is_refused_exported_and_repaired(
-    tap: Recording, tmp_path: Path
-) -> None:
-    old, mended = tmp_path / "old.mcap", tmp_path / "mended.mcap"
-    rewritten(tap, old, ticks=without_share(tap))
-    report = audit(old)
-    assert report.verdict == "invalid"
-    assert "recorded by an earlier version" in report.reason
-    assert export(old, "csv").recording.count == len(tap.ticks)
-    old.write_bytes(old.read_bytes()[:-100])
-    assert repair(old, mended).record == without_share(tap).dtype
 
 
 def test_without_resimulation_the_report_says_so_and_why(tap: Recording, folder: Path) -> None:

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import recorded, rewritten, tapped, without_share
+from audit_cases import recorded, rewritten, tapped
 from cli_cases import Called
 from numpy.typing import NDArray
 
 from hapticbridge.compare import compare
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import export
-from hapticbridge.record import LATER_FIELDS, TickFlag
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording, reader
 
 
@@ -194,21 +193,3 @@ def test_damage_is_told_and_no_recording_refused(tap: Path, tmp_path: Path, call
         other = rewritten(recording, tmp_path / "period.mcap", meta={"period_s": period})
         with pytest.raises(RecordingError, match="period_s"):
             compare(tap, other)
-
-
-def test_a_recording_without_the_share_is_compared_and_exported_in_what_it_holds(
-    tap: Path, tmp_path: Path
-) -> None:
-    recording = read_recording(tap)
-    old = rewritten(recording, tmp_path / "old.mcap", ticks=without_share(recording))
-    lacking = ", ".join(LATER_FIELDS)
-    for pair in ((tap, old), (old, tap)):
-        found = compare(*pair)
-        assert found.is_same
-        assert found.compared == len(recording.ticks)
-        assert found.notes == (f"{old} is of an earlier version, without {lacking}",)
-    written = export(old, "csv").files[0].read_text().splitlines()
-    assert len(written) == len(recording.ticks) + 1
-    assert written[0].endswith("injected_rotational_damping")
-    target = export(tap, "csv", tmp_path / "new.csv").files[0]
-    assert target.read_text().splitlines()[0].endswith(f",{','.join(LATER_FIELDS)}")

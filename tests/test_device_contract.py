@@ -490,9 +490,9 @@ def test_a_bad_data_sheet_is_refused(change: dict[str, object], words: str) -> N
     [
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
-        ("[1]", "is not a JSON object but [1]"),
-        ("{}", "lacks the keys 'axes', 'damping'"),
-        ('{"colour": "red"}', "holds unknown keys 'colour'; valid keys: 'axes'"),
+        ("[1]", "device data is [1]; it must be an object"),
+        ("{}", "device data has no 'axes', 'buttons', 'damping'"),
+        ('{"colour": "red"}', "device data has unknown fields 'colour'"),
     ],
 )
 def test_text_that_is_no_data_sheet_is_refused(text: str, words: str) -> None:

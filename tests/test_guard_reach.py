@@ -84,8 +84,6 @@ def test_a_profile_tells_a_device_its_reach() -> None:
     assert profile_named("falcon").fill(known).reach == 0.07
     text = DeviceInfo.to_json(known)
     assert DeviceInfo.from_json(text) == known
-    older = {name: value for name, value in json.loads(text).items() if name != "reach"}
-    assert DeviceInfo.from_json(json.dumps(older)) == replace(known, reach=None)
     with pytest.raises(DeviceError, match=r"reach = 0: must be a finite number > 0 m"):
         replace(info, reach=0)
 

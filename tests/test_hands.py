@@ -362,7 +362,7 @@ def test_a_changed_record_of_either_hand_is_noticed(
         (json.dumps([{}] * MAX_HANDS), "metadata 'hands' are not texts by name"),
         ("[]", "its hands have different numbers of records"),
         ('[{"grip": "right"}, {"grip": "left"}]', "its hands have different numbers of records"),
-        ('[{"grip": "right", "period_s": "0.002"}]', "metadata 'period_s' differ between"),
+        ('[{"grip": "right", "period_s": "0.002"}]', "metadata 'period_s' is '0.002'"),
     ],
 )
 def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_path: Path) -> None:

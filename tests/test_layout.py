@@ -16,7 +16,7 @@ PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
     ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
-    ("arguments", "clock", "confinement", "coupling", "files", "pose"),
+    ("arguments", "clock", "confinement", "coupling", "dataclass_json", "files", "pose"),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),
     ("scene", "inputs"),
@@ -31,11 +31,14 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export", "dataset", "recorded_scene"),
+    ("guard", "summary", "timekeeping", "export", "dataset"),
     ("testing",),
     ("commands", "check"),
-    ("audit", "compare", "options"),
+    ("options",),
     ("hands",),
+    ("request",),
+    ("recorded_scene",),
+    ("audit", "compare"),
     ("session", "film_process", "report"),
     ("bridge", "view"),
     ("whatif",),  # runs the bridge and the audit, which do not depend on each other

@@ -36,7 +36,7 @@ from hapticbridge.recording import Recording, open_recording, read_recording
 from hapticbridge.recording.container import MAX_RATIO
 from hapticbridge.report.cause import likely_cause
 from hapticbridge.report.evidence import Evidence
-from hapticbridge.run_description import SOURCE_PREFIX, parameters_of
+from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene.source import refuse_outside
 from hapticbridge.whatif import what_if
 
@@ -599,7 +599,7 @@ def test_a_trusted_scene_is_simulated_here(
 ) -> None:
     monkeypatch.setattr(os, "fork", lambda: pytest.fail("a child process was started"))
     assert audit(honest.path, in_process=True).resimulation == "bit for bit"
-    scene = compile_recorded(honest, parameters_of(honest.meta))
+    scene = compile_recorded(honest)
     assert scene.name == honest.meta["scene"]
     assert len(what_if(honest.path, {}, in_process=True).runs) > 1
     replay = pytest.importorskip("hapticbridge.view.replay").Replay

@@ -17,7 +17,7 @@ import hapticbridge as hb
 from hapticbridge import scene as scenes
 from hapticbridge.cli import main
 from hapticbridge.recorded_scene import compile_recorded, is_as_recorded
-from hapticbridge.run_description import compiled_model, parameters_of
+from hapticbridge.run_description import compiled_model
 from hapticbridge.scene import load_scene, scene_path
 
 PARAMETERS = [
@@ -276,7 +276,7 @@ def test_values_are_recorded_and_run(tmp_path: Path, capsys: pytest.CaptureFixtu
     report = hb.audit(file)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     # the walls of the recorded model stand where the clearance puts them, and the peg felt them
-    scene = compile_recorded(recording, parameters_of(recording.meta))
+    scene = compile_recorded(recording)
     assert is_as_recorded(scene, recording)
     assert scene.model.geom("hole_east").pos[0] == pytest.approx(0.0201, abs=1e-12)
     capsys.readouterr()

@@ -8,15 +8,18 @@ from bridge_runs import still, sway
 
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.options import BridgeOptions, RunSetup
+from hapticbridge.hands import Grasp
+from hapticbridge.options import BridgeOptions
+from hapticbridge.request import RunRequest
 from hapticbridge.scene import load_scene
 from hapticbridge.session import RecordOutput, Session, StopRequest
 
 
 def test_a_session_runs_without_a_bridge_and_releases_what_it_holds() -> None:
     scene, device, clock = load_scene("point_mass"), ScriptedDevice(sway), SimulatedClock()
-    setup = RunSetup.resolve(scene, device.info, None, BridgeOptions(), clock)
-    session = Session((setup,), device, clock, RecordOutput(), StopRequest())
+    request = RunRequest.of(scene, [Grasp("grip")], [device.info], BridgeOptions(), clock)
+    setups = request.resolve(scene, clock)
+    session = Session(request, setups, device, clock, RecordOutput(), StopRequest())
     with pytest.raises(SceneError, match="in use by another bridge"):
         scene.claim()
     session.begin(0.05)
@@ -33,8 +36,9 @@ def test_a_session_that_cannot_open_closes_the_device_and_frees_the_scene() -> N
     scene, clock = load_scene("point_mass"), SimulatedClock()
     device = ScriptedDevice(still)
     device.start = lambda _period: fail()  # type: ignore[method-assign,assignment,return-value]
-    setup = RunSetup.resolve(scene, device.info, None, BridgeOptions(), clock)
+    request = RunRequest.of(scene, [Grasp("grip")], [device.info], BridgeOptions(), clock)
+    setups = request.resolve(scene, clock)
     with pytest.raises(HapticBridgeError, match="stuck"):
-        Session((setup,), device, clock, RecordOutput(), StopRequest())
+        Session(request, setups, device, clock, RecordOutput(), StopRequest())
     assert device.is_closed and not device.writes
     scene.claim()

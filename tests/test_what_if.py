@@ -8,14 +8,14 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import report_runs
-from audit_cases import TAP, ScriptedDevice, SlowClock, recorded, rewritten
+from audit_cases import TAP, ScriptedDevice, SlowClock, other_sheet, recorded, rewritten
 from cli_cases import Called
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -261,8 +261,7 @@ def test_what_the_hand_wanted_is_found_where_it_is_known() -> None:
 
 def test_without_a_device_that_answers_there_is_no_closed_loop(wall: Path, tmp_path: Path) -> None:
     recording = read_recording(wall)
-    info = DeviceInfo.from_json(recording.meta["device"])
-    unknown = {"device": replace(info, mass=None).to_json()}
+    unknown = other_sheet(recording, mass=None)
     found = what_if(rewritten(recording, tmp_path / "a.mcap", meta=unknown), {"rate": 2000})
     assert [run.name for run in found.runs] == ["recorded", "prescribed"]
     assert any("no closed loop: unknown mass of the device" in note for note in found.notes)
@@ -404,8 +403,7 @@ def test_what_the_guard_did_comes_back_in_every_bit(name: str, tmp_path: Path) -
     assert before.tobytes() == after.tobytes()
     if name == "limits":
         [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
-        again = run.limits
-        assert astuple(again) == pytest.approx(astuple(EVERY_LIMIT))
+        assert run.request.options.limits == EVERY_LIMIT
     elif name == "old samples":
         slower = what_if(path, {"rate": 700}).runs[1]
         for ticks in (before, slower.ticks):  # it has faded

@@ -6,28 +6,28 @@ others determine must therefore agree.
 
 from __future__ import annotations
 
-import json
-import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.structure import Fault
 from hapticbridge.audit.timing import TimingTally
-from hapticbridge.clock import RealClock, SimulatedClock
-from hapticbridge.errors import DeviceError, RecordingError
-from hapticbridge.guard import CONTROLLERS, IDLE_FORCE, IDLE_TORQUE, Limits, guard_parameters_for
-from hapticbridge.kernel.parameters import UNGUARDED, WITHOUT_DELAY
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.files import read_json
+from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rehearsal import start_handle, static_load
-from hapticbridge.run_description import SOURCE_PREFIX, STATE_ATTACHMENT, start_state
+from hapticbridge.request import refused_request, request_of, setups_of
+from hapticbridge.run_description import (
+    SOURCE_PREFIX,
+    STATE_ATTACHMENT,
+    metas_of,
+    parameters_of,
+    sample_at,
+    start_state,
+)
 from hapticbridge.scene import Scene
 
 _TOLERANCE = 1e-9  # relative and absolute in SI units, for numbers of another processor
@@ -63,73 +63,58 @@ def first_contradiction(statements: Iterable[Statement]) -> Fault | None:
     return next((fault for each in statements if (fault := each.fault())), None)
 
 
-# Metadata against each other
+# Metadata against the request
 
 
-def metadata_statements(recording: RecordingFile, run: AuditedRun) -> Iterator[Statement]:
-    """Yields what device, coupling and method determine of the metadata."""
-    meta, parameters = recording.meta, run.parameters
-    yield from _guard_statements(run)
-    if not run.method.is_weld:
-        stated = meta.get("effective")
-        yield Statement("metadata 'effective'", stated, "null", "methods other than 'weld'")
-    clocks = (RealClock.name, SimulatedClock.name)
-    if meta.get("clock") not in clocks:
-        yield Statement("metadata 'clock'", meta.get("clock"), " or ".join(clocks), "its two kinds")
-    origins = parameters.device_origin, parameters.handle_origin
-    if IDENTITY_POSE not in origins:
-        start = parameters.device_start
-        yield Statement("metadata 'device_origin'", origins[0], start, "relative poses")
-    main = next((n for n in recording.attachments if n.startswith(SOURCE_PREFIX)), None)
+def metadata_statements(recordings: Sequence[RecordingFile]) -> Iterator[Statement]:
+    """Yields what the request determines of each hand's metadata without the scene."""
+    meta, source = recordings[0].meta, "request and start"
+    request = request_of(meta)
+    main = next((n for n in recordings[0].attachments if n.startswith(SOURCE_PREFIX)), None)
     if main is not None:
-        file = PurePosixPath(main)
-        yield Statement("metadata 'scene_file'", meta.get("scene_file"), file.name, "the sources")
-        yield Statement("metadata 'scene'", meta.get("scene"), file.stem, "the sources")
+        name = PurePosixPath(main).name
+        yield Statement("the requested scene", request.scene, name, "the sources")
+    for setup, own in zip(setups_of(meta), metas_of(meta), strict=True):
+        stored = parameters_of(own)
+        with refused_request():
+            found = setup.unloaded(sample_at(stored.device_start), stored.effective)
+        found = replace(found, guarding=_loaded(found.guarding, stored.guarding))
+        if not setup.workspace.absolute:
+            found = replace(found, handle_origin=stored.handle_origin)
+        if not setup.method.is_weld:
+            found = replace(found, effective=None)
+        yield from _differences(own, request.description(setup, found), source)
 
 
-def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
-    parameters, info = run.parameters, run.info
-    guard = parameters.guarding
-    if guard == UNGUARDED:  # a study runs without
-        return
-    needed = LoopSetting.of_run(info, replace(parameters, effective=None), run.method).needs()
-    try:
-        limits = Limits(
-            force=parameters.force_limit,
-            torque=parameters.torque_limit,
-            angle=guard.angle,
-            energy=guard.energy,
-            reach=guard.reach,
-        )
-    except DeviceError as error:
-        raise RecordingError(f"metadata 'guard' is out of range: {error}") from None
-    names = {code: name for name, code in CONTROLLERS.items()}
-    derived = guard_parameters_for(
-        info,
-        limits,
-        parameters.period,
-        needed=needed,
-        scale=parameters.scale,
-        controller=None if info.is_prescribed else names[guard.controller],
-    )
-    source = "data sheet, coupling and limits"
-    knows_delays = (guard.stated_delay, guard.delay_margin) != (0.0, math.inf)
-    chosen = _CHOSEN if knows_delays else (*_CHOSEN, *WITHOUT_DELAY)
-    free = {name: getattr(guard, name) for name in chosen}
-    for name, value in asdict(replace(derived, **free)).items():
-        yield Statement(f"guard parameter '{name}'", getattr(guard, name), value, source)
-    load = guard.idle_force - IDLE_FORCE, guard.idle_torque - IDLE_TORQUE
-    for name, weight in zip(("hold_force", "hold_torque"), load, strict=True):
-        held = getattr(guard, name)
-        if not held > weight >= 0:
-            yield Statement(f"guard parameter '{name}'", held, None, "the tool's weight")
+def _loaded(guard: GuardParameters, stored: GuardParameters) -> GuardParameters:
+    """Returns guard parameters with the load of the tool that stored ones have.
+
+    The scene determines it; without the scene it must be one load >= 0 in all of them.
+    """
+    found: dict[str, Any] = {}
+    for kind in ("force", "torque"):
+        idle, hold = f"idle_{kind}", f"hold_{kind}"
+        load = getattr(stored, idle) - getattr(guard, idle)
+        if load >= 0:
+            held, own = getattr(guard, hold) + load, getattr(stored, hold)
+            found |= {idle: getattr(stored, idle)}
+            found |= {hold: own if _agrees(own, held, is_exact=False) else held}
+    return replace(guard, **found)
 
 
-_CHOSEN = (
-    *("stretch", "clutch", "dead_man"),
-    *("hold_force", "hold_torque", "idle_force", "idle_torque"),
-)
-"""Guard parameters that the user chooses, or that follow from the scene."""
+def _differences(
+    meta: Mapping[str, str], derived: Mapping[str, str], source: str, *, is_exact: bool = True
+) -> Iterator[Statement]:
+    """Yields the texts and guard parameters that may differ from what is derived."""
+    for name, text in derived.items():
+        if name == "guard":
+            guard, own = _json(derived, name), _json(meta, name)
+            pairs = [(f"guard parameter '{each}'", own[each], guard[each]) for each in guard]
+        else:
+            pairs = [(f"metadata '{name}'", meta.get(name), text)]
+        for field, stated, expected in pairs:
+            if is_exact or not _are_near(stated, expected):
+                yield Statement(field, stated, expected, source)
 
 
 # Events against records
@@ -170,39 +155,35 @@ def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[
 
 
 def scene_statements(
-    scene: Scene, recording: RecordingFile, run: AuditedRun, *, is_exact: bool
+    scene: Scene, recording: RecordingFile, *, is_exact: bool
 ) -> Iterator[Statement]:
-    """Yields what the scene determines; ``is_exact`` is False for another processor's."""
+    """Yields what the scene determines; ``is_exact`` is False for another processor's.
+
+    Whether a tool is carried is a fact of the start, which the compiled model holds: its rehearsal
+    may take longer than the audit.
+
+    Raises:
+        RecordingError: The request is refused in this scene.
+    """
     meta, source = recording.meta, "the attached sources"
     values, changes = _json(meta, "scene_parameters"), _json(meta, "scene_changes")
     yield Statement("metadata 'scene_parameters'", values, scene.parameters, source)
     yield Statement(
         "metadata 'scene_changes'", _reasoned(changes), _reasoned(scene.changes), source
     )
-    parameters = run.parameters
     state = recording.attachments.get(STATE_ATTACHMENT, b"")
     start = start_state(scene.model, scene.data)
     stated = np.frombuffer(state, "<f8") if len(state) == start.nbytes else np.zeros(0)
     agrees = stated.size == start.size and _agrees(stated, start, is_exact=is_exact)
     yield Statement(f"attachment '{STATE_ATTACHMENT}'", agrees or "another", True, source)
-    if not run.method.has_law:
-        return
-    is_absolute = parameters.handle_origin == IDENTITY_POSE
-    grip = IDENTITY_POSE if is_absolute else scene.grip_pose()
-    unloaded, guard = replace(parameters, handle_origin=grip), parameters.guarding
-    load = static_load(scene, unloaded)
-    weights = float(np.linalg.norm(load[:3])), float(np.linalg.norm(load[3:]))
-    idle = IDLE_FORCE + weights[0], IDLE_TORQUE + weights[1]
-    pairs: list[tuple[str, object, object]]
-    pairs = [("idle_force", guard.idle_force, idle[0]), ("idle_torque", guard.idle_torque, idle[1])]
-    if guard == UNGUARDED:
-        pairs = []
-    if not is_absolute:
-        origin = start_handle(scene, unloaded, load)
-        pairs.append(("handle_origin", parameters.handle_origin, origin))
-    for name, given, expected in pairs:
-        if not _agrees(given, expected, is_exact=is_exact):
-            yield Statement(f"metadata '{name}'", given, expected, source)
+    request, source = request_of(meta), "request and attached sources"
+    for setup, own in zip(setups_of(meta, scene), metas_of(meta), strict=True):
+        parameters = parameters_of(own)
+        sample = sample_at(parameters.device_start)
+        with refused_request():
+            found = setup.parameters(sample, parameters.effective)
+        derived = request.description(setup, found)
+        yield from _differences(own, derived, source, is_exact=is_exact)
 
 
 def _reasoned(changes: Any) -> Any:
@@ -218,8 +199,20 @@ def _agrees(stated: Any, derived: Any, *, is_exact: bool) -> bool:
     return bool(np.allclose(stated, derived, rtol=_TOLERANCE, atol=_TOLERANCE))
 
 
+def _are_near(stated: Any, derived: Any) -> bool:
+    """Returns True for numbers, or texts of them, that another processor may have rounded."""
+    try:
+        numbers = [
+            np.asarray(read_json(each) if isinstance(each, str) else each, float)
+            for each in (stated, derived)
+        ]
+    except (ValueError, TypeError):
+        return False
+    return numbers[0].shape == numbers[1].shape and _agrees(*numbers, is_exact=False)
+
+
 def _json(meta: Mapping[str, str], name: str) -> Any:
     try:
-        return json.loads(meta.get(name, "null"))
-    except (ValueError, RecursionError):
+        return read_json(meta.get(name, "null"))
+    except ValueError:
         return None

@@ -17,9 +17,9 @@ from hapticbridge.commands import bits_in, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import Limits, limits_for
-from hapticbridge.kernel.parameters import EARLIER_VERSION, RunParameters
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.loop_setting import LoopSetting, delay_ticks
+from hapticbridge.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import STARTS, meta_start, method_of, parameters_of
@@ -150,21 +150,11 @@ class AuditedRun:
             RecordingError: They are damaged or do not describe a run.
         """
         meta, parameters = recording.meta, parameters_of(recording.meta)
-        if "share" not in (recording.record.names or ()):
-            raise RecordingError(EARLIER_VERSION)
         try:
             info = DeviceInfo.from_json(meta.get("device", ""))
-            limits_for(info, Limits(force=parameters.force_limit, torque=parameters.torque_limit))
             method = method_of(meta)
         except HapticBridgeError as error:
             raise RecordingError(f"the metadata do not describe a run: {error}") from None
-        if method.is_rigid and "contact_tank" not in (recording.record.names or ()):
-            raise RecordingError(
-                "the run had rigid contacts, and its records lack contact_tank, the energy that "
-                "paid for them: the field was taken out"
-            )
-        if meta.get("discretization") != method.discretization:
-            raise RecordingError(f"metadata 'discretization' is not that of method '{method.name}'")
         linear, angular = info.dissipating_damping
         parameters = replace(parameters, device_damping=linear, device_rotational_damping=angular)
         return cls(info, method, parameters, RunEvents.from_recording(recording, parameters))
@@ -259,7 +249,7 @@ class AuditState:
             RecordingError: The metadata lack the start of the energy balance.
         """
         starts = {name: np.array(meta_start(recording.meta, name)) for name in STARTS}
-        row = np.zeros(1, recording.record)
+        row = np.zeros(1, TICK_DTYPE)
         poses = {
             "device": np.array(parameters.device_start),
             "handle": starts["handle_start"],

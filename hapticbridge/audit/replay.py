@@ -55,14 +55,14 @@ instructions round differently. A larger tolerance would hide tampering, a small
 honest recordings."""
 
 
-def attached_scene(recording: RecordingFile, *parameters: RunParameters) -> Scene:
+def attached_scene(recording: RecordingFile) -> Scene:
     """Compiles the attached sources, which must give the recorded model in every bit.
 
     Raises:
         ForeignModelError: Another processor compiled another model.
         RecordingError: The sources cannot be compiled, or give another model on this processor.
     """
-    scene = compile_recorded(recording, *parameters)
+    scene = compile_recorded(recording)
     if is_as_recorded(scene, recording):
         return scene
     found = "the attached sources do not compile to the recorded model (scene_sha256)"
@@ -146,7 +146,7 @@ class Resimulator:
         self._changed = self._read_ns = 0
         self.done, self.is_over = 0, False
         every = parameters, *(own for _, own in others)
-        self.scene = scene or attached_scene(recording, *every)
+        self.scene = scene or attached_scene(recording)
         self.model = model = self.scene.model
         self.data = data = mujoco.MjData(model)
         # an error inside the C function would end the process; the first step in Python raises
@@ -365,19 +365,16 @@ def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
     recording, parameters = hands[0].recording, hands[0].run.parameters
     others = [(hand.recording, hand.run.parameters) for hand in hands[1:]]
     try:
-        scene = attached_scene(recording, parameters, *(own for _, own in others))
+        scene = attached_scene(recording)
     except ForeignModelError as error:
         return ReplayOutcome(f"{NOT_RUN}: {error}")
     worker.allow_run()
     run = Resimulator(recording, parameters, scene, others)
     is_exact = is_same_processor(recording)
-    for number, hand in enumerate(hands):
-        own = run.scene.of_hand(number)
-        if fault := first_contradiction(
-            scene_statements(own, hand.recording, hand.run, is_exact=is_exact)
-        ):
-            raise RecordingError(fault.reason)
-    names = [name for name in recording.record.names or () if name not in CLOCK_FIELDS]
+    stated = scene_statements(run.scene, recording, is_exact=is_exact)
+    if fault := first_contradiction(stated):
+        raise RecordingError(fault.reason)
+    names = [name for name in TICK_DTYPE.names or () if name not in CLOCK_FIELDS]
     off, largest = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
     first: tuple[int, str, float] | None = None
     for ticks in blocks_of_hands(hands):

@@ -37,7 +37,6 @@ from hapticbridge.certificate import (
     run_conditions,
     worst_verdict,
 )
-from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
 from hapticbridge.loop_setting import fresh_share
@@ -409,7 +408,8 @@ def verdict_on(
         facts |= _joined(of_hands, recordings)
         facts["duration"] = recording.count * hands[0].run.parameters.period
         facts["unchecked"] = _unchecked(hands[0].run)
-        fault = file_fault(recording) or _hands_fault(hands)
+        fault = file_fault(recording) or first_contradiction(metadata_statements(recordings))
+        fault = fault or _hands_fault(hands)
         if fault is None:
             energies = [PassivityTally(is_watched=own["certified"] is not True) for own in of_hands]
             with comparison(hands, is_trusted=in_process) as replayed:
@@ -419,9 +419,6 @@ def verdict_on(
                     outcome = replayed()
                     facts["resimulation"] = outcome.agreement
                     fault = _replay_fault(outcome)
-        if fault is None:
-            for each in recordings:
-                requested_of(each.meta)
     except RecordingError as error:
         fault = Fault(str(error))
     gap = _gap(signature, outcome)
@@ -484,17 +481,11 @@ def _energies_of_hands(tallies: Sequence[PassivityTally]) -> dict[str, float]:
 _SHARED = ("tick", *CLOCK_FIELDS, "kinetic", "potential", "actuator_work", "external_work")
 """Fields that the records of all hands have in common."""
 
-_SHARED_META = ("period_s", "substeps", "scene_ticks", "method", "contact", "scene_sha256", "clock")
-"""Metadata that all hands have in common."""
-
 
 def _hands_fault(hands: Sequence[AuditedHand]) -> Fault | None:
     """Returns the first contradiction between the records of several hands, or None."""
     first = hands[0].recording
     for hand in hands[1:]:
-        for name in _SHARED_META:
-            if hand.recording.meta.get(name) != first.meta.get(name):
-                return Fault(f"metadata '{name}' differ between the hands", port=name)
         blocks = zip(first.blocks(), hand.recording.blocks(), strict=True)
         start = 0
         for ours, theirs in blocks:
@@ -542,10 +533,7 @@ def _fault_in_ticks(
     facts["max_net_energy"] = max(each.max_net_energy for each in energies)
     for hand, own, timing in zip(hands, of_hands, timings, strict=True):
         own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
-        stated = metadata_statements(hand.recording, hand.run)
-        fault = fault or first_contradiction(
-            chain(stated, event_statements(hand.recording, timing))
-        )
+        fault = fault or first_contradiction(event_statements(hand.recording, timing))
     return fault
 
 
@@ -647,7 +635,7 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
         coupling = RunCoupling.of(
             method,
             parameters.timestep,
-            _requested(recording),
+            requested_of(recording.meta),
             law=parameters.coupling,
             measured=parameters.effective,
             is_always_implicit=not parameters.scene_ticks
@@ -663,13 +651,6 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
         }
     except HapticBridgeError as error:  # numbers outside the theory's range
         raise RecordingError(f"the metadata are out of range: {error}") from None
-
-
-def _requested(recording: RecordingFile) -> Coupling | None:
-    try:
-        return requested_of(recording.meta)
-    except RecordingError:
-        return None  # a fault too, but what may have caused it is reported first
 
 
 def _time_facts(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import is_number, shown
+from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import DeviceError, choices
-from hapticbridge.files import read_json
 from hapticbridge.pose import Quaternion, canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -127,9 +125,6 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 """Default limits in N, N m and m/s for sheets without a figure of their own. Force and torque are
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
-
-_LATER = {"serial", "reach", "buttons", "sensed", "grip_axis"}
-"""Fields that the first recordings lack."""
 
 _NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
 _POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
@@ -298,33 +293,16 @@ class DeviceInfo:
 
     def to_json(self) -> str:
         """Returns the sheet as one JSON object: a key per attribute, null if unknown."""
-        return json.dumps(dataclasses.asdict(self), allow_nan=False)
+        return to_json(self)
 
     @classmethod
     def from_json(cls, text: str) -> DeviceInfo:
         """Returns the sheet from the text of ``to_json``.
 
         Raises:
-            DeviceError: The text is not a JSON object with these keys (those of
-                ``_LATER`` are optional), or a value is invalid.
+            DeviceError: The text is not a JSON object with these keys, or a value is invalid.
         """
-        try:
-            values = read_json(text)
-        except ValueError as error:
-            raise DeviceError(f"device data is not JSON: {error}") from None
-        if not isinstance(values, dict):
-            raise DeviceError(f"device data is not a JSON object but {values!r:.60}")
-        names = {field.name for field in dataclasses.fields(cls)}
-        if unknown := values.keys() - names:
-            raise DeviceError(
-                f"device data holds unknown keys {choices(unknown)}; valid keys: {choices(names)}"
-            )
-        if missing := names - _LATER - values.keys():
-            raise DeviceError(f"device data lacks the keys {choices(missing)}")
-        axis = values.get("grip_axis")
-        if isinstance(axis, dict) and axis.get("grip_axis") is None:
-            values["grip_axis"] = cls.from_json(json.dumps(axis))
-        return cls(**values)
+        return from_json(cls, text, "device data", DeviceError)
 
 
 class Device(Protocol):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticbridge.arguments import Arguments, is_number, shown
 from hapticbridge.coupling import Coupling
+from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import Scheme, SchemeProperties
 from hapticbridge.pose import IDENTITY_POSE
 
@@ -48,16 +46,6 @@ _NOT_NEGATIVE = (
     "energy_credit_limit",
     "stated_delay",
 )
-
-
-EARLIER_VERSION = (
-    "recorded by an earlier version of hapticbridge, whose force limits acted on the device alone; "
-    "this version cannot judge it, but 'hapticbridge export' reads it"
-)
-
-
-WITHOUT_DELAY = {"stated_delay": 0.0, "delay_margin": None}
-"""Guard of a recording from before the watch knew delays: it judged none by ``delay_margin``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,30 +148,17 @@ class GuardParameters:
                 )
 
     def to_json(self) -> str:
-        """Returns the text for a recording's metadata; infinity becomes null."""
-        values = asdict(self).items()
-        return json.dumps({k: None if v == math.inf else v for k, v in values})
+        """Returns the text for a recording's metadata."""
+        return to_json(self)
 
     @classmethod
     def from_json(cls, text: str) -> GuardParameters:
         """Reads a text that ``to_json`` wrote.
 
         Raises:
-            HapticBridgeError: The text does not name a guard, or a value is out of range.
+            RecordingError: The text does not name a guard, or a value is out of range.
         """
-        try:
-            values = dict(read_json(text))
-        except (ValueError, TypeError):
-            values = {}
-        names = {field.name for field in fields(cls)}
-        if "controller" in values and "hold_force" not in values:
-            raise HapticBridgeError(EARLIER_VERSION)
-        if values and not values.keys() & WITHOUT_DELAY.keys():
-            values |= WITHOUT_DELAY
-        if values.keys() != names:
-            raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
-        numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
-        return cls(**numbers)
+        return from_json(cls, text, "metadata 'guard'")
 
 
 def _words(name: str) -> str:
@@ -191,7 +166,7 @@ def _words(name: str) -> str:
 
 
 UNGUARDED = GuardParameters()
-"""Guard parameters of runs without a device, and of recordings older than the guard."""
+"""Guard parameters of runs without a device."""
 
 
 MAX_SUBSTEPS = 100

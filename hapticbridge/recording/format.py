@@ -5,8 +5,7 @@ A recording is an MCAP file (https://mcap.dev/spec), zstd, chunks of 128 kB:
 - The metadata record ``hapticbridge`` and the attachments come before any chunk, so that a cut file
 still has them.
 - Topic ``/tick``, encoding ``cdr``, schema ``hapticbridge/msg/Tick`` (``ros2msg``): 4 header bytes
-and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding. Files of
-earlier versions may lack ``LATER_FIELDS``.
+and one packed ``TICK_DTYPE`` record. Every field is 8 bytes wide, so CDR adds no padding.
 - Topics ``/tick_2``, ``/tick_3`` … with equal schema: the records of further hands, if several hold
 the scene. The metadata ``hands`` hold what differs from the first hand's (``further_hands``).
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
@@ -24,12 +23,13 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import read_json
-from hapticbridge.record import LATER_FIELDS, TICK_DTYPE, columns_of
+from hapticbridge.record import FORMAT, TICK_DTYPE, columns_of
 
 TICK_TOPIC = "/tick"
 EVENT_TOPIC = "/event"
@@ -53,6 +53,23 @@ def epoch_of(meta: Mapping[str, str]) -> int:
     """Returns the Unix time of a run's start in ns; 0 if the metadata lack or spoil it."""
     text = meta.get(EPOCH_KEY, "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
+
+
+FORMAT_KEY = "format"
+
+
+def refuse_format(path: Path, meta: Mapping[str, str]) -> None:
+    """Refuses a recording of another format.
+
+    Raises:
+        RecordingError: The metadata name another format, or none.
+    """
+    found = meta.get(FORMAT_KEY, "unknown")
+    if found != FORMAT:
+        raise RecordingError(
+            f"{path} has the recording format {found!r:.20}; this version of hapticbridge reads "
+            f"format '{FORMAT}': record the run again"
+        )
 
 
 HANDS_KEY = "hands"
@@ -118,14 +135,14 @@ def payload_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
     return np.dtype([("cdr", "V4"), ("record", record)])
 
 
-def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
+def tick_schema() -> bytes:
     """Returns the ROS 2 message definition of a record: a field per line, its unit as a comment."""
     units: dict[str, list[str]] = {}
-    for column in columns_of(record):
+    for column in columns_of(TICK_DTYPE):
         units.setdefault(column.field, []).append(column.unit)
     lines = []
-    for name in record.names or ():
-        field = record[name]
+    for name in TICK_DTYPE.names or ():
+        field = TICK_DTYPE[name]
         suffix = f"[{field.shape[0]}]" if field.shape else ""
         unit = ", ".join(dict.fromkeys(units[name]))
         comment = f" # {unit}" if unit != "1" else ""
@@ -133,18 +150,13 @@ def tick_schema(record: np.dtype[np.void] = TICK_DTYPE) -> bytes:
     return "".join(lines).encode()
 
 
-def record_dtype(schema: bytes) -> np.dtype[np.void] | None:
-    """Returns the record that a schema of this or an earlier version describes, or None."""
-    described = without_comments(schema)
-    present = {line.rpartition(" ")[2] for line in described}
-    lacking = [name for name in LATER_FIELDS if name not in present]
-    names = [name for name in TICK_DTYPE.names or () if name not in lacking]
-    record = np.dtype([(name, TICK_DTYPE[name]) for name in names])
-    return record if without_comments(tick_schema(record)) == described else None
+def is_tick_schema(schema: bytes) -> bool:
+    """Returns True if a schema describes ``TICK_DTYPE``."""
+    return without_comments(schema) == without_comments(tick_schema())
 
 
 def without_comments(schema: bytes) -> list[str]:
-    """Returns the lines of a schema; those of earlier versions have no units."""
+    """Returns the lines of a schema without units, which other programs may leave out."""
     lines = schema.decode(errors="replace").splitlines()
     return [line.partition("#")[0].rstrip() for line in lines]
 

@@ -53,19 +53,17 @@ class Contents:
     Attributes:
         problems: Damage, one sentence each; appended to.
         take: Called with each run of records of a hand, in order, and the hand's number.
-        record: Fields of a record; fewer than ``TICK_DTYPE`` in a file of an earlier version.
         events: Payload and JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
         seal: Entries of the seal; None before it is read.
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events, and to compare the messages for ROS 2.
-        has_messages: True if there are such messages; earlier versions wrote none.
+        has_messages: True if there are such messages.
     """
 
     problems: list[str]
     take: Take
-    record: np.dtype[np.void] = TICK_DTYPE
     events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
@@ -177,19 +175,17 @@ class Contents:
                     f"its topic {topic} has the schema '{name}', not '{layout.TICK_SCHEMA_NAME}'"
                 )
                 return
-            record = layout.record_dtype(text)
-            is_other = bool(self._hands) and record != self.record
-            if record is None or is_other or encoding != layout.TICK_ENCODING:
+            if not layout.is_tick_schema(text) or encoding != layout.TICK_ENCODING:
                 self.refusal = (
                     f"its schema {name} has other fields than this version of hapticbridge reads"
                 )
                 return
-            self.record, self._topics[channel] = record, topic
+            self._topics[channel] = topic
             self._hands[channel] = _HANDS[topic]
 
     def _add_ticks(self, data: bytes, position: int, channel: int) -> int:
         """Adds the run of records that starts here; returns its end."""
-        message = _message_dtype(self.record)
+        message = _message_dtype()
         size, count, hand = message.itemsize, 16, self._hands[channel]
         start = position
         while True:
@@ -255,8 +251,8 @@ CUTTING_EVENTS = {
 
 
 @cache
-def _message_dtype(record: np.dtype[np.void]) -> np.dtype[np.void]:
-    return np.dtype([*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(record))])  # packed
+def _message_dtype() -> np.dtype[np.void]:
+    return np.dtype([*_HEAD_DTYPE.descr, ("payload", layout.payload_dtype(TICK_DTYPE))])  # packed
 
 
 BLOCK = 1 << 14
@@ -275,7 +271,6 @@ class RecordingFile:
 
     Attributes:
         path: The file.
-        record: Fields of a record; fewer than ``TICK_DTYPE`` in a file of an earlier version.
         count: Number of records.
         last_tick: Number of the last record's tick; -1 without records.
         flags: Union of all records' flags.
@@ -293,7 +288,6 @@ class RecordingFile:
     """
 
     path: Path
-    record: np.dtype[np.void] = TICK_DTYPE
     count: int
     last_tick: int
     flags: int
@@ -371,12 +365,12 @@ class RecordingFile:
 
         for _ in _read_parts(self.path, take, keeps_events=False):
             while held >= size:
-                block, runs[:] = _split(runs, size, self.record)
+                block, runs[:] = _split(runs, size)
                 found, held = found + size, held - size
                 yield block
         if runs:
             found += held
-            yield _join(runs, self.record)
+            yield _join(runs)
         if found != self.count:
             raise RecordingError(f"the recording {self.path} was changed while it was read")
 
@@ -401,7 +395,7 @@ class Recording(RecordingFile):
             RecordingError: pandas is not installed.
         """
         pandas = import_extra("pandas", "a data frame", "tables", RecordingError)
-        columns = TableColumns(self.record, self.period)
+        columns = TableColumns(TICK_DTYPE, self.period)
         values = zip(columns.units, columns.values(self.ticks), strict=True)
         frame = pandas.DataFrame(dict(values)).set_index(SECONDS)
         frame.attrs = {"units": columns.units, "flags": FLAG_LEGEND}
@@ -420,8 +414,8 @@ def read_recording(path: str | Path, hand: int | None = None) -> Recording:
         hand: Number of a hand, from 0, whose records are read; None for a run of one hand.
 
     Raises:
-        RecordingError: The file does not exist, cannot be read, is not a recording of this or an
-            earlier version, or is of several hands and none is named.
+        RecordingError: The file does not exist, cannot be read, is not a recording of this format,
+            or is of several hands and none is named.
     """
     return read_with_attachments(Path(path), hand)[0]
 
@@ -454,7 +448,7 @@ def open_recording(path: str | Path, hand: int | None = None) -> RecordingFile:
     facts, _ = _read_through(Path(path), runs, hand, max_kept=MAX_KEPT)
     if facts["count"] > sum(run.size for run in runs):
         return RecordingFile(**facts)
-    kept = _join(runs, facts["record"])[: facts["count"]]
+    kept = _join(runs)[: facts["count"]]
     kept.flags.writeable = False
     return RecordingFile(**facts, kept=kept)
 
@@ -487,7 +481,7 @@ def read_with_attachments(
     """Reads a recording, and its attachments in file order."""
     runs: list[NDArray[np.void]] = []
     facts, attachments = _read_through(path, runs, hand)
-    ticks = _join(runs, facts["record"])[: facts["count"]]
+    ticks = _join(runs)[: facts["count"]]
     return Recording(**facts, ticks=ticks), attachments
 
 
@@ -523,6 +517,8 @@ def _read_through(
             raise RecordingError(f"{path} is not a recording that can be read: {reason}")
     elif contents.meta is None:
         contents.problems.append(f"the metadata record '{layout.METADATA_NAME}' is missing")
+    else:
+        layout.refuse_format(path, contents.meta)
     meta = contents.meta or {}
     hands = _hands_in(path, meta, hand, contents.problems)
     if any(counts[hands:]) or (not container.is_cut and len(set(counts[:hands])) > 1):
@@ -535,7 +531,6 @@ def _read_through(
         digest.add_event(payload)
     facts = {
         "path": path,
-        "record": contents.record,
         "count": min(counts[:hands]),
         "last_tick": min(last[:hands]),
         "flags": flags,
@@ -606,9 +601,9 @@ def _add_described(contents: Contents, opcode: int, fields: Fields) -> None:
         contents.problems.append(f"{kind} is damaged: {error}")
 
 
-def _join(runs: list[NDArray[np.void]], record: np.dtype[np.void] = TICK_DTYPE) -> NDArray[np.void]:
+def _join(runs: list[NDArray[np.void]]) -> NDArray[np.void]:
     """Joins runs into one array and empties the list, so that memory never holds both."""
-    gathered = np.empty(sum(run.size for run in runs), record)
+    gathered = np.empty(sum(run.size for run in runs), TICK_DTYPE)
     stop = gathered.size
     while runs:
         run = runs.pop()
@@ -618,7 +613,7 @@ def _join(runs: list[NDArray[np.void]], record: np.dtype[np.void] = TICK_DTYPE) 
 
 
 def _split(
-    runs: list[NDArray[np.void]], size: int, record: np.dtype[np.void]
+    runs: list[NDArray[np.void]], size: int
 ) -> tuple[NDArray[np.void], list[NDArray[np.void]]]:
     """Returns the first ``size`` records of runs as one array, and the remaining runs."""
     left, head = size, []
@@ -627,5 +622,5 @@ def _split(
         left -= head[-1].size
         if not left:
             rest = [run[head[-1].size :], *runs[index + 1 :]]
-            return _join(head, record), [each for each in rest if each.size]
+            return _join(head), [each for each in rest if each.size]
     raise AssertionError("fewer records than requested")

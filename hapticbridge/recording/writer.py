@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages, seal
 from hapticbridge.recording.format import Attachment
@@ -241,11 +241,10 @@ class RecordingWriter:
 
     Args:
         path: The file; it is overwritten unless ``exclusive``.
-        metadata: Names and values; ``epoch_ns`` is added.
+        metadata: Names and values; ``format`` and ``epoch_ns`` are added.
         attachments: Files to carry, with different names.
         epoch_ns: Unix time of the run's start in ns.
         exclusive: True refuses an existing file.
-        record: Fields of a record; those of an earlier version for a repair of its file.
 
     Raises:
         RecordingError: The file cannot be written, or metadata or attachments are not valid.
@@ -259,12 +258,14 @@ class RecordingWriter:
         epoch_ns: int,
         *,
         exclusive: bool = False,
-        record: np.dtype[np.void] = TICK_DTYPE,
     ) -> None:
         self.path = Path(path)
-        self._record = record
         self._epoch = int(epoch_ns)
-        meta = {**metadata, layout.EPOCH_KEY: str(self._epoch)}
+        meta = {
+            layout.FORMAT_KEY: FORMAT,
+            **metadata,
+            layout.EPOCH_KEY: str(self._epoch),
+        }
         check_contents(meta, attachments)
         self._digest = seal.Digest(meta, attachments)
         self._messages = ros_messages.Messages(self._epoch, ros_messages.axes_of(meta))
@@ -300,7 +301,7 @@ class RecordingWriter:
                 self._epoch, self._epoch, attachment.name, attachment.media_type, attachment.data
             )
         tick_schema = self._mcap.register_schema(
-            layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema(self._record)
+            layout.TICK_SCHEMA_NAME, layout.TICK_SCHEMA_ENCODING, layout.tick_schema()
         )
         first, *others = map(layout.tick_topic, range(len(self._sequences)))
         self._ticks = [self._mcap.register_channel(first, layout.TICK_ENCODING, tick_schema)]
@@ -333,7 +334,7 @@ class RecordingWriter:
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
         """
-        payloads = np.empty(rows.size, layout.payload_dtype(self._record))
+        payloads = np.empty(rows.size, layout.payload_dtype(TICK_DTYPE))
         payloads["cdr"] = np.void(layout.CDR_HEADER)
         payloads["record"] = rows
         packed, size = payloads.tobytes(), payloads.itemsize
@@ -515,7 +516,6 @@ def rewrite(
         attachments,
         layout.epoch_of(recording.meta),
         exclusive=exclusive,
-        record=recording.record,
     )
     written = 0
 

@@ -484,7 +484,7 @@ def _cause_in_scene(
     parameters = AuditedRun.of(recording).parameters
 
     def work(worker: Worker) -> object:
-        model = compile_recorded(recording, parameters).model
+        model = compile_recorded(recording).model
         worker.allow_run()
         cause = found(model)
         return cause and asdict(cause)

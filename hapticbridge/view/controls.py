@@ -32,12 +32,9 @@ from hapticbridge.commands import (
     line_of,
 )
 from hapticbridge.coupling import Coupling
-from hapticbridge.device import DeviceInfo
 from hapticbridge.device.mouse import REST, Pose, line_of_pose
 from hapticbridge.errors import CommandError
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import LoopSetting
 from hapticbridge.pose import (
     conjugate,
     product,
@@ -46,7 +43,7 @@ from hapticbridge.pose import (
     rotation_between,
 )
 from hapticbridge.rendering import RunCoupling
-from hapticbridge.run_description import method_of, parameters_of
+from hapticbridge.request import setups_of
 from hapticbridge.view.page import quoted
 from hapticbridge.view.window import HAND_INTERVAL
 
@@ -72,20 +69,8 @@ _WORDS = {
 
 
 def allowance_of(metadata: Mapping[str, str]) -> CouplingLimits:
-    """Returns the coupling limits of a run's device, from the run's metadata."""
-    parameters, method = parameters_of(metadata), method_of(metadata)
-    info, guarding = DeviceInfo.from_json(metadata["device"]), parameters.guarding
-    limits = Limits(
-        force=parameters.force_limit,
-        torque=parameters.torque_limit,
-        stretch=guarding.stretch / parameters.scale,
-        angle=guarding.angle,
-    )
-    return CouplingLimits(
-        loop=LoopSetting.of_run(info, parameters, method),
-        start=method.requested_coupling(parameters.coupling, parameters.timestep),
-        limits=limits,
-    )
+    """Returns the coupling limits of a run's first device, from the run's metadata."""
+    return setups_of(metadata)[0].coupling_limits
 
 
 class Outlet:

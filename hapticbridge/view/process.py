@@ -76,7 +76,7 @@ class LiveRun:
         self.parameters = parameters_of(run.meta)
         metas = [run.meta | own for own in further_hands(run.meta)]
         self._hands = self.parameters, *map(parameters_of, metas)
-        self.model = compile_recorded(run, *self._hands).model
+        self.model = compile_recorded(run).model
         tell_apart(self.model, *(own.grip for own in self._hands))
         grips = [own.grip for own in self._hands if not own.grip.startswith(JOINT)]
         self.scenery = Scenery.from_model(self.model, *grips)

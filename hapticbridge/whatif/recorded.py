@@ -3,61 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.clock import period_of
 from hapticbridge.device import DeviceInfo
-from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.guard import (
-    CONTROLLERS,
-    IDLE_FORCE,
-    IDLE_TORQUE,
-    Limits,
-    guard_parameters_for,
-)
+from hapticbridge.errors import RecordingError
+from hapticbridge.guard import USUAL_RAMP
+from hapticbridge.hands import GripAxis
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.pose import IDENTITY_POSE
+from hapticbridge.options import RunSetup
 from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import (
-    load_unpacked,
-    recorded_values,
-    unpack_scene,
-)
+from hapticbridge.recorded_scene import unpack_scene
 from hapticbridge.recording import Recording
-from hapticbridge.rendering import Method
-from hapticbridge.run_description import method_of, parameters_of, requested_of
-from hapticbridge.scene import Scene
+from hapticbridge.request import RunRequest, request_of, setups_of
+from hapticbridge.run_description import parameters_of
 from hapticbridge.whatif.settings import Settings
-
-# Exact inversion of a floating-point function
-
-NEIGHBOURS = 8
-"""Number of doubles tried on either side of a guess. A product and a sum are off by two at most;
-more would only cost time."""
-
-
-def invert_exactly(wanted: float, function: Callable[[float], float], guess: float) -> float:
-    """Returns the input near a guess whose computed value equals the wanted one bit for bit.
-
-    A recording holds T, not the requested rate. Recomputed from 1/T, T may differ in the last
-    digit, and the repetition would no longer be exact.
-
-    Returns:
-        The input, or the guess if no neighbour gives the value.
-    """
-    up = down = guess
-    for _ in range(NEIGHBOURS + 1):
-        for candidate in (up, down):
-            if function(candidate) == wanted:
-                return candidate
-        up, down = math.nextafter(up, math.inf), math.nextafter(down, -math.inf)
-    return guess
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,15 +31,17 @@ class RecordedRun:
 
     Attributes:
         recording: The recording with its ticks.
+        request: What was asked for, of all hands.
+        setup: The hand's setup, without its scene.
         parameters: Run parameters.
-        info: The device.
         settings: Settings that may be changed.
         scene_file: The scene's main file, unpacked from the recording.
     """
 
     recording: Recording
+    request: RunRequest
+    setup: RunSetup
     parameters: RunParameters
-    info: DeviceInfo
     settings: Settings
     scene_file: Path
 
@@ -88,30 +55,23 @@ class RecordedRun:
             RecordingError: The recording does not describe its run, or carries no scene.
         """
         scene_file = unpack_scene(hands[0], folder)
-        return tuple(cls._of_hand(recording, scene_file) for recording in hands)
-
-    @classmethod
-    def _of_hand(cls, recording: Recording, scene_file: Path) -> RecordedRun:
-        parameters = parameters_of(recording.meta)
-        method = method_of(recording.meta)
-        try:
-            info = DeviceInfo.from_json(recording.meta.get("device", ""))
-        except HapticBridgeError as error:
-            raise RecordingError(f"the metadata do not describe a run: {error}") from None
-        rate = invert_exactly(parameters.period, period_of, 1.0 / parameters.period)
-        settings = Settings(
-            coupling=requested_of(recording.meta),
-            method=method,
-            rate=rate,
-            substeps=parameters.substeps,
-            scene_rate=rate / max(parameters.scene_ticks, 1),
-            scale=parameters.scale,
-            force_scale=parameters.force_scale,
-            contact_stiffness=parameters.contact_stiffness or None,
-            scene=recorded_values(recording.meta),
-            controller=_controller(info, parameters, method),
+        request, setups = request_of(hands[0].meta), setups_of(hands[0].meta)
+        return tuple(
+            cls(
+                recording=recording,
+                request=request,
+                setup=setup,
+                parameters=parameters_of(recording.meta),
+                settings=Settings.of(request, setup),
+                scene_file=scene_file,
+            )
+            for recording, setup in zip(hands, setups, strict=True)
         )
-        return cls(recording, parameters, info, settings, scene_file)
+
+    @property
+    def info(self) -> DeviceInfo:
+        """Data sheet of the device."""
+        return self.setup.info
 
     @property
     def ticks(self) -> NDArray[np.void]:
@@ -122,40 +82,6 @@ class RecordedRun:
     def period(self) -> float:
         """T in s."""
         return self.parameters.period
-
-    @property
-    def is_absolute(self) -> bool:
-        """True if the device's poses were poses in the scene."""
-        p = self.parameters
-        return p.device_origin == p.handle_origin == IDENTITY_POSE
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of the run, times in s."""
-        p, guarding = self.parameters, self.parameters.guarding
-        return Limits(
-            force=p.force_limit,
-            torque=p.torque_limit,
-            hold_force=_requested_hold(guarding.hold_force, guarding.idle_force - IDLE_FORCE),
-            hold_torque=_requested_hold(guarding.hold_torque, guarding.idle_torque - IDLE_TORQUE),
-            ramp=p.ramp_ticks * p.period,
-            stretch=invert_exactly(
-                guarding.stretch, lambda m: m * p.scale, guarding.stretch / p.scale
-            ),
-            angle=guarding.angle,
-            energy=guarding.energy,
-            reach=guarding.reach,
-        )
-
-    @property
-    def clutch(self) -> int | None:
-        """Number of the clutch button, from 0; None without one."""
-        return _button(self.parameters.guarding.clutch)
-
-    @property
-    def dead_man(self) -> int | None:
-        """Number of the button that had to be held for any force; None without one."""
-        return _button(self.parameters.guarding.dead_man)
 
     @property
     def anchor_pose(self) -> tuple[float, ...]:
@@ -176,32 +102,59 @@ class RecordedRun:
         return str(trips[0].get("reason", "unknown")) if trips else ""
 
 
-def scene_of(hands: Sequence[RecordedRun], settings: Settings) -> Scene:
-    """Loads the scene of a run with the parameters of some settings, and a handle per hand.
+def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> RunRequest:
+    """Returns the recorded request with changed settings, one per hand, for a simulated clock.
+
+    All else stays as requested. With any change, the coupling and the method that the bridge had
+    chosen are kept. A scene's rate that was measured is kept, and so is a real device's ramp.
 
     Raises:
-        SceneError: A parameter is out of range, or the scene cannot be loaded.
+        HapticBridgeError: The changed request is refused.
     """
-    first, grips = hands[0], tuple(hand.parameters.grip for hand in hands)
-    grip = grips if len(grips) > 1 else grips[0]
-    return load_unpacked(first.scene_file, grip, settings.scene, first.recording.meta)
+    request, new, hand = hands[0].request, settings[0], 0
+    changes: dict[str, Any] = {"realtime": False, "live": False}
+    is_changed = any(own != run.settings for own, run in zip(settings, hands, strict=True))
+    if is_changed or hands[0].setup.scene_ticks:
+        changes["scene_rate"] = new.scene_rate
+    if is_changed:
+        names = "rate", "substeps", "contact_stiffness", "controller"
+        changes |= {name: getattr(new, name) for name in names}
+        changes |= {"method": new.method.name, "contact": new.method.contact}
+    grasps = []
+    for grasp in request.grasps:
+        run, own, chosen = hands[hand], settings[hand], changes
+        if len(hands) > 1:  # each has a workspace and limits of its own
+            chosen = {}
+        if own.scales != run.settings.scales:
+            chosen["workspace"] = own.scaled(run.setup.workspace)
+        if run.info.is_real and run.setup.limits.ramp is None:
+            chosen["limits"] = replace(run.setup.limits, ramp=USUAL_RAMP)
+        if is_changed:
+            grasp = replace(grasp, coupling=own.coupling)  # noqa: PLW2901
+        if len(hands) > 1:
+            grasp = replace(grasp, **chosen)  # noqa: PLW2901
+        if is_changed and grasp.grip_axis is not None:
+            axis = _changed_axis(grasp.grip_axis, hands[hand + 1], settings[hand + 1])
+            grasp = replace(grasp, grip_axis=axis)  # noqa: PLW2901
+        grasps.append(grasp)
+        hand += len(grasp.grips)
+    return replace(
+        request,
+        parameters=new.scene,
+        grasps=tuple(grasps),
+        options=replace(request.options, **changes),
+    )
 
 
-def _requested_hold(hold: float, load: float) -> float:
-    """Returns the limit that was asked for, without the tool's load, to nine decimals."""
-    return hold if hold == math.inf else round(hold - load, 9)
+def _changed_axis(axis: GripAxis, run: RecordedRun, own: Settings) -> GripAxis:
+    """Returns a grip axis with the settings of its hand.
 
-
-def _controller(info: DeviceInfo, parameters: RunParameters, method: Method) -> str | None:
-    """Returns the run's passivity controller; None if it is the bridge's default."""
-    p = parameters
-    needed = LoopSetting.of_run(info, replace(p, effective=None), method).needs()
-    limits = Limits(force=p.force_limit, torque=p.torque_limit)
-    usual = guard_parameters_for(info, limits, p.period, needed=needed, scale=p.scale)
-    if usual.controller == p.guarding.controller:
-        return None
-    return next(name for name, code in CONTROLLERS.items() if code == p.guarding.controller)
-
-
-def _button(mask: int) -> int | None:
-    return mask.bit_length() - 1 if mask else None
+    Raises:
+        RecordingError: It is to have a force scale of its own.
+    """
+    if own.force_scale != own.scale:
+        raise RecordingError(
+            f"force_scale of the grip axis at '{run.parameters.grip}' is its scale; change scale"
+        )
+    scale = math.copysign(own.scale, run.setup.workspace.rotation[0])
+    return replace(axis, coupling=own.coupling, scale=scale)

@@ -22,16 +22,18 @@ from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.commands import CHANGES as COMMANDED
 from hapticbridge.commands import coupling_in, tuning_ticks
 from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
-from hapticbridge.device.simulated.device import SimulatedDevice
+from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import trip_reason
 from hapticbridge.hands import Grasp
 from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
 from hapticbridge.loop_setting import delay_ticks
-from hapticbridge.options import Workspace
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
-from hapticbridge.whatif.recorded import RecordedRun, scene_of
+from hapticbridge.record import TickFlag
+from hapticbridge.recorded_scene import load_unpacked
+from hapticbridge.run_description import CARRIED, sample_at
+from hapticbridge.scene import Scene
+from hapticbridge.whatif.recorded import RecordedRun, changed_request
 from hapticbridge.whatif.settings import GAINS, Settings
 
 # Recorded motion as a device, and recorded times as a clock
@@ -173,9 +175,8 @@ class ResampledMotion(TrajectoryDevice):
 
 def placed(sample: NDArray[np.void], pose: tuple[float, ...]) -> NDArray[np.void]:
     """Returns a sample at a pose (7,), with the buttons of another sample."""
-    there = np.zeros(1, SAMPLE_DTYPE)
+    there = sample_at(pose)
     there["buttons"] = sample["buttons"]
-    there["position"][0], there["quaternion"][0] = pose[:3], pose[3:]
     return there
 
 
@@ -314,12 +315,14 @@ class Repetition:
 
     Attributes:
         settings: Settings of the bridge, with the coupling of the first hand.
+        request: What is asked of it.
         warned: Warnings about the scene, one sentence each.
     """
 
     def __init__(self, hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> None:
-        self._hands, self._settings = tuple(hands), tuple(settings)
-        self._run, self.settings = self._hands[0], self._settings[0]
+        self._hands, self.settings = tuple(hands), settings[0]
+        self._run = self._hands[0]
+        self.request = changed_request(hands, settings)
         self._has_several_hands = len(self._hands) > 1
         self._per_tick = 1.0
         self.warned: tuple[str, ...] = ()
@@ -345,45 +348,30 @@ class Repetition:
         self.warned = tuple(dict.fromkeys(text.removeprefix("scene '': ") for text in messages))
         return bridge.period, trip
 
+    def scene(self) -> Scene:
+        """Loads the scene with the parameters of the settings, and a handle per hand.
+
+        Raises:
+            SceneError: A parameter is out of range, or the scene cannot be loaded.
+        """
+        is_carried = self._run.recording.meta.get("tool_weight") == CARRIED
+        return load_unpacked(self._run.scene_file, self.request, is_carried=is_carried)
+
     def _bridge(self, path: Path, devices: Sequence[Device], clock: Clock) -> Bridge:
-        """Returns the changed bridge; a grip axis is a hand with a device of its own."""
-        settings = self.settings
-        common: dict[str, Any] = {
-            "rate": settings.rate,
-            "substeps": settings.substeps,
-            "scene_rate": settings.scene_rate,
-            "method": settings.method.name,
-            "contact": settings.method.contact,
-            "contact_stiffness": settings.contact_stiffness,
-            # one choice for all hands, and None for one whose default it is
-            "controller": next((s.controller for s in self._settings if s.controller), None),
-            "recording": path,
-            "clock": clock,
-        }
-        own: list[dict[str, Any]] = [
-            {
-                "workspace": Workspace(
-                    scale=each.scale,
-                    force_scale=each.force_scale,
-                    axes=hand.parameters.axes,
-                    absolute=hand.is_absolute,
-                ),
-                "limits": hand.limits,
-                "clutch": hand.clutch,
-                "dead_man": hand.dead_man,
-            }
-            for hand, each in zip(self._hands, self._settings, strict=True)
-        ]
-        scene = scene_of(self._hands, settings)
+        """Returns the changed bridge; ``devices`` has one per hand."""
+        request, own = self.request, iter(devices)
+        options: dict[str, Any] = {"clock": clock, "recording": path}
         if not self._has_several_hands:
-            return Bridge(scene, devices[0], settings.coupling, **common, **own[0])
-        grasps = [
-            Grasp(hand.parameters.grip, device, coupling=each.coupling, **chosen)
-            for hand, device, each, chosen in zip(
-                self._hands, devices, self._settings, own, strict=True
-            )
-        ]
-        return Bridge(scene, grasps, **common)
+            coupling = request.grasps[0].coupling
+            return Bridge(self.scene(), devices[0], coupling, request.options, **options)
+        grasps = []
+        for grasp in request.grasps:
+            device = next(own)
+            if grasp.grip_axis is not None:
+                axis = next(own)
+                device = GrippingDevice(device, axis, axis.info.reach)
+            grasps.append(replace(grasp, device=device))
+        return Bridge(self.scene(), grasps, None, request.options, **options)
 
     def _repeat(self, bridge: Bridge) -> None:
         due = deque(

@@ -10,7 +10,9 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.guard import CONTROLLERS
 from hapticbridge.kernel.codes import JOINT
+from hapticbridge.options import RunSetup, Workspace
 from hapticbridge.rendering import CONTACTS, Method, method_named, method_names
+from hapticbridge.request import RunRequest
 
 UNITS = {
     "stiffness": "N/m",
@@ -65,6 +67,33 @@ class Settings:
     contact_stiffness: float | None
     scene: Mapping[str, float]
     controller: str | None = None
+
+    @classmethod
+    def of(cls, request: RunRequest, setup: RunSetup) -> Settings:
+        """Returns the settings of one hand of a request."""
+        scale, force_scale = setup.workspace.scales
+        return cls(
+            coupling=setup.coupling,
+            method=setup.method,
+            rate=request.options.rate,
+            substeps=setup.substeps,
+            scene_rate=request.options.rate / max(setup.scene_ticks, 1),
+            scale=scale,
+            force_scale=force_scale,
+            contact_stiffness=setup.contact_stiffness or None,
+            scene=request.parameters,
+            controller=request.options.controller,
+        )
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Scales of motion and of force."""
+        return self.scale, self.force_scale
+
+    def scaled(self, workspace: Workspace) -> Workspace:
+        """Returns a workspace with these scales."""
+        own = None if self.force_scale == self.scale else self.force_scale
+        return replace(workspace, scale=self.scale, force_scale=own)
 
     @property
     def timestep(self) -> float:

@@ -31,7 +31,7 @@ from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import read_hands
 from hapticbridge.scene import Scene
 from hapticbridge.units import format_si
-from hapticbridge.whatif.recorded import RecordedRun, scene_of
+from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import (
     IdentifiedDevice,
     RecordedClock,
@@ -343,9 +343,9 @@ class _Experiment:
         run, path, new = self.run, self.path, settings[0]
 
         def work(worker: Worker) -> object:
-            scene = scene_of(self.hands, new)
-            worker.allow_run()
             repetition = Repetition(self.hands, settings)
+            scene = repetition.scene()
+            worker.allow_run()
             period, trip = repetition.into(path, devices_in(scene), clock)
             return period, trip, repetition.warned
 
@@ -363,12 +363,10 @@ class _Experiment:
         )
 
     def _is_scene_as_recorded(self) -> bool:
-        recording, parameters = self.run.recording, [hand.parameters for hand in self.hands]
+        recording = self.run.recording
         if self.as_recorded is None:
             self.as_recorded = bool(
-                self._in_bounds(
-                    lambda _: is_as_recorded(compile_recorded(recording, *parameters), recording)
-                )
+                self._in_bounds(lambda _: is_as_recorded(compile_recorded(recording), recording))
             )
         return self.as_recorded
 

@@ -26,8 +26,8 @@ from hapticbridge.device.transport import websocket
 from hapticbridge.device.transport.hid_descriptor import fields_of
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.kernel.parameters import GuardParameters
-from hapticbridge.recorded_scene import recorded_values
 from hapticbridge.recording import read_recording
+from hapticbridge.request import request_of
 from hapticbridge.scene import scene_parameters, settings_from
 from hapticbridge.scene.source import read_elements, refuse_outside
 from hapticbridge.view.window import Address
@@ -112,7 +112,7 @@ PARSERS: dict[str, Callable[[bytes, Path], object]] = {
     "file names": lambda data, _: refuse_outside(data, "main.xml"),
     "guard": lambda data, _: GuardParameters.from_json(text_of(data)),
     "device": lambda data, _: DeviceInfo.from_json(text_of(data)),
-    "scene values": lambda data, _: recorded_values({"scene_parameters": text_of(data)}),
+    "recorded request": lambda data, _: request_of({"request": text_of(data)}),
     "settings": lambda data, _: settings_from(text_of(data).split()),
     "changes": lambda data, _: changes_from(tuple(text_of(data).split())),
     "firmware": firmware,
