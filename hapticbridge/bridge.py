@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, Unpack
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -41,7 +42,7 @@ from hapticbridge.hands import (
 )
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
-from hapticbridge.kernel.mujoco_c import without_timers
+from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
@@ -54,6 +55,7 @@ from hapticbridge.realtime import real_time
 from hapticbridge.recording.recorder import RingObserver
 from hapticbridge.recording.seal import Signer
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.compile import clause
 from hapticbridge.session import RecordOutput, Session, StopRequest
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Ledger, Summary
@@ -230,6 +232,7 @@ class Bridge:
             stack.callback(session.note_stop)
             stack.enter_context(stopping_on_signals(self.stop_on_signal))
             stack.enter_context(without_timers())
+            stack.enter_context(quiet())  # a warning of a step is a trip
             if self.setup.is_realtime:
                 session.note_grants(stack.enter_context(real_time()))
             try:
@@ -237,6 +240,8 @@ class Bridge:
                 reason = self._loop(session, on_tick)
             except DeviceError as error:
                 reason = f"tick {session.tick}: {error}"
+            except mujoco.FatalError as error:
+                reason = f"tick {session.tick}: MuJoCo stopped: {clause(error)}"
             finally:
                 unsent = session.command_zero_force()
         if reason or unsent:

@@ -17,7 +17,16 @@ from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+from hapticbridge.kernel.codes import (
+    BACKWARDS,
+    BAD_SAMPLE,
+    GAVE_ENERGY,
+    JUMPED,
+    STRETCHED,
+    TWISTED,
+    WARNING_REMEDIES,
+    WARNINGS,
+)
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
@@ -290,7 +299,7 @@ _REASONS = {
     STRETCHED: "the tool is farther from the handle than the stretch limit",
     TWISTED: "the tool is turned from the handle by more than the angle limit",
     GAVE_ENERGY: "the hand would get more than it put in, by more than the energy limit",
-}
+} | WARNINGS
 _REMEDIES = {
     BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
     "is not 1; check the driver's read()",
@@ -299,7 +308,7 @@ _REMEDIES = {
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
     TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
     GAVE_ENERGY: "lower --stiffness",
-}
+} | WARNING_REMEDIES
 _LIMIT_MOTORS = (
     "the scene's motors did {} of work until then{}: limit their force (forcerange), or start a "
     "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
@@ -322,7 +331,8 @@ def trip_reason(code: int, tick: int, grip: str = "") -> str:
     ``code`` is a result of a function of ``kernel.tick``, not ``OK``; ``grip`` names the hand of
     several that it is about.
     """
-    return f"tick {tick}: {_hand_at(grip)}{_REASONS.get(code, _DIVERGED)}"
+    hand = "" if code in WARNINGS else _hand_at(grip)
+    return f"tick {tick}: {hand}{_REASONS.get(code, _DIVERGED)}"
 
 
 def _hand_at(grip: str) -> str:

@@ -619,6 +619,9 @@ def _block_fault(block: AuditedBlock, balance: EnergyBalance, events: RunEvents)
 def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
     if not outcome.disagrees:
         return None
+    if outcome.warning:
+        reason = f"simulated again, tick {outcome.tick} is refused: {outcome.warning}"
+        return Fault(reason, outcome.tick, outcome.field)
     return Fault(
         f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
         f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "

@@ -22,11 +22,11 @@ from hapticbridge.check.lean import (
     Lean,
     VariantVerdict,
 )
-from hapticbridge.check.observe import quiet
 from hapticbridge.check.perception import FeltError
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.plotting import new_figure
 from hapticbridge.scene import SceneSource, read_scene
 

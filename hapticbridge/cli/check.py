@@ -44,7 +44,6 @@ from hapticbridge.check.lean_output import (
     write_lean,
     write_table,
 )
-from hapticbridge.check.observe import quiet
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
@@ -52,6 +51,7 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import plain_model, read_scene, settings_from

@@ -73,7 +73,7 @@ from hapticbridge.kernel.ledger import (
     start_energies,
 )
 from hapticbridge.kernel.lossless import LOSSLESS_DTYPE, bind_lossless, note_twist, restart_lossless
-from hapticbridge.kernel.mujoco_c import MJ_DTYPE, model_addresses
+from hapticbridge.kernel.mujoco_c import MJ_DTYPE, forget_warnings, model_addresses
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
@@ -216,6 +216,7 @@ class BoundKernel:
         self.state = np.zeros(1, STATE_DTYPE) if place.state is None else place.state
         self.row = np.zeros(1, TICK_DTYPE) if place.row is None else place.row
         self._hand, self._meters_scene = place.hand, place.hand == 0 or place.state is None
+        forget_warnings(data)  # those of a start or a trial are not the run's
         # the addresses in the state point into them
         self._model, self._data, self._loop = model, data, loop
         self._grip = parameters.grip
