@@ -24,8 +24,9 @@ class HandEnergy:
 
     S is the scene's storage and S_0 that at the start, V_0 the energy of the coupling's springs at
     the start and after each reset. W_m, W_i are the works of the scene's motors and inputs, other
-    hands included, W_u that of axes without a motor; q = force_scale / scale. What exceeds the
-    right-hand side is unpaid.
+    hands included, W_u that of axes without a motor; q = force_scale / scale. What E exceeds the
+    right-hand side by is unpaid, but no more than E: what was created and stays in the scene is not
+    at the hand.
 
     Up to ``INSTANT`` may be unpaid in a certified run, because late samples may give that much.
     Nothing else needs an allowance. The inequality holds for the positions that were read, of which
@@ -77,7 +78,7 @@ class HandEnergy:
         return (
             f"the hand got {format_energy(self.unpaid)} beyond what it put in, what the device's "
             f"damping burned, and what was released: by the scene {format_energy(self.scene)}, by "
-            f"the coupling's springs since the start {format_energy(self.springs)}, by motors "
+            f"the coupling's springs {format_energy(self.springs)}, by motors "
             f"{format_energy(self.motors)}, by inputs {format_energy(self.inputs)}"
         )
 
@@ -93,7 +94,7 @@ class HandEnergy:
             origins[-1] += ", and only --energy-limit bounds what they give the hand"
         if self.springs > INSTANT:
             springs = format_energy(self.springs)
-            origins.append(f"the coupling's springs held {springs} at the start")
+            origins.append(f"the coupling's springs began with {springs}")
         if origins:
             return f"{text}: {'; '.join(origins)}"
         return f"{text} and what the device's damping burned"

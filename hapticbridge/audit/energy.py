@@ -296,8 +296,8 @@ def _hand_energies(
     totals["forgotten"] = _summed(np.where(is_reset, lost, 0.0), before["forgotten"])
     lost = np.where(is_reset, 0.0, lost) + totals["forgotten"]
     net = totals["hand_energy"] + ratio * lost
-    unpaid = totals["hand_energy"] - totals["unfelt_work"]
-    return net, unpaid + ratio * (taken - totals["start_springs"])
+    released = np.maximum(totals["start_springs"] - taken, 0.0)
+    return net, totals["hand_energy"] - totals["unfelt_work"] - ratio * released
 
 
 def _summed(values: Array, before: float) -> Array:

@@ -207,8 +207,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``guarded_energy``: result of the function of that name. If a motor in the scene
         pushes the hand, that energy counts as excess, and so does unfelt work.
-        ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) + q (Σ E + W_c − V_0), with the
-        coupling's work W_c and the springs' energy V_0.
+        ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − Σ E − W_c, 0), with
+        the springs' energy V_0 and the coupling's work W_c.
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -249,8 +249,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
     observer.net_device_energy += delivered
     observer.hand_energy += delivered - unfelt
     released = observer.springs - energy.environment_energy - energy.coupling_work
-    unpaid = observer.hand_energy - (s.run.force_scale / s.run.scale) * released
-    observer.max_unpaid_energy = max(observer.max_unpaid_energy, unpaid)
+    paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
+    observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
     observer.guarded_energy = guarded_energy(s)
     observer.max_guarded_energy = max(observer.max_guarded_energy, observer.guarded_energy)
     for i in range(6):
