@@ -40,6 +40,7 @@ from hapticbridge.certificate import (
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
+from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
 from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
@@ -48,7 +49,7 @@ from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import RunTimes, Timekeeping, motors_pushed
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
@@ -96,8 +97,7 @@ class AuditReport:
             needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
         start_potential: Potential energy before the first tick in J; its zero is arbitrary.
-        max_net_energy: Largest energy in J that the hand had got beyond what it put in and what
-            the device's damping burned; of several hands that of the one with most.
+        hand_energies: Energy that each hand got and what paid for it; empty if invalid.
         events: Number of events of each kind.
         findings: Faults of the scene of which the run warned, as sentences.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
@@ -130,7 +130,7 @@ class AuditReport:
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     start_potential: float = 0.0
-    max_net_energy: float = 0.0
+    hand_energies: tuple[HandEnergy, ...] = ()
     events: dict[str, int] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     accepts_unverified: bool = False
@@ -144,14 +144,20 @@ class AuditReport:
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
+        values["max_net_energy"] = self.max_net_energy
         if not self.hands:
             del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
 
     @property
-    def has_pushed(self) -> bool:
-        """True if motors of the scene may have given the hand energy; see ``motors_pushed``."""
-        return motors_pushed(self.energies.get("actuator_work", 0.0), self.max_net_energy)
+    def max_net_energy(self) -> float:
+        """Largest net energy to a hand in J."""
+        return max((each.net for each in self.hand_energies), default=0.0)
+
+    @property
+    def hand_energy(self) -> HandEnergy:
+        """Energy of the hand that decides (``hand_energy.worst_of``)."""
+        return worst_of(self.hand_energies or (HandEnergy(),))
 
     @property
     def exit_code(self) -> int:
@@ -232,11 +238,11 @@ class PassivityTally:
     """Energies of a recording against their bounds, collected block by block.
 
     Attributes:
-        is_watched: True if the device port is judged by its energy. A device that meets its
-            condition behind a coupling law is proven safe without it.
+        is_watched: True if the device port is judged by any excess of its energy. A device that
+            meets its condition behind a coupling law is judged by unpaid energy alone.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
-        max_net_energy: Largest net energy to the hand in J (``EnergyBalance.net_energy``).
+        hand_energy: Energy that the hand got and what paid for it.
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
         excess: First tick in which the device received excess energy, and that energy.
@@ -245,7 +251,7 @@ class PassivityTally:
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
-    max_net_energy: float = 0.0
+    hand_energy: HandEnergy = field(default_factory=HandEnergy)
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
@@ -258,13 +264,23 @@ class PassivityTally:
         allowed = balance.slack + rounding
         used = float(np.max(np.where(is_unstrict, created / allowed, 0.0)))
         self.slack_share = max(self.slack_share, used)
-        self.max_net_energy = max(self.max_net_energy, float(np.max(balance.net_energy)))
         self.unstrict = self.unstrict or _first(is_unstrict, created, start)
         self.active = self.active or _first(created > allowed, created - balance.slack, start)
         if self.is_watched:
             excess = balance.excess_device_energy
             self.excess = self.excess or _first(excess > rounding, excess, start)
+        else:
+            unpaid = balance.unpaid_energy
+            self.excess = self.excess or _first(unpaid > INSTANT, unpaid, start)
         last = ticks[-1]
+        self.hand_energy = HandEnergy(
+            net=max(self.hand_energy.net, float(np.max(balance.net_energy))),
+            unpaid=max(self.hand_energy.unpaid, float(np.max(balance.unpaid_energy))),
+            springs=balance.springs,
+            scene=balance.scene_loss,
+            motors=float(last["actuator_work"]),
+            inputs=float(last["external_work"]),
+        )
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
             "environment_energy": float(created[-1]),
@@ -434,13 +450,13 @@ def verdict_on(
     return AuditReport(**facts, **found)
 
 
-def _motor_words(work: float, net: float) -> str:
-    """Returns a clause on motors of the scene that pushed the hand; empty if none did."""
-    if not motors_pushed(work, net):
-        return ""
-    return (
-        f"the scene's motors did {format_energy(work)} of work and the hand got up to "
-        f"{format_energy(net)} beyond what it put in, which only --energy-limit bounds"
+def _hand_words(facts: Mapping[str, Any]) -> str:
+    """Returns a clause for each hand that got more than ``INSTANT``; empty without one."""
+    grips = facts.get("hands") or ("",)
+    return "; ".join(
+        f"net to the hand{f' at {grip!r}' if grip else ''} {energy.sentence}"
+        for grip, energy in zip(grips, facts["hand_energies"], strict=True)
+        if energy.net > INSTANT
     )
 
 
@@ -539,9 +555,9 @@ def _fault_in_ticks(
     fault, facts["duration"] = _check_records(hands, energies, timings)
     facts["energies"] = _energies_of_hands(energies)
     facts["start_potential"] = meta_start(hands[0].recording.meta, "start_potential")[0]
-    facts["max_net_energy"] = max(each.max_net_energy for each in energies)
-    for hand, own, timing in zip(hands, of_hands, timings, strict=True):
-        own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
+    facts["hand_energies"] = tuple(each.hand_energy for each in energies)
+    for hand, own, timing, tally in zip(hands, of_hands, timings, energies, strict=True):
+        own.update(_time_facts(hand, timing, own["certified"], tally.hand_energy))
         stated = metadata_statements(hand.recording, hand.run)
         fault = fault or first_contradiction(
             chain(stated, event_statements(hand.recording, timing))
@@ -552,11 +568,13 @@ def _fault_in_ticks(
 def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
     kept = facts.get("timekeeping")
-    doubt = "" if kept is None else kept.fault
-    if facts["certified"] is False and not (kept and kept.refutation):
-        doubt = "the device has less damping than the coupling needs"
-    pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
-    return kept.silence if kept else "", doubt, pushed, unusual_end(events), facts["unchecked"]
+    energy = worst_of(facts["hand_energies"])
+    cause = kept.refutation(energy) if kept else ""
+    doubt = kept.fault if kept else ""
+    if facts["certified"] is False and cause in ("", energy.fault):
+        doubt = cause or "the device has less damping than the coupling needs"
+    silence = kept.silence if kept else ""
+    return silence, doubt, _hand_words(facts), unusual_end(events), facts["unchecked"]
 
 
 def _check_records(
@@ -676,9 +694,10 @@ def _requested(recording: RecordingFile) -> Coupling | None:
 
 
 def _time_facts(
-    run: AuditedRun, recording: RecordingFile, timing: TimingTally, certified: bool | None
+    hand: AuditedHand, timing: TimingTally, certified: bool | None, energy: HandEnergy
 ) -> dict[str, Any]:
     """Returns the time that a run kept, and its device's verdict and margin at this time."""
+    run, recording = hand.run, hand.recording
     times = RunTimes(
         ticks=timing.ticks,
         fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
@@ -697,7 +716,7 @@ def _time_facts(
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.from_times(times, run.worst, conditions)
-    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified)}
+    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified, energy)}
     if kept.conditions:
         facts["damping_margin"] = damping_margin(kept.conditions)
     return facts

@@ -254,7 +254,7 @@ class Audit:
             remedy = trip_remedy(report.reason, work, created)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
-        page = "active-verdict" if cause is not None or report.has_pushed else "faults"
+        page = "active-verdict" if cause is not None or report.hand_energy.limit else "faults"
         out.print(f"next: hapticbridge guide {page}")
 
     def _audit_many(self, files: list[Path]) -> int:
@@ -379,7 +379,7 @@ def _print_report(report: AuditReport) -> None:
     if not report.conditions and report.verdict != "invalid":
         out.print(f"  {_without_condition(report)}")
     if kept is not None and report.conditions:
-        out.print(f"  {kept.device_words(report.certified, has_pushed=report.has_pushed)}")
+        out.print(f"  {kept.device_words(report.certified, report.hand_energy)}")
     if report.is_cut:
         mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
         hint = f"; {mend}" if CUT in report.cut else ""

@@ -78,6 +78,7 @@ from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
+    credit_springs,
     observe_reset,
 )
 from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_model
@@ -311,6 +312,7 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
+        credit_springs(s)
         if self._loop is None:
             let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
@@ -412,6 +414,7 @@ class BoundKernel:
         else:
             direct(refresh_energies, s)(s)
         start_energies(s["energy"])
+        credit_springs(s)
         if parameters.scene_ticks:
             direct(start_shown, self.state)(self.state)
         elif parameters.scheme == Scheme.MIDPOINT:
