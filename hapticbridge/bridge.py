@@ -53,7 +53,6 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import real_time
 from hapticbridge.recording.recorder import RingObserver
-from hapticbridge.recording.seal import Signer
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import clause
 from hapticbridge.session import RecordOutput, Session, StopRequest
@@ -128,10 +127,7 @@ class Bridge:
             raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
-        if options.sign is not None and path is None:
-            raise HapticBridgeError("sign needs a recording; nothing would be signed")
-        signer = None if options.sign is None else Signer.load(options.sign)
-        self.output = RecordOutput(path, observer, options.live, signer)
+        self.output = RecordOutput(path, observer, options.live)
         self.clock = clock or RealClock()
         if isinstance(self.clock, type):
             raise HapticBridgeError(

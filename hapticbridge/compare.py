@@ -322,8 +322,6 @@ def _events_named(file: RecordingFile, name: str) -> list[dict[str, Any]]:
 def _notes(file: RecordingFile) -> Iterator[str]:
     if file.cut_sentence:
         yield f"{file.path}: {file.cut_sentence}; the rest is compared"
-    if file.seal_fault:
-        yield f"{file.path}: {file.seal_fault}"
     missing = [name for name in TICK_DTYPE.names or () if name not in (file.record.names or ())]
     if missing:
         yield f"{file.path} is of an earlier version, without {', '.join(missing)}"

@@ -58,7 +58,6 @@ from hapticbridge.realtime import (
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import prepare, prepare_hands
 from hapticbridge.run_description import attachments, describe_hands, describe_run, start_state
 from hapticbridge.scene.checks import first_pump, strongest_actuator
@@ -110,13 +109,11 @@ class RecordOutput:
         path: File of the recording; None records nothing.
         observer: Second reader of the records, such as ``view.Window``; None without one.
         live: True shows the state of the run on standard error.
-        signer: Key that signs the recording when it is closed; None leaves it unsigned.
     """
 
     path: Path | None = None
     observer: RingObserver | None = None
     live: bool = False
-    signer: Signer | None = None
 
     def open_stream(
         self, period: float, snapshot: Snapshot | None, *, may_wait: bool, hands: int = 1
@@ -490,7 +487,7 @@ class Session:
     def _close_stream(self) -> None:
         """Finishes the recording, or removes it if start-up failed or a signal came before."""
         is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
-        self.stream.close(self.output.signer, is_discarded=is_discarded)
+        self.stream.close(is_discarded=is_discarded)
 
     def begin(self, duration: float | None) -> None:
         """Sets the end of a run and its event; a later run starts with a ramp of the force.

@@ -534,7 +534,7 @@ def description(recording: Recording) -> Json:
 
 
 def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yields files with something changed and signed anew, each with what was changed."""
+    """Yields files with something changed and new checksums, each with what was changed."""
     path = folder / "tampered.mcap"
     meta, events = recording.meta, recording.events
     for name in recording.ticks.dtype.names or ():

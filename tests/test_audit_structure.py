@@ -125,4 +125,4 @@ def test_a_recording_of_an_earlier_version_that_begins_in_mid_run_is_refused_in_
         assert code == (1 if command == ("audit",) else 2)
         assert "the recording begins in mid-run" in " ".join((out + err).split())
     done = export(path, "csv")
-    assert (done.recording.count, done.damage) == (len(tap.ticks), ())
+    assert (done.recording.count, done.recording.problems) == (len(tap.ticks), ())

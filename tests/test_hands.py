@@ -377,7 +377,7 @@ def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_pat
 def rewrite(
     path: Path, forged: Path, edit: Callable[[list[NDArray[np.void]]], None], **meta: str
 ) -> None:
-    """Writes a recording of two hands again, with its seal made anew."""
+    """Writes a recording of two hands again, with its checksums made anew."""
     from hapticbridge.recording import RecordingWriter
     from hapticbridge.recording.format import Attachment
     from hapticbridge.recording.reader import open_hands

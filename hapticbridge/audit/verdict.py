@@ -45,7 +45,6 @@ from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
@@ -62,7 +61,7 @@ class AuditReport:
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
-            passive, but the run was not simulated again or no trusted key signed the file.
+            passive, but the run was not simulated again.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
         certified: True if the recorded device bears the coupling and the run kept its time; None if
             its damping is unknown or its motion is prescribed.
@@ -76,10 +75,6 @@ class AuditReport:
         is_cut: True if the file lacks the end of its run, or did before a repair; the verdict is on
             the rest.
         cut: Reasons for that, as a sentence; else empty.
-        signature: Result of the signature's check, as a sentence; without a key, what only a key
-            would prove.
-        is_trusted: True if a trusted key signed exactly this file, False if not; such a run is
-            never passive. None if no trusted key was named.
         ticks: Number of records.
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
@@ -118,8 +113,6 @@ class AuditReport:
     resimulation: str = ""
     is_cut: bool = False
     cut: str = ""
-    signature: str = ""
-    is_trusted: bool | None = None
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
@@ -162,8 +155,7 @@ class AuditReport:
     @property
     def exit_code(self) -> int:
         """0 if passive (or unverified, if accepted) and not known to lack damping, else 1."""
-        is_accepted = self.accepts_unverified and self.is_trusted is not False
-        accepted = ("passive", "unverified")[: 1 + is_accepted]
+        accepted = ("passive", "unverified")[: 1 + self.accepts_unverified]
         return 0 if self.verdict in accepted and self.certified is not False else 1
 
     @property
@@ -330,8 +322,7 @@ def decide(
     Args:
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
-        gap: Clause with the reason why the run is not called passive: it was not simulated again,
-            or no trusted key signed the file. Empty without such a reason.
+        gap: Clause with the reason why the run was not simulated again; empty if it was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
     found = _decide_on_records(fault, energies, strict=strict)
@@ -382,7 +373,6 @@ def _decide_on_records(
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
 def verdict_on(
     path: str | Path,
-    trusted: Mapping[str, str] | None,
     *,
     strict: bool,
     accepts_unverified: bool,
@@ -390,21 +380,16 @@ def verdict_on(
 ) -> AuditReport:
     """Judges a recording; implements ``audit.audit``.
 
-    ``trusted`` holds the comments of trusted public keys; None checks no signature.
-
     Raises:
         RecordingError: The file is not a recording.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     recordings = open_hands(path)
     recording = recordings[0]
-    signature = check_signature(recording.seal, _unsignable(recording), trusted)
     facts: dict[str, Any] = {
         "path": recording.path,
         "is_cut": bool(recording.cut_sentence),
         "cut": recording.cut_sentence,
-        "signature": signature.sentence,
-        "is_trusted": signature.is_trusted,
         "ticks": recording.count,
         "events": _event_counts(recording),
         "findings": tuple(
@@ -440,7 +425,7 @@ def verdict_on(
                 requested_of(each.meta)
     except RecordingError as error:
         fault = Fault(str(error))
-    gap = _gap(signature, outcome)
+    gap = "" if outcome.has_run else f"the run was {outcome.agreement}; in its records alone"
     found = asdict(decide_on_hands(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
@@ -521,19 +506,6 @@ def _hands_fault(hands: Sequence[AuditedHand]) -> Fault | None:
                     return Fault(reason, start + row, name)
             start += len(ours)
     return None
-
-
-def _unsignable(recording: RecordingFile) -> str:
-    """Returns why a file cannot be what was signed; empty if it can."""
-    return recording.cut_sentence or recording.seal_fault or "; ".join(recording.problems)
-
-
-def _gap(signature: SignatureCheck, outcome: ReplayOutcome) -> str:
-    """Returns why the run is not called passive, as the beginning of a sentence, or nothing."""
-    reasons = [signature.sentence] if signature.is_trusted is False else []
-    if not outcome.has_run:
-        return "; ".join([*reasons, f"the run was {outcome.agreement}; in its records alone"])
-    return f"{reasons[0]}; apart from that" if reasons else ""
 
 
 def _fault_in_ticks(
