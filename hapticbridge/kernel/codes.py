@@ -186,7 +186,7 @@ WARNINGS = {
 }
 """Reasons in words, by result."""
 
-_MORE_MEMORY = 'give it more in the scene, such as <size memory="100M"/>'
+_MORE_MEMORY = 'give MuJoCo more memory in the scene, such as <size memory="100M"/>'
 WARNING_REMEDIES = {
     CONTACTS_FULL: _MORE_MEMORY,
     CONSTRAINTS_FULL: _MORE_MEMORY,

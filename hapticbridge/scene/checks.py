@@ -10,14 +10,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import (
-    COUPLING_ACTUATORS,
-    WARNINGS,
-    added_actuators,
-    held_body,
-    warning_words,
-)
-from hapticbridge.kernel.mujoco_c import warning_of
+from hapticbridge.kernel.codes import COUPLING_ACTUATORS, added_actuators, held_body
 from hapticbridge.scene.source import SourceFile, read_elements
 
 # Requirements of the rendering methods for comparison on a scene
@@ -389,16 +382,10 @@ off by more than the 1e-9 N that the audit takes for tampering."""
 
 
 def check_start(data: mujoco.MjData, grip: str) -> None:
-    """Refuses a start that is not finite or MuJoCo warns of, and a tool beyond ``FARTHEST``.
+    """Raises SceneError for a start that is not finite, or a tool beyond ``FARTHEST``.
 
     ``data`` must be at the start, after ``mj_forward``.
-
-    Raises:
-        SceneError: The message names what is wrong, and the remedy.
     """
-    code = warning_of(data)
-    if code in WARNINGS:
-        raise SceneError(f"at the scene's start {warning_words(code)}")
     for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qacc"):
         if not np.all(np.abs(getattr(data, name)) <= mujoco.mjMAXVAL):
             raise SceneError(

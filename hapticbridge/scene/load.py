@@ -14,7 +14,6 @@ import mujoco
 
 from hapticbridge.arguments import shown
 from hapticbridge.errors import SceneError, choices, nearest
-from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene.checks import (
     check_model,
     check_numbers,
@@ -296,8 +295,7 @@ def compile_scene(
             path, grips[0], model, data, source.sources, values, changes, as_is, _spec=spec
         )
         scene.other_grips = grips[1:]
-        with quiet():
-            scene.reset()
+        scene.reset()
         for each in dict.fromkeys(grips):
             scene.changes += limit_motors_alone(model, scene.data, each, as_is=as_is)
     if checks_start:
