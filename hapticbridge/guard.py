@@ -315,6 +315,11 @@ _LIMIT_MOTORS = (
     "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
     "may get"
 )
+_LIMIT_INPUTS = (
+    "the scene's inputs (applied forces, moved mocap bodies, gravity compensation) did {} of work "
+    "until then: make them smaller or slower; if they are meant to push the hand, --energy-limit "
+    "is what it may get"
+)
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
     "'hapticbridge audit RECORDING' names the likely cause"
@@ -339,7 +344,13 @@ def _hand_at(grip: str) -> str:
     return f"hand at '{grip}': " if grip else ""
 
 
-def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest: str = "") -> str:
+def trip_remedy(
+    reason: str,
+    motor_work: float,
+    created: float = 0.0,
+    strongest: str = "",
+    input_work: float = 0.0,
+) -> str:
     """Returns the remedy for a trip, for the message to the user; empty if none is known.
 
     Exception and recording keep the bare reason, because it is compared when the run is repeated.
@@ -349,6 +360,7 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest:
         motor_work: Work of the scene's own motors until then in J, which may be the cause.
         created: Energy in J that the scene had created until then, which may be the cause.
         strongest: Name of the actuator that pushes most, or empty.
+        input_work: Work of the scene's inputs until then in J, which may be the cause.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
@@ -358,6 +370,8 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest:
                 return _LIMIT_MOTORS.format(
                     format_energy(motor_work), f" ('{strongest}' pushes most)" * bool(strongest)
                 )
+            if code == GAVE_ENERGY and input_work > 0.5 * USUAL_ENERGY:
+                return _LIMIT_INPUTS.format(format_energy(input_work))
             return remedy
     return ""
 

@@ -632,15 +632,15 @@ class Session:
         self.event("trip", reason=reason)
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
         trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
-        work, created = (
+        work, inputs, created = (
             float(trip.records[name][-1]) if len(trip.records) else 0.0
-            for name in ("actuator_work", "environment_energy")
+            for name in ("actuator_work", "external_work", "environment_energy")
         )
         model, data = self.setup.scene.model, self.setup.scene.data
         pump = first_pump(model) if may_be_pumped(reason) else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
-        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data)):
+        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data), inputs):
             trip.add_note(remedy)
         return trip
 

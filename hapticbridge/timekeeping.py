@@ -230,8 +230,8 @@ class Timekeeping:
     def certified(self, verdict: bool | None, energy: HandEnergy) -> bool | None:
         """Returns a verdict on the device, False if the run was not as it assumes."""
         is_refuted = self.is_kept is False or self.watch
-        is_refuted = is_refuted or (verdict and (self.has_tripped or energy.fault))
-        return False if is_refuted else verdict
+        is_spoiled = verdict and (self.has_tripped or energy.fault)
+        return False if is_refuted or is_spoiled else verdict
 
     def device_words(self, verdict: bool | None, energy: HandEnergy) -> str:
         """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""

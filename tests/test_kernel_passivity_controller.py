@@ -138,7 +138,10 @@ def test_what_the_environment_creates_beyond_the_slack_is_kept_from_a_certified_
     tmp_path: Path,
 ) -> None:
     without = shaken(tmp_path, "off")
-    assert without.report.certified
+    margin = without.report.damping_margin
+    assert margin is not None
+    assert margin > 0.0  # the device bears the coupling
+    assert without.report.certified is False  # but not the energy that the scene created
     assert without.report.environment == "active"
     assert without.energy > 1e-3
     with_it = shaken(tmp_path, None)

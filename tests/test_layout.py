@@ -16,7 +16,7 @@ PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
     ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
-    ("arguments", "clock", "confinement", "coupling", "files", "pose"),
+    ("arguments", "clock", "confinement", "coupling", "files", "hand_energy", "pose"),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),
     ("scene", "inputs"),

@@ -244,7 +244,8 @@ class Audit:
             remedy = cause.remedy
         else:
             created = report.energies.get("environment_energy", 0.0)
-            remedy = trip_remedy(report.reason, work, created)
+            inputs = report.energies.get("external_work", 0.0)
+            remedy = trip_remedy(report.reason, work, created, input_work=inputs)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
         page = "active-verdict" if cause is not None or report.hand_energy.limit else "faults"

@@ -93,7 +93,7 @@ def sentences(run: WhatIfRun) -> Iterator[str]:
         yield f"tripped: {run.trip}"
     kept = run.report.timekeeping
     if run.report.certified is False and kept is not None:
-        yield kept.device_words(False)
+        yield kept.device_words(verdict=False, energy=run.report.hand_energy)
 
 
 def _certified(run: WhatIfRun) -> str:
