@@ -154,7 +154,7 @@ def test_a_chunk_that_is_lost_doubled_or_moved_is_found(
     assert len(parts.chunks) >= 5
     change(parts)
     path = parts.write(tmp_path / "forged.mcap")
-    assert read_recording(path).problems == ()
+    assert not any("checksum" in problem for problem in read_recording(path).problems)
     report = audit(path)
     assert report.verdict == verdict, report.reason
 

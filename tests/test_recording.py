@@ -482,6 +482,17 @@ def test_no_damage_gives_more_than_a_recording_or_error(whole: Path, data: st.Da
     assert recording.is_cut or recording.problems
 
 
+def test_no_byte_of_the_marks_at_the_end_changes_unseen(whole: Path, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    mark = content.rindex(b"\x0f" + struct.pack("<Q", 4))  # the end of the data section
+    for position in (*range(mark, mark + 13), *range(len(content) - 37, len(content))):
+        for bit in (1, 128):
+            damaged = bytearray(content)
+            damaged[position] ^= bit
+            recording = changed(tmp_path / "run.mcap", damaged)
+            assert recording.is_cut or recording.problems, (position - mark, bit)
+
+
 @given(content=st.binary(max_size=300))
 def test_arbitrary_bytes_behind_the_magic_never_crash(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as name:
