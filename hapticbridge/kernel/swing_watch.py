@@ -144,6 +144,11 @@ STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
 
+SLAM, PURE = 0.3, 0.9
+"""Least RMS value of a fast swing of the wrench as a share of the limit, and least Σ W² as a share
+of that above ``SLOWEST``; no unit. A swing of 25 Hz has the share 0.9, and a hand that shakes at 11
+Hz against the limit 0.2."""
+
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
 ms is late by 30 ms on average; with three lags instead of six it is found a throw later."""
@@ -217,6 +222,7 @@ WATCH_DTYPE = np.dtype(
         ("fast_speed", "<f8", 6),
         ("mean_wrench", "<f8", 3),
         ("change", "<f8", 3),
+        ("swing_square", "<f8", 2),
         ("wrench_square", "<f8", 2),
         ("speed_square", "<f8", 2),
         ("change_square", "<f8", 2),
@@ -232,7 +238,7 @@ WATCH_DTYPE = np.dtype(
         ("gained", "<f8", 2),
         ("still", "<i8", 2),
         ("steps", "<f8", 2),
-        ("counts", "<i8", 10),
+        ("counts", "<i8", 12),
         ("stray", "<f8", 6),
         ("step", "<f8", 6),
         ("stood", "<i8", 2),
@@ -489,7 +495,8 @@ def _add_block(s: State, kind: int) -> None:
         watch.delayed[len(LAGS) * kind + d] *= kept_work
     watch.believed[kind] *= kept_work
     watch.steps[kind] *= kept_work
-    wrench_square = speed_square = change_square = whole_square = power = along = 0.0
+    swing_square = wrench_square = speed_square = change_square = 0.0
+    whole_square = power = along = 0.0
     for i in range(3):
         at = first + i
         wrench, moved = watch.wrench[at] / watch.ticks, whole * watch.motion[at]
@@ -504,6 +511,7 @@ def _add_block(s: State, kind: int) -> None:
         slow_wrench = _without_slow(watch, at, wrench)
         motion = _without_slow(watch, 6 + at, moved)
         ring[6 * (watch.blocks % RING) + at] = slow_wrench
+        swing_square += slow_wrench * slow_wrench
         burnt += b * motion * motion / block
         watch.believed[kind] += slow_wrench * motion
         for d in range(len(LAGS)):
@@ -521,6 +529,7 @@ def _add_block(s: State, kind: int) -> None:
         along += mean * answer
     for d in range(len(LAGS)):
         watch.delayed[len(LAGS) * kind + d] -= burnt
+    watch.swing_square[kind] = kept * watch.swing_square[kind] + block * swing_square
     watch.wrench_square[kind] = kept * watch.wrench_square[kind] + block * wrench_square
     watch.speed_square[kind] = kept * watch.speed_square[kind] + block * speed_square
     watch.change_square[kind] = kept * watch.change_square[kind] + block * change_square
@@ -570,7 +579,7 @@ def _late_answer(watch: Part, kind: int, least: float) -> float:
 @compiled
 def _verdict(s: State, kind: int) -> int:
     """Returns ``RUNS_AWAY`` or ``SWINGING`` for a finding, ``PROBED`` for a suspicion, else 0."""
-    watch, counts, at = s.watch, s.watch.counts, 5 * kind
+    watch, counts, at = s.watch, s.watch.counts, 6 * kind
     late = 0.0
     for d in range(len(LAGS)):
         late = max(late, watch.delayed[len(LAGS) * kind + d])
@@ -606,11 +615,15 @@ def _verdict(s: State, kind: int) -> int:
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
+    slam = FAST_MEMORY * (SLAM * watch.limits[kind] * watch.cap) ** 2
+    is_slammed = wrench >= max(slam, PURE * watch.swing_square[kind]) and slam > 0.0
+    counts[at + 5] = counts[at + 5] + 1 if is_slammed else 0
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
     is_coarse = watch.steps[kind] >= STEPS
     is_found = max(counts[at], counts[at + 3]) >= BLOCKS or counts[at + 4] >= DELAY_BLOCKS
+    is_found = is_found or counts[at + 5] >= watch.ring_blocks
     if is_coarse or is_found or (has_swung and is_working):
         return SWINGING
     is_suspicious = late >= MUCH * enough or watch.gained[kind] >= watch.gain[kind]
