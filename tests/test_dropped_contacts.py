@@ -15,7 +15,7 @@ from cli_cases import Called, one_sentence
 import hapticbridge as hb
 from hapticbridge.audit import audit
 from hapticbridge.errors import SafetyTrip, SceneError
-from hapticbridge.kernel import state
+from hapticbridge.kernel import mujoco_c, state
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
 
@@ -177,7 +177,7 @@ def test_a_recording_that_hides_a_warning_is_invalid(
 ) -> None:
     """The run is made by a bridge that does not look at MuJoCo's warnings."""
     calm, path = np.zeros(2 * len(mujoco.mjtWarning.__members__), np.int32), file_decides / "r.mcap"
-    found = state.model_addresses
+    found = mujoco_c.model_addresses
 
     def blind(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
         values, owned = found(model, data)
