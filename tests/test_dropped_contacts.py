@@ -14,8 +14,12 @@ from cli_cases import Called, one_sentence
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
+from hapticbridge.audit.events import AuditedRun
+from hapticbridge.audit.replay import AuditedHand, comparison
+from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import SafetyTrip, SceneError
-from hapticbridge.kernel import mujoco_c, state
+from hapticbridge.kernel.mujoco_c import model_addresses
+from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
 from hapticbridge.scene import load_scene
 
@@ -177,14 +181,13 @@ def test_a_recording_that_hides_a_warning_is_invalid(
 ) -> None:
     """The run is made by a bridge that does not look at MuJoCo's warnings."""
     calm, path = np.zeros(2 * len(mujoco.mjtWarning.__members__), np.int32), file_decides / "r.mcap"
-    found = mujoco_c.model_addresses
 
     def blind(model: mujoco.MjModel, data: mujoco.MjData) -> Any:
-        values, owned = found(model, data)
+        values, owned = model_addresses(model, data)
         return values | {"warnings": calm.ctypes.data}, owned
 
     with monkeypatch.context() as patch:
-        patch.setattr(state, "model_addresses", blind)
+        patch.setattr("hapticbridge.kernel.state.model_addresses", blind)
         run(plate(file_decides, NO_CONTACTS), path)
     assert len(read_recording(path).ticks) == 200  # the plate went through
     report = audit(path)
@@ -200,6 +203,38 @@ def test_a_trip_whose_event_was_removed_is_not_passive(file_decides: Path) -> No
         run(plate(file_decides, NO_CONTACTS), path)
     honest = read_recording(path)
     rewritten(honest, forged, events=[e for e in honest.events if e["event"] != "trip"])
+    assert audit(forged).verdict == "invalid"
+
+
+def test_mujocos_stop_in_a_longer_recording_is_named(
+    file_decides: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The forger goes on after the tick in which MuJoCo stopped, and hides the trip."""
+    scene, path, forged = (file_decides / name for name in ("row.xml", "r.mcap", "forged.mcap"))
+    scene.write_text(ROW.format(' memory="14K"'))
+    with pytest.raises(SafetyTrip, match="stack overflow"):
+        run(scene, path)
+    honest = read_recording(path)
+    count = len(honest.ticks)
+    more = np.repeat(honest.ticks[-1:], 9)
+    more["tick"] += 1 + np.arange(9)
+    for name in CLOCK_FIELDS:
+        more[name] += 1_000_000 * (1 + np.arange(9))
+    for name in ("device_position", "handle_position"):
+        more[name][:, 2] -= 4e-5 * (1 + np.arange(9))
+    events = [e | {"tick": count + 9} for e in honest.events if e["event"] == "stop"]
+    events = [e for e in honest.events if e["event"] not in ("trip", "stop")] + [
+        e | {"reason": "duration"} for e in events
+    ]
+    rewritten(honest, forged, ticks=np.concatenate([honest.ticks, more]), events=events)
+    recording = read_recording(forged)
+    hand = AuditedHand(recording, AuditedRun.of(recording))
+    with (
+        comparison([hand]) as outcome,
+        pytest.raises(ForeignSceneError, match=r"made MuJoCo fail: mj_stack.*stack overflow"),
+    ):
+        outcome()
+    assert not capfd.readouterr().err
     assert audit(forged).verdict == "invalid"
 
 
