@@ -11,6 +11,7 @@ from typing import Literal
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.loop_setting import (
     IN_TIME,
@@ -24,6 +25,7 @@ from hapticbridge.loop_setting import (
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
+    midpoint_damping,
     stiffest_coupling,
     stiffest_late_coupling,
 )
@@ -464,7 +466,25 @@ def run_conditions(
     """
     if info.is_prescribed or not method.has_coupling:
         return ()
-    return conditions_of(LoopSetting.of_run(info, parameters, method))
+    conditions = conditions_of(LoopSetting.of_run(info, parameters, method))
+    guard, ratio = parameters.guarding, parameters.force_scale / parameters.scale
+    is_whole = method.scheme == Scheme.MIDPOINT and guard.has_hand and not parameters.scene_ticks
+    if not (is_whole and info.turns and guard.twist_damping == math.inf):
+        return conditions
+    law, period, twist = parameters.coupling, parameters.period, min(guard.angle, math.pi)
+    needed = ratio * midpoint_damping(
+        law.rotational_stiffness, law.rotational_damping, period, twist
+    )
+    return tuple(
+        replace(each, needed=max(needed, each.needed), remedy=each.remedy or _EARLIER)
+        if each.axis == "rotation"
+        else each
+        for each in conditions
+    )
+
+
+_EARLIER = "an earlier version had a lossless torque at any twist: record the run again"
+"""Remedy for a recording whose lossless coupling did not yield to a large twist."""
 
 
 def condition_sentences(

@@ -30,6 +30,7 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
+from hapticbridge.loop_setting import IN_TIME, Lag
 from hapticbridge.units import format_energy
 
 # Limits of the wrench and of the run
@@ -439,6 +440,14 @@ def button_mask(button: int | None, what: str) -> int:
     return 1 << button
 
 
+def _twist_damping(info: DeviceInfo, period: float) -> float:
+    """Returns ``GuardParameters.twist_damping`` of a device with a hand."""
+    if not info.turns:
+        return math.inf
+    is_in_time = Lag.of(info, period) == IN_TIME
+    return (info.rotational_damping or 0.0) if is_in_time else 0.0
+
+
 def guard_parameters_for(
     info: DeviceInfo,
     limits: Limits,
@@ -507,6 +516,7 @@ def guard_parameters_for(
         energy=limits.energy,
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
+        twist_damping=_twist_damping(info, period),
         stated_delay=info.delay or 0.0,
         delay_margin=DELAY_MARGINS[info.delay is not None],
     )

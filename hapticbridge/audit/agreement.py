@@ -115,6 +115,8 @@ def _guard_statements(run: AuditedRun) -> Iterator[Statement]:
     source = "data sheet, coupling and limits"
     knows_delays = (guard.stated_delay, guard.delay_margin) != (0.0, math.inf)
     chosen = _CHOSEN if knows_delays else (*_CHOSEN, *WITHOUT_DELAY)
+    if guard.twist_damping == math.inf:  # of an earlier version, which the certificate counts
+        chosen = (*chosen, "twist_damping")
     free = {name: getattr(guard, name) for name in chosen}
     for name, value in asdict(replace(derived, **free)).items():
         yield Statement(f"guard parameter '{name}'", getattr(guard, name), value, source)

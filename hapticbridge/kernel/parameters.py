@@ -96,6 +96,9 @@ class GuardParameters:
         swing_energy: Energy in J that a late force would give within 0.3 s, at a limit of 10 N or
             0.5 N m, above which the watch suspects the device (``kernel.swing_watch``).
         runaway_speed: Speed in m/s gained against a limit of 10 N above which it does.
+        twist_damping: Damping in N m s/rad that pays for a torque across the motion
+            (``kernel.law.torque_across``); 0 if the device's is unknown or it answers late, inf if
+            no torque acts on a hand.
         stated_delay: Delay in s that the device states; 0 without a statement.
         delay_margin: Time in s by which a delay must exceed the stated one to be a finding.
 
@@ -128,6 +131,7 @@ class GuardParameters:
     idle_torque: float = math.inf
     swing_energy: float = math.inf
     runaway_speed: float = math.inf
+    twist_damping: float = math.inf
     stated_delay: float = 0.0
     delay_margin: float = math.inf
 
@@ -140,6 +144,10 @@ class GuardParameters:
                 raise HapticBridgeError(
                     f"guard: {_words(name)} is {value!r}; it must be finite and >= 0"
                 )
+        if not is_number(self.twist_damping) or not self.twist_damping >= 0:
+            raise HapticBridgeError(
+                f"guard: twist damping is {self.twist_damping!r}; it must be >= 0"
+            )
         for name in (*_POSITIVE, *_TRIPS):
             value = getattr(self, name)
             if not is_number(value) or not value > 0:
@@ -180,6 +188,8 @@ class GuardParameters:
             raise HapticBridgeError(EARLIER_VERSION)
         if values and not values.keys() & WITHOUT_DELAY.keys():
             values |= WITHOUT_DELAY
+        if values:  # without it, a recording has the whole torque at any twist
+            values.setdefault("twist_damping", None)
         if values.keys() != names:
             raise HapticBridgeError(f"metadata 'guard' is {text!r:.80}; it does not name a guard")
         numbers: dict[str, Any] = {k: math.inf if v is None else v for k, v in values.items()}
