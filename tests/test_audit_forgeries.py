@@ -226,7 +226,7 @@ def other_sheet(recording: Recording, **values: Any) -> Parts:
     old = json.loads(recording.meta["guard"])
     limits = Limits(force=10.0, torque=0.5)
     new = guard_parameters_for(info, limits, float(recording.meta["period_s"]), controller="off")
-    names = ("assumed_damping", "assumed_rotational_damping", "max_damping")
+    names = ("assumed_damping", "assumed_rotational_damping", "max_damping", "twist_damping")
     changed = {name: getattr(new, name) for name in (*names, "max_rotational_damping")}
     return {"meta": {"device": json.dumps(sheet), "guard": json.dumps(old | changed)}}
 
@@ -346,7 +346,7 @@ FORGERIES: dict[str, Forgery] = {
             *("controller", "assumed_damping", "assumed_rotational_damping", "max_damping"),
             *("max_rotational_damping", "energy_credit_limit", "stale_ticks", "fade_ticks"),
             *("has_hand", "dead_man", "speed", "turn_speed", "full_speed", "motors"),
-            *("swing_energy", "runaway_speed"),
+            *("swing_energy", "runaway_speed", "twist_damping"),
         )
     },
     "guard: delay margin": seen(hand, entry("guard", delay_margin=1.0)),

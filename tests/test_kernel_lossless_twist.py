@@ -176,7 +176,7 @@ def circled(
     sample: NDArray[np.void],
     row: NDArray[np.void],
     path: tuple[float, float, float, float],
-    b_r: float,
+    device: tuple[float, float],
     dampings: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Leads the device in a circle across its twist, each tick about one axis.
@@ -184,13 +184,13 @@ def circled(
     Args:
         state, sample, row: Of the bound kernel.
         path: Twist and radius in rad, angle of the circle per tick in rad, share of axis 2.
-        b_r: Damping of the device in N m s/rad.
+        device: Damping in N m s/rad, and periods by which every second sample is late.
         dampings: What may pay for the midpoint torque in each tick; below 0 as bound.
 
     Returns:
         As the second result of ``hold``, and the energy in J that went to and fro.
     """
-    twist, radius, angle, share = path
+    (twist, radius, angle, share), (b_r, late) = path, device
     at = (math.cos(0.5 * twist), math.sin(0.5 * twist), 0.0, 0.0)
     net, through, start, most, torque, last = 0.0, 0.0, 0.0, -np.inf, np.zeros(3), at
     for k in range(dampings.size):
@@ -199,24 +199,28 @@ def circled(
         size = radius * min(k / 50.0, 1.0)
         turn = (0.0, size * math.cos(angle * k), share * size * math.sin(angle * k))
         pose = product(quaternion_exp(turn), at)
+        elapsed = T * (1.0 + late * (k % 2))
         step = rotation_between(last, pose)
-        work = dot(vector_of(torque), step) - b_r / T * dot(step, step)
+        work = dot(vector_of(torque), step) - b_r / elapsed * dot(step, step)
         net, through, last = net + work, through + abs(work), pose
         store_quaternion(sample[0].quaternion, pose)
-        if not whole_tick(state, sample, row, T):
+        if not whole_tick(state, sample, row, elapsed):
             return np.inf, through
         if k == 1:
             net, start = 0.0, stored(state, row)
-        most = max(most, net + stored(state, row) - start) if k > 0 else most
+        owed = state[0].coupling.owed[1]
+        most = max(most, net + stored(state, row) - start - owed) if k > 0 else most
         store_vector(torque, vector_of(row[0].wrench_on_device[3:6]))
     return most, through
 
 
-def wobble(seed: int, *, is_whole: bool = False, is_random: bool = False) -> tuple[float, float]:
+def wobble(
+    seed: int, *, is_whole: bool = False, is_random: bool = False, late: float = 0.0
+) -> tuple[float, float]:
     """Circles at random about 0.1 to 2.8 rad; the device has just the damping that is needed.
 
     The tool turns on a spring or not at all. ``is_whole`` takes the midpoint torque at any twist;
-    ``is_random`` takes another share of it in each tick.
+    ``is_random`` takes another share of it in each tick; samples are ``late`` periods in turn.
     """
     rng = np.random.default_rng(seed)
     stiffness, twist = 10 ** rng.uniform(-1.3, 0.7), rng.uniform(0.1, 2.8)
@@ -240,14 +244,14 @@ def wobble(seed: int, *, is_whole: bool = False, is_random: bool = False) -> tup
         rng.uniform(-np.pi, np.pi),
         float(rng.choice([1.0, 0.6])),
     )
-    return circled(kernel.state, sample, kernel.row, path, b_r, dampings)
+    return circled(kernel.state, sample, kernel.row, path, (b_r, late), dampings)
 
 
-@pytest.mark.parametrize("is_random", [False, True])
-def test_circling_about_a_twist_gains_nothing(is_random: bool) -> None:
-    """With a share that changes in each tick too, however it changes."""
+@pytest.mark.parametrize(("is_random", "late"), [(False, 0.0), (True, 0.0), (False, 0.3)])
+def test_circling_about_a_twist_gains_nothing(is_random: bool, late: float) -> None:
+    """With a share that changes in each tick too, however it changes, and with late samples."""
     for seed in SEEDS:
-        gained, through = wobble(seed, is_random=is_random)
+        gained, through = wobble(seed, is_random=is_random, late=late)
         assert gained < 1e-13 + 1e-9 * through, seed
 
 
@@ -267,7 +271,9 @@ def test_up_to_the_twist_that_is_paid_for_the_torque_is_the_midpoint_one_to_the_
     for pays in (None, math.inf, 0.0):
         kernel = twisted(load(TOOL.format(spring=1.0, inertia=1e-5)), law, twist, b_r, pays)
         sample = np.zeros(1, SAMPLE_DTYPE)
-        circled(kernel.state, sample, kernel.row, (twist, 0.1, 0.3, 0.5), b_r, np.full(300, -1.0))
+        circled(
+            kernel.state, sample, kernel.row, (twist, 0.1, 0.3, 0.5), (b_r, 0.0), np.full(300, -1.0)
+        )
         found.append(kernel.row.tobytes())
     assert found[0] == found[1] != found[2]
 
