@@ -18,9 +18,12 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import AuditedHand, comparison
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import SafetyTrip, SceneError
-from hapticbridge.kernel.mujoco_c import model_addresses
+from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.mujoco_c import model_addresses, warning_of
+from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import read_recording
+from hapticbridge.rendering import METHODS, unguarded_parameters
 from hapticbridge.scene import load_scene
 
 PLATE = """<mujoco>
@@ -266,11 +269,13 @@ def test_every_warning_of_mujoco_trips(kind: str) -> None:
     assert not device.writes[-1].any()
 
 
-def test_warnings_before_a_run_do_not_end_it() -> None:
-    scene = load_scene("point_mass")
-    for warning in scene.data.warning:
-        warning.number = 1
-    run(scene)
+def test_warnings_of_a_trial_do_not_end_the_run_after_it() -> None:
+    scene, method = load_scene("point_mass"), METHODS["implicit"]
+    parameters = unguarded_parameters(scene, COUPLING, 1e-3, 1, method)
+    scene.data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number = 1
+    kernel = BoundKernel(scene.model, scene.data, parameters)
+    assert warning_of(scene.data) == OK
+    kernel.release()
 
 
 # MuJoCo stops
