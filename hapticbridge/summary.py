@@ -214,12 +214,12 @@ class Summary:
         coupling: Requested, law and effective coupling. For a weld the effective one is that of its
             stiffest axes, measured at the start.
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
-            coupling law the device port is not metered during the run. A certified device needs no
-            metering; for any other the audit of the recording decides.
+            coupling law the device port has no fault here: unpaid energy to the hand refutes the
+            certificate, and the audit of the recording decides.
         conditions: Device conditions, as sentences.
         is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation, the run kept its time, and the force did not swing as a late
-            one does. None if its damping is unknown, or
+            translation and rotation, the run kept its time, the force did not swing as a late one
+            does, and the hand got no unpaid energy. None if its damping is unknown, or
             if no coupling law makes the condition sufficient.
         timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
