@@ -32,7 +32,7 @@ from hapticbridge.errors import (
     SceneError,
     choices,
 )
-from hapticbridge.guard import Limits, trip_reason
+from hapticbridge.guard import Limits, is_unsound, trip_reason
 from hapticbridge.hands import (
     DeviceGroup,
     Grasp,
@@ -238,6 +238,7 @@ class Bridge:
                 reason = f"tick {session.tick}: {error}"
             except mujoco.FatalError as error:
                 reason = f"tick {session.tick}: MuJoCo stopped: {clause(error)}"
+                session.is_unsound = True
             finally:
                 unsent = session.command_zero_force()
         if reason or unsent:
@@ -293,7 +294,7 @@ class Bridge:
             while code == RING_FULL and stream.makes_room(is_stopping=bool(stops)):
                 code = kernel.publish_again(deadline, wake, read, write, flags)
             if code == BAD_RESULT:
-                return trip_reason(code, session.tick)
+                return self._reason_with_hand(code, session.tick)
             session.tick += 1
         return ""
 
@@ -301,6 +302,7 @@ class Bridge:
         """Describes why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
         grip = self.setups[hand].scene.grip if self.setup.scene.has_several_hands else ""
+        self.session.is_unsound = is_unsound(code)
         return trip_reason(code, tick, grip)
 
     def stop(self, by: str = "caller") -> None:

@@ -135,6 +135,8 @@ class StepCondition:
         available: Coulomb friction f_c in N; None if unknown.
         resolution: Step Δ of the position in m; None if unknown.
         remedy: Changes with which it holds with 15 % in reserve; empty if it holds.
+        is_late: True for a device that answers late, or gives a sample in some ticks only. Its
+            steps are not judged, because the condition is not derived for it.
 
     References:
         Abbott & Okamura 2005.
@@ -144,6 +146,7 @@ class StepCondition:
     available: float | None
     resolution: float | None
     remedy: str = ""
+    is_late: bool = False
 
     @classmethod
     def of(cls, loop: LoopSetting) -> StepCondition | None:
@@ -156,12 +159,12 @@ class StepCondition:
             return cls(None, info.friction, None)
         needed = loop.ratio("translation") * step
         needed *= 0.5 * law.stiffness + law.damping / loop.period
-        return cls(needed, info.friction, step)
+        return cls(needed, info.friction, step, is_late=loop.lag != IN_TIME)
 
     @property
     def holds(self) -> bool | None:
         """True if friction holds the steps; None if it is unknown."""
-        if self.needed is None or self.available is None:
+        if self.needed is None or self.available is None or self.is_late:
             return None
         return self.available >= self.needed
 
@@ -182,6 +185,8 @@ class StepCondition:
                 f"its {steps} are not judged: its friction is unknown ('hapticbridge identify' "
                 f"measures it), {format_si(self.needed or 0.0, 'N')} needed"
             )
+        if self.is_late:
+            return f"its {steps} are not judged: it is late, or slower than the loop"
         relation = ">=" if self.holds else "<"
         text = (
             f"friction {format_si(self.available, 'N')} {relation} "
@@ -196,7 +201,7 @@ UNPROVED = "no proof is built in yet"
 
 @dataclass(frozen=True, slots=True)
 class DampingCondition:
-    """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
+    """The device condition on one kind of axis: b >= scale · force_scale · (K T/2 + B'), in time.
 
     Attributes:
         axis: ``translation`` or ``rotation``; if it is not felt, the names of the axes.

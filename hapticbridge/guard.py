@@ -341,6 +341,14 @@ def trip_reason(code: int, tick: int, grip: str = "") -> str:
     return f"tick {tick}: {hand}{_REASONS.get(code, _DIVERGED)}"
 
 
+def is_unsound(code: int) -> bool:
+    """Returns True for a trip after which the simulation itself is in doubt.
+
+    MuJoCo dropped contacts or constraints, or its numbers were bad. Such a run is never passive.
+    """
+    return code in WARNINGS or code not in _REASONS
+
+
 def _hand_at(grip: str) -> str:
     return f"hand at '{grip}': " if grip else ""
 

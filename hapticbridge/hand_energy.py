@@ -94,12 +94,14 @@ class HandEnergy:
             origins[-1] += ", and only --energy-limit bounds what they give the hand"
         if self.springs > INSTANT:
             springs = format_energy(self.springs)
-            origins.append(f"the coupling's springs began with {springs}")
+            origins.append(f"the coupling's springs held {springs} at the start or after resets")
         if origins:
             return f"{text}: {'; '.join(origins)}"
         return f"{text} and what the device's damping burned"
 
 
 def worst_of(hands: Sequence[HandEnergy]) -> HandEnergy:
-    """Returns the energy of the hand with the most unpaid, else of the one with the most net."""
-    return max(hands, key=lambda each: (bool(each.fault), bool(each.limit), each.net))
+    """Returns that of the hand with the most unpaid, else of one whose certificate is limited."""
+    return max(
+        hands, key=lambda each: (each.unpaid if each.fault else 0.0, bool(each.limit), each.net)
+    )

@@ -145,7 +145,7 @@ class BridgeOptions:
     Attributes:
         rate: Ticks per second in Hz, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one, the device receives the mean
-            of their wrenches and needs another damping (``certificate.required_damping``). For a
+            of their wrenches and needs another damping (``loop_setting.required_damping``). For a
             slower scene they are the steps between two of its results.
         scene_rate: Results of the scene per second in Hz. Below ``rate`` the scene steps in a
             thread of its own, and the tool is shown between its results (``slow_scene``). The scene

@@ -274,6 +274,7 @@ class Session:
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
         signal: Name of the signal that ended the last run; empty if none did.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
         is_open: False after ``close``.
 
     Raises:
@@ -296,6 +297,7 @@ class Session:
         self.end, self._is_timed, self._slept = -1, False, 0
         self._start_potential = 0.0
         self.stopped_by = self.signal = ""
+        self.is_unsound = False
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
@@ -512,6 +514,7 @@ class Session:
             (self.kernel.hands or self.kernel.bound).resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
+        self.is_unsound = False
         self._before_trip = np.empty(0, TICK_DTYPE)
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
@@ -629,7 +632,7 @@ class Session:
         The remedy is a note of the exception. Its message is the bare reason, as in the recording.
         """
         self.stopped_by = "trip"
-        self.event("trip", reason=reason)
+        self.event("trip", reason=reason, **({"unsound": True} if self.is_unsound else {}))
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
         trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
         work, inputs, created = (
@@ -662,6 +665,7 @@ class Session:
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
             start_potential=self._start_potential,
+            is_unsound=self.is_unsound,
         )
         hands = [
             Summary.from_state(

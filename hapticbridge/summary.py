@@ -155,6 +155,7 @@ class RunOutcome:
         recording: The recording, or None.
         is_realtime: True if real time was requested from the system.
         start_potential: Potential energy in J before the first tick.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
     """
 
     ticks: int
@@ -165,6 +166,7 @@ class RunOutcome:
     recording: Path | None
     is_realtime: bool
     start_potential: float
+    is_unsound: bool = False
 
 
 WELD = "the weld in its stiffest directions at the start"
@@ -232,6 +234,7 @@ class Summary:
         start_potential: Potential energy in J before the first tick; its zero is arbitrary.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and ``is_certified`` of the whole are then those of all of them.
     """
@@ -265,6 +268,7 @@ class Summary:
     start_potential: float = 0.0
     grip: str = ""
     device: str = ""
+    is_unsound: bool = False
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
@@ -381,7 +385,7 @@ class Summary:
     @property
     def max_net_energy(self) -> float:
         """Largest net energy to the hand in J (``HandEnergy.net``)."""
-        return self.hand_energy.net
+        return max((each.hand_energy.net for each in self.hands), default=self.hand_energy.net)
 
     def _device_lines(self) -> Iterator[str]:
         """Yields if the device bears the coupling at the time that the run kept."""
@@ -403,8 +407,13 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """``passive`` (strict or within slack, without a metered kick) or ``active``."""
-        return "active" if self.fault is not None else "passive"
+        """``passive`` (strict or within slack, without a metered kick), or ``active``.
+
+        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad.
+        """
+        if self.fault is not None:
+            return "active"
+        return "unverified" if self.is_unsound else "passive"
 
     @classmethod
     def from_state(
@@ -480,6 +489,7 @@ class Summary:
             has_hand=not info.is_prescribed,
             hand_energy=hand,
             start_potential=outcome.start_potential,
+            is_unsound=outcome.is_unsound,
             grip=parameters.grip,
             device=info.name,
         )

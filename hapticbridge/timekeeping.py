@@ -245,9 +245,15 @@ class Timekeeping:
             return f"device not judged: {self._unproved}{self.slowness}"
         if reason := self.refutation(energy):
             return f"device not certified: {reason}"
-        if all(each.is_damped for each in self.in_time if each.is_felt):
-            return "device not certified: friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
-        return f"device not certified: b < {self._bound}"
+        return f"device not certified: {self.lack}"
+
+    @property
+    def lack(self) -> str:
+        """Clause on what the device has too little of for the coupling."""
+        is_shaken = any(each.steps and each.steps.holds is False for each in self.in_time)
+        if is_shaken and not any(each.is_damped is False for each in self.in_time):
+            return "friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
+        return f"b < {self._bound}"
 
     @property
     def _unproved(self) -> str:
@@ -419,10 +425,12 @@ def _at_times(
         stiffness = ratio * coupling.rotational_stiffness
     needed = condition.needed * (1.0 / share + times.mean_jitter / parameters.period)
     if stiffness > 0.0:
-        half = 0.5 * stiffness * parameters.period
-        needed += (
-            DELAY_PRICE * half * half / condition.needed * times.mean_delay / parameters.period
-        )
+        held = condition.ticks_per_sample * parameters.period
+        # of one force for n ticks the price of a spring alone, which is the larger one
+        price = DELAY_PRICE * 0.5 * stiffness * condition.ticks_per_sample
+        if condition.ticks_per_sample == 1:
+            price *= 0.5 * stiffness * held / condition.needed
+        needed += price * times.mean_delay
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

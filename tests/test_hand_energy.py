@@ -129,7 +129,7 @@ def test_springs_that_hold_a_weight_at_the_start_may_give_it_back(tmp_path: Path
     assert summary.hand_energy.unpaid == 0.0
     assert (summary.is_certified, report.certified, report.exit_code) == (True, True, 0)
     assert "device certified: b >= KT/2 + B_law\n" in str(summary)  # without a limit
-    assert "beyond what it put in: the coupling's springs began with 16.2 mJ" in str(summary)
+    assert "beyond what it put in: the coupling's springs held 16.2 mJ" in str(summary)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from hapticbridge.kernel.parameters import RunParameters
 
 SLACK_SHARE = 0.5
 """Share of the slack that counts with several laws per tick, without unit; equal to the assumption
-of ``certificate.required_damping``."""
+of ``loop_setting.required_damping``."""
 
 
 def dissipated_by_damping(

@@ -426,6 +426,8 @@ def verdict_on(
     except RecordingError as error:
         fault = Fault(str(error))
     gap = "" if outcome.has_run else f"the run was {outcome.agreement}; in its records alone"
+    if any(event.get("unsound") for event in recording.events):
+        gap = "MuJoCo could not simulate the scene to the end; until then"
     found = asdict(decide_on_hands(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
@@ -544,7 +546,7 @@ def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tup
     cause = kept.refutation(energy) if kept else ""
     doubt = kept.fault if kept else ""
     if facts["certified"] is False and cause in ("", energy.fault):
-        doubt = cause or "the device has less damping than the coupling needs"
+        doubt = cause or (kept.lack if kept else "the device has less than the coupling needs")
     silence = kept.silence if kept else ""
     return silence, doubt, _hand_words(facts), unusual_end(events), facts["unchecked"]
 

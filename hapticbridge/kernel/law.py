@@ -113,7 +113,7 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     evaluation of the law per tick g = K + B'/T.
 
     With n > 1 evaluations g = ½ (K/n + B'/T), which is the ``SLACK_SHARE`` of each evaluation's
-    slack ½ (K + nB'/T) ‖δx_i‖² (``certificate.required_damping``). A record holds only δx_k, the
+    slack ½ (K + nB'/T) ‖δx_i‖² (``loop_setting.required_damping``). A record holds only δx_k, the
     sum of all δx_i. For a given sum the slack is least if all δx_i are equal, so that g bounds it
     from below.
     """

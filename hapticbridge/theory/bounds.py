@@ -305,9 +305,9 @@ def stiffest_late_coupling(
     """Returns K in N/m and B' in N s/m of the default coupling behind a device that is late.
 
     It is the stiffest one that needs ``NEEDED_SHARE`` of b, with B' of at least b/(4 n). For a
-    device in time that is ``stiffest_coupling``. Behind a delay the stiffest one has more damping,
-    because the damper lowers the need at low frequencies. Arguments and errors are those of
-    ``late_minimum_damping``; b in N s/m must be finite and > 0.
+    device in time that is ``stiffest_coupling`` within 1 %. Behind a delay the stiffest one has
+    more damping, because the damper lowers the need at low frequencies. Arguments and errors are
+    those of ``late_minimum_damping``; b in N s/m must be finite and > 0.
     """
     b = scalar("device damping", device_damping, "N s/m", positive=True)
     largest = 1.0 + ticks_per_sample**0.5 + delay / period
