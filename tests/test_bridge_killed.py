@@ -65,7 +65,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped
     try:
         for how in HOW:
             path = folder / f"{how}.mcap"
-            command = [sys.executable, "-c", SCRIPT, str(path), how]
+            # from 3.12 on Python warns of a fork beside threads, which the script wants
+            quiet = ("-W", "ignore::DeprecationWarning")
+            command = [sys.executable, *quiet, "-c", SCRIPT, str(path), how]
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
             )
