@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from hapticbridge.jit import compiled, direct
+from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
 from hapticbridge.kernel.law import pulled, spring_energy
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
@@ -85,13 +85,14 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     observer["energy_credit_limit"] = guarding.energy_credit_limit
 
 
+@compiled
 def credit_springs(s: State) -> None:
     """Adds the present energy of the coupling's springs to what may reach the hand."""
-    k, level = s["coupling"], s["level"]["level"]
-    stretch, twist = direct(pulled, s)(s)
-    held = spring_energy(float(k["stiffness"]), norm(stretch), float(level[0]))
-    held += spring_energy(float(k["rotational_stiffness"]), norm(twist), float(level[1]))
-    s["observer"]["springs"] += held
+    k, level = s.coupling, s.level.level
+    stretch, twist = pulled(s)
+    held = spring_energy(k.stiffness, norm(stretch), level[0])
+    held += spring_energy(k.rotational_stiffness, norm(twist), level[1])
+    s.observer.springs += held
 
 
 def observe_reset(s: State, stored_before: float) -> None:

@@ -312,7 +312,7 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
-        credit_springs(s)
+        direct(credit_springs, s)(s)
         if self._loop is None:
             let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
@@ -414,7 +414,7 @@ class BoundKernel:
         else:
             direct(refresh_energies, s)(s)
         start_energies(s["energy"])
-        credit_springs(s)
+        direct(credit_springs, s)(s)
         if parameters.scene_ticks:
             direct(start_shown, self.state)(self.state)
         elif parameters.scheme == Scheme.MIDPOINT:
