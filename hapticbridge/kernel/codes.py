@@ -175,14 +175,13 @@ JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 """Reasons of the guard to refuse a tick: the device's pose jumped; time ran backwards; the coupling
 is too long; it is turned too far; the device received too much energy."""
 
-CONTACTS_FULL, CONSTRAINTS_FULL, NO_INERTIA = 16, 17, 18
+CONTACTS_FULL, CONSTRAINTS_FULL = 16, 17
 """Warnings of MuJoCo that refuse a tick: contacts or constraint rows were dropped, because they do
-not fit into its memory; the inertia matrix is singular."""
+not fit into its memory."""
 
 WARNINGS = {
     CONTACTS_FULL: "MuJoCo's memory holds no more contacts, so bodies would pass each other",
     CONSTRAINTS_FULL: "MuJoCo's memory holds no more constraints, so nothing would be held",
-    NO_INERTIA: "the inertia matrix is singular: a body has too little mass or inertia",
 }
 """Reasons in words, by result."""
 
@@ -190,7 +189,6 @@ _MORE_MEMORY = 'give MuJoCo more memory in the scene, such as <size memory="100M
 WARNING_REMEDIES = {
     CONTACTS_FULL: _MORE_MEMORY,
     CONSTRAINTS_FULL: _MORE_MEMORY,
-    NO_INERTIA: "give every body that moves a mass and an inertia, or its joint an armature",
 }
 """Remedies by result, for ``WARNINGS``."""
 

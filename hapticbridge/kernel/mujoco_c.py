@@ -28,7 +28,6 @@ from hapticbridge.kernel.codes import (
     BAD_RESULT,
     CONSTRAINTS_FULL,
     CONTACTS_FULL,
-    NO_INERTIA,
     OK,
 )
 
@@ -187,19 +186,21 @@ def warning_at(address: int) -> int:
     """Returns the result for MuJoCo's warnings since they were forgotten; ``OK`` without one.
 
     ``BAD_RESULT`` is a position, velocity, acceleration or control that is no number, or beyond
-    mjMAXVAL = 1e10, which is finite but no motion. ``address`` is that of ``mjData.warning``.
+    mjMAXVAL = 1e10, which is finite but no motion. A singular inertia, of which a solver with few
+    iterations warns too, does not count: 'check' counts it. ``address`` is that of
+    ``mjData.warning``.
     """
     # mjWarningStat: two integers, the second is the count
     counts, total = ints(address, 2 * _KINDS), 0
     for kind in range(_KINDS):
-        total += counts[2 * kind + 1]
+        total += counts[2 * kind + 1] if kind != _SINGULAR else 0
     if total == 0:
         return OK
     if counts[2 * _FULL_OF_CONTACTS + 1] > 0:
         return CONTACTS_FULL
     if counts[2 * _FULL_OF_CONSTRAINTS + 1] > 0:
         return CONSTRAINTS_FULL
-    return NO_INERTIA if counts[2 * _SINGULAR + 1] > 0 else BAD_RESULT
+    return BAD_RESULT
 
 
 def warning_of(data: mujoco.MjData) -> int:
