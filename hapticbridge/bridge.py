@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, Unpack
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -31,7 +32,7 @@ from hapticbridge.errors import (
     SceneError,
     choices,
 )
-from hapticbridge.guard import Limits, trip_reason
+from hapticbridge.guard import Limits, is_unsound, trip_reason
 from hapticbridge.hands import (
     DeviceGroup,
     Grasp,
@@ -40,7 +41,7 @@ from hapticbridge.hands import (
 )
 from hapticbridge.inputs import Write, input_writes
 from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
-from hapticbridge.kernel.mujoco_c import without_timers
+from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
@@ -51,9 +52,9 @@ from hapticbridge.options import (
 )
 from hapticbridge.realtime import real_time
 from hapticbridge.recording.recorder import RingObserver
-from hapticbridge.recording.seal import Signer
 from hapticbridge.request import RunRequest
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.scene.compile import clause
 from hapticbridge.session import RecordOutput, Session, StopRequest
 from hapticbridge.signals import stopping_on_signals
 from hapticbridge.summary import Ledger, Summary
@@ -127,10 +128,7 @@ class Bridge:
             raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
-        if options.sign is not None and path is None:
-            raise HapticBridgeError("sign needs a recording; nothing would be signed")
-        signer = None if options.sign is None else Signer.load(options.sign)
-        self.output = RecordOutput(path, observer, options.live, signer)
+        self.output = RecordOutput(path, observer, options.live)
         self.clock = clock or RealClock()
         if isinstance(self.clock, type):
             raise HapticBridgeError(
@@ -236,6 +234,7 @@ class Bridge:
             stack.callback(session.note_stop)
             stack.enter_context(stopping_on_signals(self.stop_on_signal))
             stack.enter_context(without_timers())
+            stack.enter_context(quiet())  # a warning of a step is a trip
             if self.setup.is_realtime:
                 session.note_grants(stack.enter_context(real_time()))
             try:
@@ -243,6 +242,9 @@ class Bridge:
                 reason = self._loop(session, on_tick)
             except DeviceError as error:
                 reason = f"tick {session.tick}: {error}"
+            except mujoco.FatalError as error:
+                reason = f"tick {session.tick}: MuJoCo stopped: {clause(error)}"
+                session.is_unsound = True
             finally:
                 unsent = session.command_zero_force()
         if reason or unsent:
@@ -298,7 +300,7 @@ class Bridge:
             while code == RING_FULL and stream.makes_room(is_stopping=bool(stops)):
                 code = kernel.publish_again(deadline, wake, read, write, flags)
             if code == BAD_RESULT:
-                return trip_reason(code, session.tick)
+                return self._reason_with_hand(code, session.tick)
             session.tick += 1
         return ""
 
@@ -306,6 +308,7 @@ class Bridge:
         """Describes why the kernel refused a tick, and for which of several hands."""
         hand, code = divmod(code, HAND_CODES)
         grip = self.setups[hand].scene.grip if self.setup.scene.has_several_hands else ""
+        self.session.is_unsound = is_unsound(code)
         return trip_reason(code, tick, grip)
 
     def stop(self, by: str = "caller") -> None:

@@ -11,6 +11,7 @@ from typing import Literal
 from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import DeviceInfo
 from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.loop_setting import (
     IN_TIME,
@@ -24,6 +25,7 @@ from hapticbridge.loop_setting import (
 from hapticbridge.rendering import Method, default_method
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
+    midpoint_damping,
     stiffest_coupling,
     stiffest_late_coupling,
 )
@@ -133,6 +135,8 @@ class StepCondition:
         available: Coulomb friction f_c in N; None if unknown.
         resolution: Step Δ of the position in m; None if unknown.
         remedy: Changes with which it holds with 15 % in reserve; empty if it holds.
+        is_late: True for a device that answers late, or gives a sample in some ticks only. Its
+            steps are not judged, because the condition is not derived for it.
 
     References:
         Abbott & Okamura 2005.
@@ -142,6 +146,7 @@ class StepCondition:
     available: float | None
     resolution: float | None
     remedy: str = ""
+    is_late: bool = False
 
     @classmethod
     def of(cls, loop: LoopSetting) -> StepCondition | None:
@@ -154,12 +159,12 @@ class StepCondition:
             return cls(None, info.friction, None)
         needed = loop.ratio("translation") * step
         needed *= 0.5 * law.stiffness + law.damping / loop.period
-        return cls(needed, info.friction, step)
+        return cls(needed, info.friction, step, is_late=loop.lag != IN_TIME)
 
     @property
     def holds(self) -> bool | None:
         """True if friction holds the steps; None if it is unknown."""
-        if self.needed is None or self.available is None:
+        if self.needed is None or self.available is None or self.is_late:
             return None
         return self.available >= self.needed
 
@@ -180,6 +185,8 @@ class StepCondition:
                 f"its {steps} are not judged: its friction is unknown ('hapticbridge identify' "
                 f"measures it), {format_si(self.needed or 0.0, 'N')} needed"
             )
+        if self.is_late:
+            return f"its {steps} are not judged: it is late, or slower than the loop"
         relation = ">=" if self.holds else "<"
         text = (
             f"friction {format_si(self.available, 'N')} {relation} "
@@ -194,7 +201,7 @@ UNPROVED = "no proof is built in yet"
 
 @dataclass(frozen=True, slots=True)
 class DampingCondition:
-    """The device condition b >= scale · force_scale · (K T / 2 + B') on one kind of axis.
+    """The device condition on one kind of axis: b >= scale · force_scale · (K T/2 + B'), in time.
 
     Attributes:
         axis: ``translation`` or ``rotation``; if it is not felt, the names of the axes.
@@ -464,7 +471,25 @@ def run_conditions(
     """
     if info.is_prescribed or not method.has_coupling:
         return ()
-    return conditions_of(LoopSetting.of_run(info, parameters, method))
+    conditions = conditions_of(LoopSetting.of_run(info, parameters, method))
+    guard, ratio = parameters.guarding, parameters.force_scale / parameters.scale
+    is_whole = method.scheme == Scheme.MIDPOINT and guard.has_hand and not parameters.scene_ticks
+    if not (is_whole and info.turns and guard.twist_damping == math.inf):
+        return conditions
+    law, period, twist = parameters.coupling, parameters.period, min(guard.angle, math.pi)
+    needed = ratio * midpoint_damping(
+        law.rotational_stiffness, law.rotational_damping, period, twist
+    )
+    return tuple(
+        replace(each, needed=max(needed, each.needed), remedy=each.remedy or _EARLIER)
+        if each.axis == "rotation"
+        else each
+        for each in conditions
+    )
+
+
+_EARLIER = "an earlier version had a lossless torque at any twist: record the run again"
+"""Remedy for a recording whose lossless coupling did not yield to a large twist."""
 
 
 def condition_sentences(

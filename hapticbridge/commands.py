@@ -207,7 +207,7 @@ class AxisCouplingLimits:
 
     They follow from the device condition b >= s (K T/2 + B'), with s = s_h s_f for translation and
     s_f/s_h for rotation. B' is the damping of the law. With a delay or several laws per tick the
-    requirement is larger and has no closed form (``certificate.required_damping``).
+    requirement is larger and has no closed form (``loop_setting.required_damping``).
 
     Attributes:
         axis: ``translation`` or ``rotation``.

@@ -322,7 +322,5 @@ def _events_named(file: RecordingFile, name: str) -> list[dict[str, Any]]:
 def _notes(file: RecordingFile) -> Iterator[str]:
     if file.cut_sentence:
         yield f"{file.path}: {file.cut_sentence}; the rest is compared"
-    if file.seal_fault:
-        yield f"{file.path}: {file.seal_fault}"
     if file.problems:
         yield f"{file.path} is damaged: {'; '.join(file.problems)}"

@@ -175,6 +175,7 @@ class Confined:
         seconds: Processor time in s that the child has after ``Worker.allow_run``.
         reads: Files and folders that the child may read besides programs.
         writes: Folders in which it may also write.
+        on_error: Function that lets MuJoCo report an error that would end the child.
     """
 
     def __init__(
@@ -185,6 +186,7 @@ class Confined:
         seconds: float = 0.0,
         reads: Iterable[str | Path] = (),
         writes: Iterable[str | Path] = (),
+        on_error: Callable[[Callable[[str], None]], None] | None = None,
     ) -> None:
         self._what, self._work = what, work
         self._folder = tempfile.mkdtemp(prefix="hapticbridge-")
@@ -199,6 +201,8 @@ class Confined:
         self._child = os.fork()
         if self._child == 0:
             limits = _Limits(writing, seconds, (*writes, self._folder), tuple(reads))
+            if on_error is not None:
+                on_error(limits.fail)
             limits.work_and_exit(work, self._folder)
         os.close(writing)
 
@@ -327,6 +331,11 @@ class _Limits:
             with contextlib.suppress(BaseException):
                 self._send(_REFUSED if is_refusal else _FAILED, found)
             os._exit(1)
+
+    def fail(self, words: str) -> None:
+        """Hands over MuJoCo's error message and ends this process."""
+        self._send(_FAILED, f"made MuJoCo fail: {' '.join(words.split())[:200]}")
+        os._exit(1)
 
     def _send(self, kind: int, value: object) -> None:
         for piece in packed(kind, value):

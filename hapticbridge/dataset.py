@@ -430,7 +430,7 @@ def write_dataset(
 
 def _sound(recording: RecordingFile) -> RecordingFile:
     """Returns a recording if it is whole and undamaged; what is learned from must be true."""
-    faults = [*recording.problems, recording.cut_sentence, recording.seal_fault]
+    faults = [*recording.problems, recording.cut_sentence]
     if found := "; ".join(filter(None, faults)):
         raise RecordingError(f"'{recording.path}' cannot be learned from: {found}")
     return recording

@@ -375,13 +375,6 @@ class Exported:
     ticks: int
     events: tuple[dict[str, Any], ...]
 
-    @property
-    def damage(self) -> tuple[str, ...]:
-        """Damage of the recording, one sentence each; a cut recording is not damaged."""
-        found = self.recording
-        fault = found.seal_fault
-        return found.problems or ((fault,) if fault else ())
-
 
 def target_for(path: str | Path, form: str) -> Path:
     """Returns the default target of an export: a file beside the recording.

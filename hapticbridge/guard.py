@@ -17,10 +17,20 @@ from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import BACKWARDS, BAD_SAMPLE, GAVE_ENERGY, JUMPED, STRETCHED, TWISTED
+from hapticbridge.kernel.codes import (
+    BACKWARDS,
+    BAD_SAMPLE,
+    GAVE_ENERGY,
+    JUMPED,
+    STRETCHED,
+    TWISTED,
+    WARNING_REMEDIES,
+    WARNINGS,
+)
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
+from hapticbridge.loop_setting import IN_TIME, Lag
 from hapticbridge.units import format_energy
 
 # Limits of the wrench and of the run
@@ -290,7 +300,7 @@ _REASONS = {
     STRETCHED: "the tool is farther from the handle than the stretch limit",
     TWISTED: "the tool is turned from the handle by more than the angle limit",
     GAVE_ENERGY: "the hand would get more than it put in, by more than the energy limit",
-}
+} | WARNINGS
 _REMEDIES = {
     BAD_SAMPLE: "its last sample holds NaN or infinity, or a quaternion (w, x, y, z) whose length "
     "is not 1; check the driver's read()",
@@ -299,12 +309,17 @@ _REMEDIES = {
     "carries a tool that falls or tips over); with another reach in mind raise --stretch-limit",
     TWISTED: "turn more slowly, or raise --rotational-stiffness if the device bears it",
     GAVE_ENERGY: "lower --stiffness",
-}
+} | WARNING_REMEDIES
 _LIMIT_MOTORS = (
     "the scene's motors did {} of work until then{}: limit their force (forcerange), or start a "
     "motor at ctrl 0 and a servo at its target (keyframe 'home'); 'hapticbridge check SCENE' names "
     "those that push at the start; if they are meant to push the hand, --energy-limit is what it "
     "may get"
+)
+_LIMIT_INPUTS = (
+    "the scene's inputs (applied forces, moved mocap bodies, gravity compensation) did {} of work "
+    "until then: make them smaller or slower; if they are meant to push the hand, --energy-limit "
+    "is what it may get"
 )
 _FIND_PUMP = (
     "the scene itself created {} until then: 'hapticbridge check SCENE' looks for what pumps, and "
@@ -322,14 +337,29 @@ def trip_reason(code: int, tick: int, grip: str = "") -> str:
     ``code`` is a result of a function of ``kernel.tick``, not ``OK``; ``grip`` names the hand of
     several that it is about.
     """
-    return f"tick {tick}: {_hand_at(grip)}{_REASONS.get(code, _DIVERGED)}"
+    hand = "" if code in WARNINGS else _hand_at(grip)
+    return f"tick {tick}: {hand}{_REASONS.get(code, _DIVERGED)}"
+
+
+def is_unsound(code: int) -> bool:
+    """Returns True for a trip after which the simulation itself is in doubt.
+
+    MuJoCo dropped contacts or constraints, or its numbers were bad. Such a run is never passive.
+    """
+    return code in WARNINGS or code not in _REASONS
 
 
 def _hand_at(grip: str) -> str:
     return f"hand at '{grip}': " if grip else ""
 
 
-def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest: str = "") -> str:
+def trip_remedy(
+    reason: str,
+    motor_work: float,
+    created: float = 0.0,
+    strongest: str = "",
+    input_work: float = 0.0,
+) -> str:
     """Returns the remedy for a trip, for the message to the user; empty if none is known.
 
     Exception and recording keep the bare reason, because it is compared when the run is repeated.
@@ -339,6 +369,7 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest:
         motor_work: Work of the scene's own motors until then in J, which may be the cause.
         created: Energy in J that the scene had created until then, which may be the cause.
         strongest: Name of the actuator that pushes most, or empty.
+        input_work: Work of the scene's inputs until then in J, which may be the cause.
     """
     for code, remedy in _REMEDIES.items():
         if reason.endswith(_REASONS[code]):
@@ -348,6 +379,8 @@ def trip_remedy(reason: str, motor_work: float, created: float = 0.0, strongest:
                 return _LIMIT_MOTORS.format(
                     format_energy(motor_work), f" ('{strongest}' pushes most)" * bool(strongest)
                 )
+            if code == GAVE_ENERGY and input_work > 0.5 * USUAL_ENERGY:
+                return _LIMIT_INPUTS.format(format_energy(input_work))
             return remedy
     return ""
 
@@ -413,6 +446,14 @@ def button_mask(button: int | None, what: str) -> int:
     if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MAX_BUTTONS:
         raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MAX_BUTTONS - 1}")
     return 1 << button
+
+
+def _twist_damping(info: DeviceInfo, period: float) -> float:
+    """Returns ``GuardParameters.twist_damping`` of a device with a hand."""
+    if not info.turns:
+        return math.inf
+    is_in_time = Lag.of(info, period) == IN_TIME
+    return (info.rotational_damping or 0.0) if is_in_time else 0.0
 
 
 def guard_parameters_for(
@@ -483,6 +524,7 @@ def guard_parameters_for(
         energy=limits.energy,
         swing_energy=SWING_ENERGY,
         runaway_speed=RUNAWAY_SPEED,
+        twist_damping=_twist_damping(info, period),
         stated_delay=info.delay or 0.0,
         delay_margin=DELAY_MARGINS[info.delay is not None],
     )

@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict, cast
 
 import numpy as np
@@ -146,7 +145,7 @@ class BridgeOptions:
     Attributes:
         rate: Ticks per second in Hz, 1 to 1e6.
         substeps: MuJoCo steps per tick, 1 to 100. With more than one, the device receives the mean
-            of their wrenches and needs another damping (``certificate.required_damping``). For a
+            of their wrenches and needs another damping (``loop_setting.required_damping``). For a
             slower scene they are the steps between two of its results.
         scene_rate: Results of the scene per second in Hz. Below ``rate`` the scene steps in a
             thread of its own, and the tool is shown between its results (``slow_scene``). The scene
@@ -177,8 +176,6 @@ class BridgeOptions:
             sooner, and the whole tick takes 5 % longer. Between two ticks ``Scene.data`` then holds
             the contacts of the new positions, without forces. None does so on a real clock.
         live: True shows the state of the run on standard error, from the recorder's process.
-        sign: File of the private ed25519 key that signs the recording when it is closed
-            (``recording.seal.Signer``); needs the extra ``sign``. None leaves it unsigned.
 
     Raises:
         HapticBridgeError: A value is out of range; the message names the valid ones.
@@ -201,7 +198,6 @@ class BridgeOptions:
     realtime: bool | None = None
     pipelined: bool | None = None
     live: bool = False
-    sign: str | Path | None = None
 
     def __post_init__(self) -> None:
         for name, kind in _KINDS.items():
@@ -277,7 +273,6 @@ class OptionChanges(TypedDict, total=False):
     realtime: bool | None
     pipelined: bool | None
     live: bool
-    sign: str | Path | None
 
 
 # Setup of a run

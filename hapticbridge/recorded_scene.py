@@ -7,7 +7,9 @@ which hands over numbers and texts.
 
 from __future__ import annotations
 
+import ctypes
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -21,6 +23,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.hands import simulate_hands
+from hapticbridge.kernel.mujoco_c import library_path
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -70,7 +73,23 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
+        "on_error": report_errors,
     }
+
+
+_HANDLERS: list[Any] = []  # C has their addresses
+
+
+def report_errors(report: Callable[[str], None]) -> None:
+    """Lets MuJoCo call a function with the message of an error that would end the process.
+
+    Such an error occurs in compiled code; in the Python bindings it raises as before. The function
+    must end the process.
+    """
+    kind = ctypes.CFUNCTYPE(None, ctypes.c_char_p)
+    _HANDLERS.append(kind(lambda message: report(message.decode(errors="replace"))))
+    pointer = ctypes.c_void_p.in_dll(ctypes.CDLL(str(library_path())), "mju_user_error")
+    pointer.value = ctypes.cast(_HANDLERS[-1], ctypes.c_void_p).value
 
 
 @cache

@@ -16,14 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import Scheme, added_actuators, coupling_ids, handle_ids, held_body
+from hapticbridge.kernel.codes import (
+    WARNINGS,
+    Scheme,
+    added_actuators,
+    coupling_ids,
+    handle_ids,
+    held_body,
+    warning_words,
+)
 from hapticbridge.kernel.lossless import tree_of_tool
+from hapticbridge.kernel.mujoco_c import quiet, warning_at
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.rigid_contact import finish_contacts
 from hapticbridge.kernel.state import BoundKernel, Place
 from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.scene import Scene
+from hapticbridge.scene.compile import clause
 from hapticbridge.scene.handle import PROBE
 
 AT_REST = 1e-6
@@ -82,6 +93,9 @@ class Rehearsal:
         Args:
             handle: Pose of the handle.
             count: Largest number of steps.
+
+        Raises:
+            SceneError: MuJoCo stopped, or warned (``codes.WARNINGS``).
         """
         data, bias = self.data, self.model.actuator_biasprm[self._actuator].copy()
         if self._joint < 0:
@@ -92,9 +106,15 @@ class Rehearsal:
         bound = BoundKernel(self.model, data, self._parameters, place=self._place)
         record, step = bound.state[0], bound.step
         finish, work = direct(finish_contacts, record), 0
+        address = int(record["mj"]["warnings"])
+        warning = direct(warning_at, address)
         try:
             for done in range(count):
-                step(self.model, data)
+                with quiet():
+                    step(self.model, data)
+                code = warning(address)
+                if code in WARNINGS:
+                    raise SceneError(f"while the tool settles {warning_words(code)}")
                 finish(record)
                 work += self.model.nv + data.nefc
                 is_long = work > MAX_WORK and done >= MIN_STEPS
@@ -103,6 +123,8 @@ class Rehearsal:
                 wrench, forces = np.zeros(6), data.actuator_force[self._outputs]
                 wrench[: len(forces)] = forces
                 yield wrench
+        except mujoco.FatalError as error:
+            raise SceneError(f"MuJoCo stopped while the tool settled: {clause(error)}") from None
         finally:
             bound.release()
             self.model.actuator_biasprm[self._actuator] = bias

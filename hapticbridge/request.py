@@ -82,7 +82,7 @@ class RunRequest:
         options: BridgeOptions,
         clock: Clock,
     ) -> RunRequest:
-        """Returns the request for a run in a loaded scene; it leaves out a key's place."""
+        """Returns the request for a run in a loaded scene."""
         named = zip(grasps, devices, strict=True)
         return cls(
             scene=scene.path.name,
@@ -90,7 +90,7 @@ class RunRequest:
             as_is=scene.as_is,
             grasps=tuple(replace(grasp, device=info.name) for grasp, info in named),
             devices=tuple(devices),
-            options=replace(options, sign=None),
+            options=options,
             clock=clock.name,
         )
 

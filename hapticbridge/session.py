@@ -59,7 +59,6 @@ from hapticbridge.realtime import (
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.recording.seal import Signer
 from hapticbridge.rendering import prepare, prepare_hands
 from hapticbridge.request import RunRequest
 from hapticbridge.run_description import (
@@ -119,13 +118,11 @@ class RecordOutput:
         path: File of the recording; None records nothing.
         observer: Second reader of the records, such as ``view.Window``; None without one.
         live: True shows the state of the run on standard error.
-        signer: Key that signs the recording when it is closed; None leaves it unsigned.
     """
 
     path: Path | None = None
     observer: RingObserver | None = None
     live: bool = False
-    signer: Signer | None = None
 
     def open_stream(
         self, period: float, snapshot: Snapshot | None, *, may_wait: bool, hands: int = 1
@@ -287,6 +284,7 @@ class Session:
         tick: Number of the next tick.
         end: Tick before which the run ends; −1 for none.
         signal: Name of the signal that ended the last run; empty if none did.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
         is_open: False after ``close``.
 
     Raises:
@@ -310,6 +308,7 @@ class Session:
         self.end, self._is_timed, self._slept = -1, False, 0
         self._start_potential = 0.0
         self.stopped_by = self.signal = ""
+        self.is_unsound = False
         self._before_trip = np.empty(0, TICK_DTYPE)
         self._grants: tuple[Grant, ...] = ()
         self._is_begun = self._is_held = self._has_warned = False
@@ -499,7 +498,7 @@ class Session:
     def _close_stream(self) -> None:
         """Finishes the recording, or removes it if start-up failed or a signal came before."""
         is_discarded = not self._is_begun or (not self.tick and bool(self.signal))
-        self.stream.close(self.output.signer, is_discarded=is_discarded)
+        self.stream.close(is_discarded=is_discarded)
 
     def begin(self, duration: float | None) -> None:
         """Sets the end of a run and its event; a later run starts with a ramp of the force.
@@ -524,6 +523,7 @@ class Session:
             (self.kernel.hands or self.kernel.bound).resume()
             self.event("resume", reason=self.stopped_by, **self._signal_detail())
         self.stopped_by = self.signal = ""
+        self.is_unsound = False
         self._before_trip = np.empty(0, TICK_DTYPE)
         # a callback that forbids the split may have been set since the bridge was opened
         model, method = self.setup.scene.model, self.setup.method
@@ -641,18 +641,18 @@ class Session:
         The remedy is a note of the exception. Its message is the bare reason, as in the recording.
         """
         self.stopped_by = "trip"
-        self.event("trip", reason=reason)
+        self.event("trip", reason=reason, **({"unsound": True} if self.is_unsound else {}))
         self._before_trip = self.stream.latest(1)  # the ring is closed before the summary
         trip = SafetyTrip(reason, self.stream.latest(round(1.0 / self.setup.period)))
-        work, created = (
+        work, inputs, created = (
             float(trip.records[name][-1]) if len(trip.records) else 0.0
-            for name in ("actuator_work", "environment_energy")
+            for name in ("actuator_work", "external_work", "environment_energy")
         )
         model, data = self.setup.scene.model, self.setup.scene.data
         pump = first_pump(model) if may_be_pumped(reason) else None
         if pump is not None:
             trip.add_note(f"{pump.words}; write {pump.change}")
-        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data)):
+        elif remedy := trip_remedy(reason, work, created, strongest_actuator(model, data), inputs):
             trip.add_note(remedy)
         return trip
 
@@ -674,6 +674,7 @@ class Session:
             recording=self.output.path,
             is_realtime=self.setup.is_realtime,
             start_potential=self._start_potential,
+            is_unsound=self.is_unsound,
         )
         hands = [
             Summary.from_state(

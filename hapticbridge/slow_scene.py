@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.codes import BAD_RESULT, OK
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.shown_tool import fail_scene
 from hapticbridge.kernel.state import BoundKernel
@@ -78,7 +78,7 @@ class SlowScene:
         self.step = self.bound.step
         self._thread: threading.Thread | None = None
         self._wake, self._done = threading.Semaphore(0), threading.Event()
-        self._is_closed, self._is_sound = False, True
+        self._is_closed, self._code = False, OK
         self._error: Exception | None = None
 
     def queue_change(self, apply: Callable[[], None]) -> None:
@@ -96,8 +96,7 @@ class SlowScene:
         """
         if self._waits[0]:
             self._finish_step()
-            if not self._is_sound:
-                fail_scene(self._front.state["shown"])
+            fail_scene(self._front.state["shown"], self._code)
         self._apply_changes()
 
     @property
@@ -149,8 +148,8 @@ class SlowScene:
             if not self.is_idle:  # late; the shown pose stays
                 return
             self._finish_step()
-            if not self._is_sound:
-                fail_scene(self._front.state["shown"])
+            if self._code != OK:
+                fail_scene(self._front.state["shown"], self._code)
                 return
         self._take_result(self._front.state, self.bound.state, self._given)
         self._apply_changes()
@@ -163,7 +162,7 @@ class SlowScene:
 
     def _finish_step(self) -> None:
         if self._thread is None:
-            self._is_sound = self._do_step()
+            self._code = self._do_step()
         elif not self._done.wait(LONGEST_WAIT):
             raise HapticBridgeError(f"a step of the scene takes more than {LONGEST_WAIT:g} s")
         if self._error is not None:
@@ -176,21 +175,22 @@ class SlowScene:
             if self._is_closed:
                 return
             try:
-                self._is_sound = self._do_step()
+                self._code = self._do_step()
             except Exception as error:  # raised again in the bridge's loop
                 self._error = error
             self._done.set()
 
-    def _do_step(self) -> bool:
-        """Runs one tick of the scene; returns False if its result is not usable."""
+    def _do_step(self) -> int:
+        """Runs one tick of the scene; returns ``OK``, or why its result is not usable."""
         state, row, period = self.bound.state, self.bound.row, self._scene_period
         for substep in self._substeps:
             if self._before(state, self._given, row, substep, period) != OK:
-                return False
+                return BAD_RESULT
             self.step(self._model, self._data)
-            if self._end(state, row, substep) != OK:
-                return False
-        return True
+            code = self._end(state, row, substep)
+            if code != OK:
+                return code
+        return OK
 
     def close(self) -> None:
         """Ends the thread after its present step, which is waited for ``LONGEST_WAIT`` s.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
+from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
 from hapticbridge.kernel.codes import JOINT, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
@@ -28,13 +29,11 @@ from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import TickFlag
 from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
 from hapticbridge.timekeeping import (
-    INSTANT,
     NO_DAMPING,
     RunTimes,
     Timekeeping,
-    motors_pushed,
 )
-from hapticbridge.units import energy_rows, format_energy, format_share, format_si, format_wrenches
+from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law
 
@@ -156,6 +155,7 @@ class RunOutcome:
         recording: The recording, or None.
         is_realtime: True if real time was requested from the system.
         start_potential: Potential energy in J before the first tick.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
     """
 
     ticks: int
@@ -166,6 +166,7 @@ class RunOutcome:
     recording: Path | None
     is_realtime: bool
     start_potential: float
+    is_unsound: bool = False
 
 
 WELD = "the weld in its stiffest directions at the start"
@@ -215,12 +216,12 @@ class Summary:
         coupling: Requested, law and effective coupling. For a weld the effective one is that of its
             stiffest axes, measured at the start.
         fault: Tick and port (``environment`` or ``device``) of the first fault, or None. With a
-            coupling law the device port is not metered during the run. A certified device needs no
-            metering; for any other the audit of the recording decides.
+            coupling law the device port has no fault here: unpaid energy to the hand refutes the
+            certificate, and the audit of the recording decides.
         conditions: Device conditions, as sentences.
         is_certified: True if b >= scale · force_scale · (KT/2 + B_law) holds for the device in
-            translation and rotation, the run kept its time, and the force did not swing as a late
-            one does. None if its damping is unknown, or
+            translation and rotation, the run kept its time, the force did not swing as a late one
+            does, and the hand got no unpaid energy. None if its damping is unknown, or
             if no coupling law makes the condition sufficient.
         timekeeping: Time that the run kept, and the device conditions at this time.
         stopped_by: ``duration``, ``signal``, ``trip``, ``caller``, or another caller of
@@ -229,11 +230,11 @@ class Summary:
         reach: Distance in m of the device from the origin of its frame beyond which it moved
             without handle and force; None without such a limit.
         has_hand: True if the device gives its force to a hand; a prescribed motion does not.
-        max_net_energy: Largest energy in J that the hand had got beyond what it put in and what the
-            device's damping burned; 0 without a hand.
+        hand_energy: Energy that the hand got and what paid for it; of several, of the worst.
         start_potential: Potential energy in J before the first tick; its zero is arbitrary.
         grip: Name of the grip that the hand holds.
         device: Name of the device.
+        is_unsound: True if a trip leaves the simulation itself in doubt (``guard.is_unsound``).
         hands: Summary of each hand by itself, if several hold the scene. Fault, share of the slack
             and ``is_certified`` of the whole are then those of all of them.
     """
@@ -263,17 +264,21 @@ class Summary:
     recording: Path | None
     reach: float | None
     has_hand: bool
-    max_net_energy: float = 0.0
+    hand_energy: HandEnergy = field(default_factory=HandEnergy)
     start_potential: float = 0.0
     grip: str = ""
     device: str = ""
+    is_unsound: bool = False
     hands: tuple[Summary, ...] = ()
 
     def at_record(self, record: np.void) -> Summary:
         """Returns the summary with the energies of a tick's record."""
         names = record.dtype.names or ()
         found = {name: float(record[name]) for name in self.energies if name in names}
-        return replace(self, energies=self.energies | found)
+        hand = replace(
+            self.hand_energy, motors=found["actuator_work"], inputs=found["external_work"]
+        )
+        return replace(self, energies=self.energies | found, hand_energy=hand)
 
     @staticmethod
     def of_hands(hands: tuple[Summary, ...]) -> Summary:
@@ -286,11 +291,12 @@ class Summary:
             fault=min(faults, default=None),
             slack_share=max(each.slack_share for each in hands),
             is_certified=worst_verdict(certified),
+            hand_energy=worst_of([each.hand_energy for each in hands]),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns all fields by name, with the verdict; ``hands`` only where there are several."""
-        values = asdict(self) | {"verdict": self.verdict}
+        values = asdict(self) | {"verdict": self.verdict, "max_net_energy": self.max_net_energy}
         for each in values["hands"]:  # the file is that of all hands
             del each["hands"], each["recording"]
         if not self.hands:
@@ -374,22 +380,12 @@ class Summary:
             yield "reach", f"{format_si(self.reach, 'm')}; beyond, no handle and no force"
         yield from energy_rows(self.energies, self.start_potential)
         if self.max_net_energy > INSTANT:
-            yield "net to the hand", f"{format_energy(self.max_net_energy)} at most, {self._origin}"
+            yield "net to the hand", self.hand_energy.sentence
 
     @property
-    def _has_pushed(self) -> bool:
-        return motors_pushed(self.energies["actuator_work"], self.max_net_energy)
-
-    @property
-    def _origin(self) -> str:
-        """Origin of energy that a hand got, as far as it is known."""
-        if self._has_pushed:
-            work = format_energy(self.energies["actuator_work"])
-            return (
-                f"beyond what it put in: the scene's motors did {work} of work, and only "
-                "--energy-limit bounds what they give the hand"
-            )
-        return "beyond what it put in and what the device's damping burned"
+    def max_net_energy(self) -> float:
+        """Largest net energy to the hand in J (``HandEnergy.net``)."""
+        return max((each.hand_energy.net for each in self.hands), default=self.hand_energy.net)
 
     def _device_lines(self) -> Iterator[str]:
         """Yields if the device bears the coupling at the time that the run kept."""
@@ -403,7 +399,7 @@ class Summary:
         if self.is_certified is None and not self.conditions:
             yield f"device not judged: {NO_DAMPING}{kept.slowness}"
             return
-        yield kept.device_words(self.is_certified, has_pushed=self._has_pushed)
+        yield kept.device_words(self.is_certified, self.hand_energy)
         if not self.is_certified:
             yield from self.conditions
         if self.is_certified is False and method_named(self.method).has_law:
@@ -411,8 +407,13 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """``passive`` (strict or within slack, without a metered kick) or ``active``."""
-        return "active" if self.fault is not None else "passive"
+        """``passive`` (strict or within slack, without a metered kick), or ``active``.
+
+        It is ``unverified`` if MuJoCo dropped contacts or its numbers were bad.
+        """
+        if self.fault is not None:
+            return "active"
+        return "unverified" if self.is_unsound else "passive"
 
     @classmethod
     def from_state(
@@ -449,6 +450,7 @@ class Summary:
         timekeeping = Timekeeping.from_times(
             times, parameters, conditions if method.has_law else ()
         )
+        hand = HandEnergy() if info.is_prescribed else _hand_energy(state, parameters)
         return cls(
             ticks=outcome.ticks,
             duration=(outcome.ticks + outcome.skipped) * parameters.period,
@@ -479,16 +481,30 @@ class Summary:
             ).felt_at(parameters.grip, parameters.scale, parameters.force_scale),
             fault=ledger.fault,
             conditions=condition_sentences(info, parameters, method),
-            is_certified=timekeeping.certified(is_run_certified(conditions, method)),
+            is_certified=timekeeping.certified(is_run_certified(conditions, method), hand),
             timekeeping=timekeeping,
             stopped_by=outcome.stopped_by,
             recording=outcome.recording,
             reach=parameters.guarding.reach if parameters.guarding.reach < math.inf else None,
             has_hand=not info.is_prescribed,
-            max_net_energy=0.0
-            if info.is_prescribed
-            else float(state["observer"]["max_guarded_energy"][0]),
+            hand_energy=hand,
             start_potential=outcome.start_potential,
+            is_unsound=outcome.is_unsound,
             grip=parameters.grip,
             device=info.name,
         )
+
+
+def _hand_energy(state: NDArray[np.void], parameters: RunParameters) -> HandEnergy:
+    """Reads the energy of a hand from the kernel's state."""
+    observer, energy = state["observer"][0], state["energy"][0]
+    loss = energy["start_energy"] - energy["kinetic"] - energy["potential"]
+    ratio = parameters.force_scale / parameters.scale
+    return HandEnergy(
+        net=float(observer["max_guarded_energy"]),
+        unpaid=float(observer["max_unpaid_energy"]),
+        springs=ratio * float(observer["springs"]),
+        scene=max(float(loss), 0.0),
+        motors=float(energy["actuator_work"]),
+        inputs=float(energy["external_work"]),
+    )

@@ -27,16 +27,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from hapticbridge.certificate import UNPROVED, DampingCondition
+from hapticbridge.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
-
-INSTANT = 1e-3
-"""Energy in J that delays may give to the hand: 1 N over 1 mm, less than a key of a keyboard takes,
-and a fortieth of the guard's usual energy limit. A smaller value fails runs for one late force; a
-larger one can be felt."""
 
 NOT_KEPT = "the run did not keep its time"
 """Words that name this fault."""
@@ -51,20 +47,6 @@ after ten, a hand has met a tool that stands still."""
 SWUNG = "its force came late, reversed or in steps"
 UNKNOWN = "it is not known whether its motors push the right way"
 """Words for what the watch found, and for what it could not find (``kernel.swing_watch``)."""
-
-MOTORS_PUSHED = "motors of the scene pushed: what they give the hand, only --energy-limit bounds"
-"""Limit of the certificate, which covers no energy that a scene's motors give."""
-
-
-def motors_pushed(work: float, net: float) -> bool:
-    """Returns True if motors of a scene may have given the hand energy.
-
-    Args:
-        work: Work of the motors so far in J; negative if they took back more than they gave.
-        net: Largest energy in J that the hand had got beyond what it put in.
-    """
-    return min(abs(work), net) > INSTANT
-
 
 STEPS_UNKNOWN = "its encoder's steps are not judged"
 """Limit of the certificate of a device whose resolution or friction is unknown."""
@@ -245,29 +227,33 @@ class Timekeeping:
             sample_rate=sample_rate,
         )
 
-    def certified(self, verdict: bool | None) -> bool | None:
+    def certified(self, verdict: bool | None, energy: HandEnergy) -> bool | None:
         """Returns a verdict on the device, False if the run was not as it assumes."""
-        is_refuted = self.is_kept is False or self.watch or (verdict and self.has_tripped)
-        return False if is_refuted else verdict
+        is_refuted = self.is_kept is False or self.watch
+        is_spoiled = verdict and (self.has_tripped or energy.fault)
+        return False if is_refuted or is_spoiled else verdict
 
-    def device_words(self, verdict: bool | None, *, has_pushed: bool = False) -> str:
-        """Returns the verdict on the device in a clause; ``fault`` has the reason in full.
-
-        ``has_pushed`` is as returned by ``motors_pushed``.
-        """
+    def device_words(self, verdict: bool | None, energy: HandEnergy) -> str:
+        """Returns the verdict on the device in a clause; ``fault`` has the reason in full."""
         steps = [each.steps for each in self.in_time if each.steps is not None]
         if verdict:
-            limit = f", but {MOTORS_PUSHED}" if has_pushed else ""
+            limit = f", but {energy.limit}" if energy.limit else ""
             if any(each.holds is None for each in steps):
                 limit = f"; {STEPS_UNKNOWN}{limit}"
             return f"device certified{self.clause}: b >= {self._bound}{limit}"
         if verdict is None:
             return f"device not judged: {self._unproved}{self.slowness}"
-        if self.refutation:
-            return f"device not certified: {self.refutation}"
-        if all(each.is_damped for each in self.in_time if each.is_felt):
-            return "device not certified: friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
-        return f"device not certified: b < {self._bound}"
+        if reason := self.refutation(energy):
+            return f"device not certified: {reason}"
+        return f"device not certified: {self.lack}"
+
+    @property
+    def lack(self) -> str:
+        """Clause on what the device has too little of for the coupling."""
+        is_shaken = any(each.steps and each.steps.holds is False for each in self.in_time)
+        if is_shaken and not any(each.is_damped is False for each in self.in_time):
+            return "friction < K Δ/2 + B_law Δ/T, so encoder steps shake it"
+        return f"b < {self._bound}"
 
     @property
     def _unproved(self) -> str:
@@ -281,13 +267,14 @@ class Timekeeping:
             return f"it answers late, and {UNPROVED}"
         return "nothing proves that it bears the coupling"
 
-    @property
-    def refutation(self) -> str:
-        """Reason in the run itself why its device is not certified, in a clause; or empty."""
+    def refutation(self, energy: HandEnergy) -> str:
+        """Returns the reason in the run itself why its device is not certified, or nothing."""
         if self.is_kept is False:
             return NOT_KEPT
         if self.watch:
             return UNKNOWN if UNKNOWN in self.watch else SWUNG
+        if energy.fault and all(each.holds for each in self.in_time):
+            return energy.fault
         is_cause = self.has_tripped and self.is_kept is not None
         return "the guard stopped the run" if is_cause else ""
 
@@ -438,10 +425,12 @@ def _at_times(
         stiffness = ratio * coupling.rotational_stiffness
     needed = condition.needed * (1.0 / share + times.mean_jitter / parameters.period)
     if stiffness > 0.0:
-        half = 0.5 * stiffness * parameters.period
-        needed += (
-            DELAY_PRICE * half * half / condition.needed * times.mean_delay / parameters.period
-        )
+        held = condition.ticks_per_sample * parameters.period
+        # of one force for n ticks the price of a spring alone, which is the larger one
+        price = DELAY_PRICE * 0.5 * stiffness * condition.ticks_per_sample
+        if condition.ticks_per_sample == 1:
+            price *= 0.5 * stiffness * held / condition.needed
+        needed += price * times.mean_delay
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

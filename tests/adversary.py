@@ -274,7 +274,10 @@ class Attack:
             device_rotational_damping=b_r,
             scene_ticks=self.scene_ticks,
             guarding=GuardParameters(
-                clutch=1, fade_ticks=max(round(0.02 / period), 1), has_hand=True
+                clutch=1,
+                fade_ticks=max(round(0.02 / period), 1),
+                has_hand=True,
+                twist_damping=b_r,
             ),
         )
         kernel = slow = BoundKernel(scene.model, scene.data, parameters)

@@ -1,4 +1,4 @@
-"""Recordings to audit: honest runs, and the same files with something changed and signed anew."""
+"""Recordings to audit: honest runs, and files with something changed and new checksums."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
@@ -26,7 +24,6 @@ from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording import Attachment, Recording, RecordingWriter
-from hapticbridge.recording.seal import KEY, SIGNATURE
 from hapticbridge.run_description import SOURCE_PREFIX
 from hapticbridge.scene import Scene
 from hapticbridge.summary import Summary
@@ -101,9 +98,8 @@ def rewritten(
     meta: Mapping[str, str] | None = None,
     events: Sequence[Mapping[str, object]] | None = None,
     attachments: Mapping[str, bytes] | None = None,
-    signer: Any = None,
 ) -> Path:
-    """Writes a recording with parts changed, and a seal that fits them.
+    """Writes a recording with parts changed, and checksums that fit them.
 
     As in a recording of a run, an event comes before the ticks that follow it.
     """
@@ -122,40 +118,8 @@ def rewritten(
         writer.write_event(event, time if isinstance(time, int) else 0)
         start = max(start, stop)
     writer.write_ticks(rows[start:])
-    writer.close(signer)
+    writer.close()
     return path
-
-
-def key_pair(folder: Path, name: str = "lab") -> Path:
-    """Writes a private key and its public one as ssh-keygen does; returns the private one."""
-    key, path = Ed25519PrivateKey.generate(), folder / name
-    path.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.OpenSSH,
-            serialization.NoEncryption(),
-        )
-    )
-    path.chmod(0o600)
-    public = key.public_key().public_bytes(
-        serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
-    )
-    path.with_suffix(".pub").write_bytes(public + f" {name}@bench\n".encode())
-    return path
-
-
-class OldSignature:
-    """Signs a changed file with the signature of another one.
-
-    Args:
-        seal: Seal of the other file.
-    """
-
-    def __init__(self, seal: Mapping[str, str]) -> None:
-        self.old = {name: seal[name] for name in (KEY, SIGNATURE)}
-
-    def signed(self, seal: Mapping[str, str]) -> dict[str, str]:
-        return {**seal, **self.old}
 
 
 def without_model(recording: Recording) -> Recording:

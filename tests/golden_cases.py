@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import math
+import operator
 import os
 import platform
 import re
@@ -48,6 +49,13 @@ Json = dict[str, Any]
 DIGITS = 12
 """Hexadecimal digits of a digest: 48 bits. Two of some thousand differing columns collide with a
 probability below 1e-8."""
+
+BITS = re.compile(f"[0-9a-f]{{{DIGITS}}}")
+"""A digest of floats. ``zero`` is none: another machine has the same fields without a bit."""
+
+ROUNDING = 1e-6
+"""Largest relative difference of numbers that another machine computes. Without FMA and AVX the
+libraries compute numbers that differ by up to 2e-11; a smaller limit may fail elsewhere."""
 
 WORKSHOP = """
 <mujoco model="workshop">
@@ -91,10 +99,11 @@ def digest(column: NDArray[Any]) -> str:
 
 
 def machine() -> dict[str, str]:
-    """Returns what may change a digest although the code is the same."""
-    found = {name: version(name) for name in ("mujoco", "numba", "numpy", "scipy", "tyro", "rich")}
+    """Returns what may change a bit although the code is the same."""
+    found = {name: version(name) for name in ("mujoco", "numba", "numpy", "scipy")}
     return found | {
         "python": ".".join(platform.python_version_tuple()[:2]),
+        "libc": " ".join(platform.libc_ver()),
         "system": platform.system(),
         "architecture": platform.machine(),
         "processor": _processor(),
@@ -102,14 +111,12 @@ def machine() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Returns the processor's model with its numbers: a virtual machine may hide its name."""
+    """Returns the instructions by which the mathematical libraries choose their code."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        words = set(Path("/proc/cpuinfo").read_text(encoding="utf-8").split())
     except OSError:
         return platform.processor()
-    told = dict(line.split(":", 1) for line in reversed(lines) if ":" in line)
-    kept = {name.strip(): value.strip() for name, value in told.items()}
-    return ", ".join(kept[n] for n in ("model name", "cpu family", "model") if n in kept)
+    return " ".join(sorted(words & {"avx2", "avx512f", "fma"}))
 
 
 def json_text(content: Json) -> str:
@@ -117,8 +124,21 @@ def json_text(content: Json) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def difference_lines(one: Any, other: Any, where: str = "") -> list[str]:
+def is_close(one: Any, other: Any) -> bool:
+    """Returns True for values that differ in bits alone, which another machine may give."""
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=1e-12)
+    return bool(one == other) or all(
+        isinstance(value, str) and BITS.fullmatch(value) for value in (one, other)
+    )
+
+
+def difference_lines(
+    one: Any, other: Any, where: str = "", is_same: Callable[[Any, Any], bool] = operator.eq
+) -> list[str]:
     """Returns the places in which two JSON values differ, with both values."""
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        one, other = dict(enumerate(one)), dict(enumerate(other))
     if isinstance(one, dict) and isinstance(other, dict):
         names = [*one, *(name for name in other if name not in one)]
         return [
@@ -128,9 +148,10 @@ def difference_lines(one: Any, other: Any, where: str = "") -> list[str]:
                 one.get(name, "missing"),
                 other.get(name, "missing"),
                 f"{where} / {name}".lstrip(" /"),
+                is_same,
             )
         ]
-    return [] if one == other else [f"{where}: {one!r:.200} -> {other!r:.200}"]
+    return [] if is_same(one, other) else [f"{where}: {one!r:.200} -> {other!r:.200}"]
 
 
 def sway(tick: int) -> Pose:
@@ -505,7 +526,7 @@ def description(recording: Recording) -> Json:
     """Returns what a recording says of its run beside its ticks, and how it is judged."""
     meta = {name: text for name, text in sorted(recording.meta.items()) if name not in VOLATILE}
     files = {
-        name: hashlib.sha256(data).hexdigest()[:DIGITS]
+        name: f"sha256 {hashlib.sha256(data).hexdigest()[:DIGITS]}"
         for name, data in sorted(recording.attachments.items())
     }
     report = audit_report(recording.path)
@@ -513,7 +534,7 @@ def description(recording: Recording) -> Json:
 
 
 def tampered_files(recording: Recording, folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yields files with something changed and signed anew, each with what was changed."""
+    """Yields files with something changed and new checksums, each with what was changed."""
     path = folder / "tampered.mcap"
     meta, events = recording.meta, recording.events
     for name in recording.ticks.dtype.names or ():

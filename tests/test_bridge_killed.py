@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import key_pair
 
 from hapticbridge.audit import audit
 from hapticbridge.errors import RecordingError
@@ -33,7 +32,7 @@ def tell(tick):
             time.sleep(60)
         print(bridge.session.stream.recorder.pid, child, flush=True)
 
-with hb.Bridge("virtual_wall", recording=sys.argv[1], sign=sys.argv[3]) as bridge:
+with hb.Bridge("virtual_wall", recording=sys.argv[1]) as bridge:
     summary = bridge.run(60.0, tell)
 print(summary.stopped_by, summary.ticks, summary.overruns, summary.dropped, summary.verdict)
 """
@@ -61,13 +60,14 @@ HOW = ("SIGINT", "SIGTERM", "SIGKILL", "both")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Stopped]]:
     """Four runs at once, each stopped in its own way: most of their time is start and wait."""
     folder = tmp_path_factory.mktemp("killed")
-    key = key_pair(folder)
     started = {}
     stopped = {}
     try:
         for how in HOW:
             path = folder / f"{how}.mcap"
-            command = [sys.executable, "-c", SCRIPT, str(path), how, str(key)]
+            # from 3.12 on Python warns of a fork beside threads, which the script wants
+            quiet = ("-W", "ignore::DeprecationWarning")
+            command = [sys.executable, *quiet, "-c", SCRIPT, str(path), how]
             process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
             )
@@ -109,9 +109,8 @@ def test_signal_ends_a_run_cleanly(runs: dict[str, Stopped], how: str) -> None:
     assert stop["tick"] == len(recording.ticks) == int(ticks)
     assert 600 < int(ticks) < 60_000
     assert (stop["overruns"], stop["dropped"]) == (int(overruns), int(dropped))
-    report = audit(run.path, trust=run.path.with_name("lab.pub"))
+    report = audit(run.path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
-    assert report.is_trusted
 
 
 def test_real_clock_counts_every_skipped_deadline(runs: dict[str, Stopped]) -> None:
@@ -129,16 +128,13 @@ def test_killed_bridge_leaves_a_whole_recording_that_says_so(runs: dict[str, Sto
     assert run.status == -signal.SIGKILL
     recording = read_recording(run.path)
     assert not recording.is_cut
-    assert recording.digest == recording.computed_digest
+    assert recording.problems == ()
     assert [event["event"] for event in recording.events] == ["start", "bridge_died"]
     assert recording.events[-1]["tick"] == recording.ticks["tick"][-1] == len(recording.ticks) - 1
     assert len(recording.ticks) >= 600
     report = audit(run.path)
     assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
     assert report.events["bridge_died"] == 1
-    trusted = audit(run.path, trust=run.path.with_name("lab.pub"))
-    assert (trusted.verdict, trusted.exit_code) == ("unverified", 1)
-    assert trusted.signature == "the file is not signed (the bridge died during the run)"
     assert (report.is_cut, report.cut) == (True, "the bridge died during the run")
 
 

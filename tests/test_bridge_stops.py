@@ -71,7 +71,7 @@ def test_whatever_fails_zero_force_comes_first_and_the_recording_is_whole(
     assert not any(wrench.any() for wrench in device.writes[60 + (name == "write") :])
     assert device.is_closed
     recording = read_recording(path)
-    assert not recording.is_cut and recording.digest == recording.computed_digest
+    assert not recording.is_cut and not recording.problems
     report = audit(path)
     assert (report.verdict, report.ticks) == ("passive", len(recording.ticks))
     if name in ("pose", "read"):
@@ -243,9 +243,9 @@ def test_the_device_is_closed_before_the_recorder_is_waited_for(
     order: list[str] = []
     usual = Recorder.close
 
-    def noted(recorder: Recorder, *signer: Any) -> None:
+    def noted(recorder: Recorder) -> None:
         order.append("recorder")
-        usual(recorder, *signer)
+        usual(recorder)
 
     monkeypatch.setattr(Recorder, "close", noted)
     device = ScriptedDevice(sway, on_close=lambda: order.append("device"))

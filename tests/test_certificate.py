@@ -175,7 +175,9 @@ def test_a_remedy_that_is_followed_leaves_a_reserve_of_15_percent(
     # numbers are rounded down to three digits, and behind a delay less damping needs more
     assert max(used) <= NEEDED_SHARE * 1.005
     # a late device is told the best pair, at most as stiff as the requested one
-    assert min(used) > 0.9 * NEEDED_SHARE or "set the" in failing.remedy
+    name = "stiffness" if axis == "translation" else "rotational_stiffness"
+    is_softer = all(getattr(way[0], name) < 0.99 * getattr(requested, name) for way in ways)
+    assert min(used) > 0.9 * NEEDED_SHARE or not is_softer
 
 
 def test_less_damping_is_no_remedy_behind_a_delay() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from hapticbridge.check import lean
 from hapticbridge.check.case import motion_for
 from hapticbridge.check.cost import CHUNKS, Stage, one_pass, processor_costs
 from hapticbridge.check.lean import IS_FELT, MAY_GO, Judge, Lean, find_lean
-from hapticbridge.check.lean_output import draw_lean, lean_facts, write_lean, write_table
+from hapticbridge.check.lean_output import lean_facts, write_lean
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.perception import felt_error
 from hapticbridge.check.simplify import (
@@ -303,20 +302,11 @@ def test_files_not_to_be_written_are_refused(with_files: Path, name: str, messag
     load_scene(there, grip="tip")
 
 
-def test_table_picture_and_facts_hold_every_trial_by_name(found: Lean, tmp_path: Path) -> None:
-    alone, together = ([each.name for each in trials] for trials in (found.alone, found.together))
-    write_table(found, tmp_path / "lean.csv")
-    with (tmp_path / "lean.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["name"] for row in rows] == [*alone, *together, "lean"]
-    assert float(rows[-1]["felt_jnd"]) == found.result.error.jnd  # type: ignore[union-attr]
+def test_facts_hold_every_trial_by_name(found: Lean) -> None:
     facts = json.loads(json.dumps(lean_facts(found), allow_nan=False))
-    assert [trial["name"] for trial in facts["alone"]] == alone
-    drawn = [text.get_text() for text in draw_lean(found, "peg").axes[0].texts]
-    felt = [trial.name for trial in found.alone if trial.error]
-    assert sorted(drawn) == sorted(felt + [f"{k}: {name}" for k, name in enumerate(together, 1)])
-    with pytest.raises(SceneError, match="cannot write the table"):
-        write_table(found, tmp_path / "no" / "lean.csv")
+    assert [trial["name"] for trial in facts["alone"]] == [each.name for each in found.alone]
+    assert [trial["name"] for trial in facts["together"]] == [each.name for each in found.together]
+    assert facts["result"]["felt_jnd"] == found.result.error.jnd  # type: ignore[union-attr]
 
 
 def test_processor_time_of_more_work_is_more_and_both_are_positive() -> None:

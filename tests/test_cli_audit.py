@@ -129,7 +129,7 @@ def test_page_is_whole_fetches_nothing_and_runs_nothing(
     assert not page.fetched
     assert "url(http" not in text and "@import" not in text
     assert "alert('x')" in page.text
-    for told in ("invalid", "2400 N/m", "unknown", "metadata 'clock'"):
+    for told in ("invalid", "2400 N/m", "unknown", "metadata 'scene'"):
         assert told in page.text
     picture = text[text.index("<svg") : text.index("</svg>") + 6]
     ET.fromstring(picture)

@@ -133,14 +133,12 @@ def studded(tmp_path: Path) -> tuple[str, ...]:
 def test_check_writes_a_leaner_scene_that_runs(
     studded: tuple[str, ...], tmp_path: Path, call: Called
 ) -> None:
-    lean, picture, table = (tmp_path / name for name in ("lean.xml", "lean.png", "tried.csv"))
-    code, out, _ = call("check", *studded, "--write", lean, "--plot", picture, "--table", table)
+    lean = tmp_path / "lean.xml"
+    code, out, _ = call("check", *studded, "--write", lean)
     assert code == 0
     run = f"hapticbridge run {lean} --grip tip"
     for words in ("What could go", "nothing only seen", "may go with the picture", f"next: {run}"):
         assert words in out
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert table.read_text(encoding="utf-8").startswith("step,name,verdict")
     assert "rivet" not in lean.read_text(encoding="utf-8")
     assert call(*run.split()[1:], "--fast", "--duration", 0.2)[0] == 0
 
@@ -163,9 +161,6 @@ def test_bad_input_is_refused_before_anything_is_run(
         ("--lean --budget nan", "budget"),
         (f"--write {studded[0]}", "is a file of the scene itself"),
         (f"--write {tmp_path}/lean.txt", "must end in .xml"),
-        (f"--table {tmp_path}/tried.txt", "must end in .csv"),
-        (f"--table {tmp_path}/scene.csv", "taken for the hand's motion in 'scene.xml'"),
-        (f"--write {tmp_path}/lean.xml --table {tmp_path}/lean.csv", "motion in 'lean.xml'"),
     ):
         code, out, err = call("check", *studded, *extra.split())
         assert (code, out) == (2, "")

@@ -222,7 +222,7 @@ def test_a_motor_that_pulls_the_tool_is_told_as_the_load_and_as_the_reason_of_th
     assert "mJ at most, beyond what it put in: the scene's motors did " in out
     assert f"next: hapticbridge audit {record}" in out
     _, out, _ = call("audit", record)
-    assert "beyond what it put in, which only --energy-limit bounds" in out
+    assert "and only --energy-limit bounds what they give the hand" in out
     for energy in ("kinetic", "actuator work", "coupling work", "device energy"):
         row = next(line for line in summary.splitlines() if line.startswith(energy))
         assert f"{energy} {row.removeprefix(energy).strip()}" in out
@@ -243,7 +243,9 @@ def test_a_certificate_names_its_limit_where_motors_pushed(call: Called, tmp_pat
         code, out, _ = call("audit", record, "--report", page)
         assert (code, f"device certified: b >= KT/2 + B_law, {pushed}" in out) == (0, told)
         assert (pushed in page.read_text("utf-8")) == told
-        assert (", which only --energy-limit bounds" in call("audit", record, "--json")[1]) == told
+        assert (
+            "and only --energy-limit bounds what they" in call("audit", record, "--json")[1]
+        ) == told
         _, out, _ = call("audit", record, "--what-if", "stiffness=900", "--in-process")
         assert ("net to the hand" in out) == told
 

@@ -25,7 +25,7 @@ from hapticbridge.bridge import Bridge
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import ENERGIES, export, sidecar_of
 from hapticbridge.files import install_command
-from hapticbridge.record import TICK_DTYPE, TickFlag
+from hapticbridge.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording, reader
 
 h5py: Any = importlib.import_module("h5py")
@@ -106,7 +106,7 @@ def test_every_number_comes_back_to_the_bit(
     monkeypatch.setattr(reader, "BLOCK", 64)  # in three parts
     done = export(recording, form)
     columns, units, meta, events = read(done.files[0])
-    assert not done.damage
+    assert not done.recording.problems
     assert columns.pop("seconds").shape == (COUNT,)
     rows, position = rows_to_keep(), 0
     names = list(columns)
@@ -126,7 +126,7 @@ def test_every_number_comes_back_to_the_bit(
             position += 1
     assert position == len(columns) == TICK_DTYPE.itemsize // 8
     assert {name: units[name] for name in UNITS} == UNITS
-    assert meta == META | {"epoch_ns": str(EPOCH)}
+    assert meta == META | {"format": FORMAT, "epoch_ns": str(EPOCH)}
     assert [event["event"] for event in events] == ["start", "mark", "mark"]
 
 

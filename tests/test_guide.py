@@ -24,7 +24,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)
 """A code block and its language: ``sh`` and ``python`` are executed, ``bash`` on a simulated
 device, ``console`` is executed and compared; ``xml``, ``toml`` and ``text`` are shown alone."""
 
-OTHERS = {"ssh-keygen", "ssh", "sudo"}
+OTHERS = {"ssh", "sudo"}
 """Programs in the guide that are not ours. Those that make files for later commands are run."""
 
 
@@ -78,9 +78,6 @@ def test_every_command_and_program_of_a_page_works(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(workplace)
-    if "ssh-keygen" in page(topic):
-        pytest.importorskip("cryptography")
-        check_signed_run(workplace)
     for count, (language, block) in enumerate(BLOCK.findall(page(topic))):
         if language == "console":
             check_session(block, capsys)
@@ -99,25 +96,6 @@ def test_every_command_and_program_of_a_page_works(
             Path(f"{name}.xml").write_text(block, encoding="utf-8")
         else:
             assert language in ("text", "toml"), language
-
-
-def check_signed_run(folder: Path) -> None:
-    """Makes the pair of keys that the page makes with a program that may be missing here."""
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    key = Ed25519PrivateKey.generate()
-    private = key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.OpenSSH,
-        serialization.NoEncryption(),
-    )
-    (folder / "lab").write_bytes(private)
-    (folder / "lab").chmod(0o600)
-    public = key.public_key().public_bytes(
-        serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH
-    )
-    (folder / "lab.pub").write_bytes(public)
 
 
 def test_every_page_has_a_topic() -> None:

@@ -362,7 +362,7 @@ def test_a_changed_record_of_either_hand_is_noticed(
         (json.dumps([{}] * MAX_HANDS), "metadata 'hands' are not texts by name"),
         ("[]", "its hands have different numbers of records"),
         ('[{"grip": "right"}, {"grip": "left"}]', "its hands have different numbers of records"),
-        ('[{"grip": "right", "period_s": "0.002"}]', "metadata 'period_s' is '0.002'"),
+        ('[{"grip": "right", "period_s": "0.002"}]', "data of the device: 'damping' is 2.0"),
     ],
 )
 def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_path: Path) -> None:
@@ -377,7 +377,7 @@ def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_pat
 def rewrite(
     path: Path, forged: Path, edit: Callable[[list[NDArray[np.void]]], None], **meta: str
 ) -> None:
-    """Writes a recording of two hands again, with its seal made anew."""
+    """Writes a recording of two hands again, with its checksums made anew."""
     from hapticbridge.recording import RecordingWriter
     from hapticbridge.recording.format import Attachment
     from hapticbridge.recording.reader import open_hands

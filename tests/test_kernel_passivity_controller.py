@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from audit_cases import ScriptedDevice, recorded, tapped, verdict_of
+from audit_cases import ScriptedDevice, recorded
 from bridge_runs import fast
 from faults.catalogue import HEAVY, NO_TRIPS, UNWATCHED, stiff
 from faults.rig import CAUSE, Outcome, Rig
@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from test_bridge_commands import FLOOR
 
 from hapticbridge.audit import audit
-from hapticbridge.audit.events import AuditedRun
-from hapticbridge.audit.replay import AuditedHand, comparison
+from hapticbridge.audit.replay import Resimulator
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
@@ -27,6 +26,7 @@ from hapticbridge.kernel.passivity_controller import observe_energy
 from hapticbridge.kernel.state import STATE_DTYPE
 from hapticbridge.record import CLOCK_FIELDS, TICK_DTYPE, TickFlag
 from hapticbridge.recording import open_recording, read_recording
+from hapticbridge.run_description import parameters_of
 from hapticbridge.theory.sampled_loop import WorstHand
 
 T = 1e-3
@@ -43,11 +43,13 @@ def knocked(folder: Path, factor: float, hand: WorstHand | None, controller: str
 
 def check_again(outcome: Outcome, folder: Path) -> None:
     """The two other routes agree: all that the audit minds is that the trips were taken out."""
-    assert outcome.report.reason.startswith("guard parameter 'speed' is inf")
+    assert outcome.report.reason.startswith("guard parameter 'speed' is 'inf'")
     recording = open_recording(folder / "run.mcap")
-    hands = [AuditedHand(recording, AuditedRun.of(recording))]
-    with comparison(hands, is_trusted=True) as replayed:
-        assert replayed().agreement == "bit for bit"
+    again = Resimulator(recording, parameters_of(recording.meta))
+    for ticks in recording.blocks():
+        simulated = again.add(ticks)
+        for name in {*(TICK_DTYPE.names or ())} - {*CLOCK_FIELDS, "flags"}:
+            np.testing.assert_array_equal(simulated[name], ticks[name], err_msg=name)
 
 
 def largest(outcome: Outcome, after: int) -> float:
@@ -138,7 +140,10 @@ def test_what_the_environment_creates_beyond_the_slack_is_kept_from_a_certified_
     tmp_path: Path,
 ) -> None:
     without = shaken(tmp_path, "off")
-    assert without.report.certified
+    margin = without.report.damping_margin
+    assert margin is not None
+    assert margin > 0.0  # the device bears the coupling
+    assert without.report.certified is False  # but not the energy that the scene created
     assert without.report.environment == "active"
     assert without.energy > 1e-3
     with_it = shaken(tmp_path, None)
@@ -275,11 +280,3 @@ def test_an_hour_in_a_dissipating_scene_pays_for_no_more_than_the_surplus_either
     state["energy"]["slack"] += 0.002
     observe_energy(state[0], nothing, nothing, T)
     assert observer["created_energy"][0] == pytest.approx(0.008)
-
-
-def test_a_recording_from_before_the_guard_is_judged_as_it_was(tmp_path: Path) -> None:
-    recording = read_recording(tapped(tmp_path))
-    meta = {name: value for name, value in recording.meta.items() if name != "guard"}
-    recording.meta.clear()
-    recording.meta.update(meta)
-    assert verdict_of(recording, tmp_path).verdict == "passive"

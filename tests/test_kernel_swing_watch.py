@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from audit_cases import ScriptedDevice
 from faults.catalogue import FINGERS
+from faults.rig import FaultyDevice
 from model_runs import LOOP_SCENES
 from numpy.typing import NDArray
 from random_hands import random_motion
@@ -22,6 +23,7 @@ from hapticbridge.device import (
     AXES,
     DEFAULT_HAND,
     DeviceInfo,
+    Hand,
     Motion,
     SimulatedDevice,
     TrajectoryDevice,
@@ -333,6 +335,66 @@ def pressed(path: Path, *, is_watched: bool) -> hb.Summary:
         bridge.setup = replace(bridge.setup, guard=guard)
     with bridge:
         return bridge.run(1.5)
+
+
+SHAKER = """<mujoco><compiler angle="radian"/>
+<option timestep="0.001" integrator="discrete" cone="elliptic" gravity="0 0 0"/>
+<worldbody><body name="tool"><joint name="x" type="slide" axis="1 0 0"/>
+  <geom type="sphere" size="0.01" mass="0.05"/><site name="grip"/></body></worldbody>
+<actuator><motor name="shaker" joint="x"/></actuator></mujoco>
+"""
+"""A tool of 50 g on a motor; with the default coupling it swings at 35 Hz."""
+
+
+def slammed(path: Path, delay: int) -> tuple[hb.Summary, float]:
+    """Throws 20 g at a wall, by a device that states no delay; returns its run and J given."""
+    motion = Motion([0.0, 0.3, 0.5, 9.0], [(x, 0.0, 0.0) for x in (0.0, -0.03, 0.035, 0.035)])
+    hand = Hand(mass=0.01, damping=0.5, stiffness=100.0)
+    device = FaultyDevice(SimulatedDevice(mass=0.01, path=motion, hand=hand, delay=delay))
+    device.info = replace(device.info, delay=0.0)
+    with hb.Bridge("virtual_wall", device, clock=hb.SimulatedClock(), recording=path) as bridge:
+        summary = bridge.run(4.0)
+    return summary, device.energy
+
+
+def test_a_light_hand_that_slams_on_a_device_1_ms_late_is_found(tmp_path: Path) -> None:
+    """The force swung between 10 and -10 N at 60 Hz for ever, at a phase like that of no delay."""
+    path = tmp_path / "run.mcap"
+    summary, joules = slammed(path, 1)
+    assert joules <= 0.2  # 1.3 J where it goes on
+    assert summary.is_certified is False
+    report = audit(path)
+    assert report.certified is False
+    assert "the device swung: it answered late" in report.reason
+    assert report.resimulation == "bit for bit"
+    force = hb.read_recording(path).ticks["wrench_on_device"][:, 0]
+    assert np.abs(force[:1200]).max() == 10.0
+    assert np.abs(force[1500:]).max() <= 3.0
+
+
+def test_a_light_hand_is_no_alarm_if_the_force_comes_in_time(tmp_path: Path) -> None:
+    summary, joules = slammed(tmp_path / "run.mcap", 0)
+    assert summary.is_certified
+    assert joules <= 1e-6
+
+
+@pytest.mark.parametrize("frequency", [35.0, 50.0])
+def test_a_motor_that_shakes_the_tool_is_no_alarm(tmp_path: Path, frequency: float) -> None:
+    """It swings the force by 3 N and more, and gives the hand what it burns."""
+    scene = tmp_path / "shaker.xml"
+    scene.write_text(SHAKER)
+    device = SimulatedDevice(path=Motion([0.0, 1.5], [(0.0, 0.0, 0.0)] * 2), hand=DEFAULT_HAND)
+    limits = Limits(force=10.0, torque=0.5, energy=10.0)
+    with hb.Bridge(scene, device, clock=hb.SimulatedClock(), limits=limits) as bridge:
+        summary = bridge.run(
+            1.5,
+            lambda tick: bridge.set_input(
+                ctrl={"shaker": 8.0 * math.sin(2e-3 * math.pi * frequency * tick)}
+            ),
+        )
+        force = bridge.latest_records(500)["wrench_on_device"][:, 0]
+    assert force.std() >= 3.0
+    assert not summary.timekeeping.watch
 
 
 def sways(amplitude: float, duration: float) -> Motion:

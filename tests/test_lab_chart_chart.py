@@ -255,6 +255,17 @@ def test_command_draws_a_chart(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert names == {f"point_mass.{ending}" for ending in ("png", "svg", "csv", "json")}
 
 
+@pytest.mark.parametrize(
+    "option", [["--methods", "implicit"], ["--steps", "1"], ["--engines", "all"]]
+)
+def test_chart_of_rates_refuses_what_it_would_not_heed(
+    option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["chart", "slow_scene", *option, "--out", str(tmp_path)]) == 2
+    assert "it takes neither --methods nor" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_table_says_what_contacts_and_solver_really_were() -> None:
     workload = open_workload("rod_impact", Extent(4e-3, 1e-3))
     own = METHODS["implicit"].with_contact("scene")

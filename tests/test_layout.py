@@ -16,7 +16,16 @@ PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
     ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
-    ("arguments", "clock", "confinement", "coupling", "dataclass_json", "files", "pose"),
+    (
+        "arguments",
+        "clock",
+        "confinement",
+        "coupling",
+        "dataclass_json",
+        "files",
+        "hand_energy",
+        "pose",
+    ),
     ("recording",),
     ("kernel", "theory", "plotting", "sweep", "film"),
     ("scene", "inputs"),

@@ -64,7 +64,6 @@ NOT_OURS = {
     "hapticbridge.meta",
     "hapticbridge.events",
     "hapticbridge.flags",
-    "hapticbridge.digest",
 }
 """Dotted names that begin like a module here: names of MuJoCo, and names in a recording."""
 

@@ -147,10 +147,10 @@ def test_a_recording_without_them_is_read_as_before(
 
 
 @pytest.mark.parametrize("topic", ["/tf", "/wrench_on_hand", "/rosout"])
-def test_messages_that_say_something_else_are_found_in_a_file_sealed_with_them(
+def test_messages_that_say_something_else_are_found_in_a_file_with_right_checksums(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topic: str
 ) -> None:
-    """Someone who writes the whole file anew can seal what he likes; the messages give him away."""
+    """A forger can write all checksums anew; the messages contradict the ticks."""
     true_ticks, true_event = Messages.of_ticks, Messages.of_event
 
     def other_ticks(self: Messages, rows: np.ndarray) -> dict[str, np.ndarray]:

@@ -33,9 +33,8 @@ OPTION_CLASSES = BridgeOptions, Workspace, Limits, hb.Coupling, Grasp, GripAxis
 NOT_REPEATED = {"live", "realtime"}
 """Options that a repetition turns off: it is shown nowhere, and its time is not real."""
 
-NOT_RECORDED = {("BridgeOptions", "sign"), ("Grasp", "device")}
-"""Fields that a recording lacks: the place of a private key, and the open device, whose data sheet
-and name it has."""
+NOT_RECORDED = {("Grasp", "device")}
+"""Fields that a recording lacks: the open device, whose data sheet and name it has."""
 
 PINNED = {"coupling", "method", "contact", "contact_stiffness", "scene_rate"}
 """Fields that a what-if with any change sets to what the recorded run had."""
@@ -83,7 +82,8 @@ def one_hand(scene: str = "point_mass", **choices: Any) -> Callable[[Path], Brid
     """Returns a bridge of one hand; ``sheet`` are fields of its device's data sheet."""
 
     def bridge(path: Path) -> Bridge:
-        own = {"clock": hb.SimulatedClock(), "sheet": {}, "coupling": None} | choices
+        own: dict[str, Any] = {"clock": hb.SimulatedClock(), "sheet": {}, "coupling": None}
+        own |= choices
         sheet, coupling = own.pop("sheet"), own.pop("coupling")
         moved = ScriptedDevice(drift, buttons=lambda tick: 2 + 4 * (tick % 20 > 10), **sheet)
         return Bridge(scene, moved, coupling, recording=path, **own)
@@ -109,7 +109,7 @@ def two_hands(path: Path) -> Bridge:
     return Bridge(scene, [grasp], clock=hb.SimulatedClock(), recording=path)
 
 
-REAL = {"is_real": True}
+REAL: dict[str, Any] = {"is_real": True}
 
 RUNS: dict[str, Callable[[Path], Bridge]] = {
     "nothing": one_hand(),
@@ -205,7 +205,7 @@ def test_nothing_changed_asks_for_all_again_and_runs_to_the_bit(
     before, again, *_ = what_if(run.path, {}, in_process=True).runs
     assert before.recording.ticks.tobytes() == again.recording.ticks.tobytes()
     asked, repeated = run.request, request_of(again.recording.meta)
-    off = dict.fromkeys(NOT_REPEATED, False)
+    off: dict[str, Any] = dict.fromkeys(NOT_REPEATED, False)
     limits = repeated.options.limits if name == "a real device" else asked.options.limits
     assert repeated.options == replace(asked.options, **off, limits=limits)
     names = [replace(grasp, device="") for grasp in repeated.grasps]
@@ -266,7 +266,7 @@ def test_a_real_devices_ramp_is_repeated_on_a_simulated_one(
         (lambda r: r["grasps"][0].update(coupling={"softness": 1.0}), "no gain 'softness'"),
         (lambda r: r["grasps"][0].update(grip="elsewhere"), "'grip'"),
         (lambda r: r["options"]["workspace"].update(scale=1e-300), "request"),
-        (lambda r: r["devices"][0].update(damping=9.0), "'device'"),
+        (lambda r: r["devices"][0].update(damping=9.0), "'damping' is 2.0, but"),
         (lambda r: r["devices"][0].update(damping=-9.0), ".devices[0] is refused"),
         (lambda r: r.update(clock="real"), "'clock'"),
         (lambda r: r.update(scene="other.xml"), "scene"),

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, rewritten, verdict_of
+from audit_cases import COUPLING, ScriptedDevice, SlowClock, recorded, verdict_of
 from bridge_runs import fast, still, sway
 from cli_cases import Called
 from random_hands import random_motion
@@ -486,13 +486,6 @@ def test_a_tool_that_nobody_paid_for_is_seen_without_simulation(
     ticks["tool_position"][311:, 0] -= 2e-3  # toward the hand that pulls back
     report = verdict_of(recording, tmp_path, ticks=ticks, meta={"versions": "{}"})
     assert report.verdict == "invalid"
-
-
-def test_records_without_steps_are_refused(pressed: Path, tmp_path: Path) -> None:
-    recording = read_recording(pressed)
-    names = [name for name in recording.ticks.dtype.names or () if name != "scene_step"]
-    path = rewritten(recording, tmp_path / "old.mcap", ticks=np.array(recording.ticks[names]))
-    assert audit(path).exit_code != 0
 
 
 def test_what_if_repeats_it_to_the_bit(pressed: Path) -> None:

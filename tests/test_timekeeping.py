@@ -23,11 +23,11 @@ from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
+from hapticbridge.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.loop_setting import fresh_share
 from hapticbridge.recording import read_recording
 from hapticbridge.summary import Summary
-from hapticbridge.timekeeping import INSTANT
 
 T = 1e-3
 B = 2.0
@@ -496,8 +496,8 @@ def kept_time() -> timekeeping.Timekeeping:
 
 def test_a_force_that_the_watch_lowered_refutes_a_device_that_is_not_judged() -> None:
     kept = kept_time()
-    assert kept.certified(None) is None
-    assert replace(kept, watch="the force was lowered").certified(None) is False
+    assert kept.certified(None, HandEnergy()) is None
+    assert replace(kept, watch="the force was lowered").certified(None, HandEnergy()) is False
 
 
 def test_a_silence_of_the_device_is_the_cause_and_not_the_clock() -> None:

@@ -29,11 +29,10 @@ def audit(
     strict: bool = False,
     accepts_unverified: bool = False,
     in_process: bool = False,
-    trust: str | Path | None = None,
 ) -> AuditReport:
     """Judges a recording from the file alone.
 
-    The audit checks the structure (checksums, schema, contiguous ticks, finite numbers, digest),
+    The audit checks the structure (checksums, schema, contiguous ticks, finite numbers),
     the wrench against coupling law and guard, energies recomputed from poses and wrenches, and the
     device condition. The scene is compiled from the attached sources, and a re-simulation must
     agree bit for bit. A run that cannot be simulated again here, for another version or processor,
@@ -42,7 +41,7 @@ def audit(
     verdict is ``active`` from the tick at which the device has received more than its damping
     dissipates and scene and coupling release.
 
-    A long file is read four times, block by block: digest and events, structure, second
+    A long file is read four times, block by block: checksums and events, structure, second
     computation, re-simulation. One of up to two minutes at 1 kHz is read once. Beyond that memory
     grows only with the number of events.
 
@@ -52,20 +51,15 @@ def audit(
         accepts_unverified: True counts ``unverified`` as a success in ``AuditReport.exit_code``.
         in_process: True compiles and simulates in this process, without the limits on memory and
             time that a child process has. It is for recordings of a known origin.
-        trust: File of public ed25519 keys (``recording.seal.trusted_keys``). A file that none of
-            them has signed as it is now is ``unverified`` instead of passive, also with
-            ``accepts_unverified`` no success. None checks no signature.
 
     Raises:
-        RecordingError: The file is not a recording, or that of the keys holds none.
+        RecordingError: The file is not a recording.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     from hapticbridge.audit.verdict import verdict_on  # noqa: PLC0415 - takes seconds
-    from hapticbridge.recording.seal import trusted_keys  # noqa: PLC0415 - takes seconds
 
     return verdict_on(
         path,
-        None if trust is None else trusted_keys(trust),
         strict=strict,
         accepts_unverified=accepts_unverified,
         in_process=in_process,

@@ -105,16 +105,20 @@ def _loaded(guard: GuardParameters, stored: GuardParameters) -> GuardParameters:
 def _differences(
     meta: Mapping[str, str], derived: Mapping[str, str], source: str, *, is_exact: bool = True
 ) -> Iterator[Statement]:
-    """Yields the texts and guard parameters that may differ from what is derived."""
+    """Yields the texts, and fields of data sheet and guard, beside those that are derived."""
     for name, text in derived.items():
-        if name == "guard":
-            guard, own = _json(derived, name), _json(meta, name)
-            pairs = [(f"guard parameter '{each}'", own[each], guard[each]) for each in guard]
-        else:
-            pairs = [(f"metadata '{name}'", meta.get(name), text)]
+        stated_text = meta.get(name)
+        pairs = [(f"metadata '{name}'", stated_text, text)]
+        if name in _KINDS and stated_text != text:
+            own, fields = _json(meta, name), _json(derived, name)
+            pairs = [(f"{_KINDS[name]} '{each}'", own.get(each), fields[each]) for each in fields]
         for field, stated, expected in pairs:
             if is_exact or not _are_near(stated, expected):
                 yield Statement(field, stated, expected, source)
+
+
+_KINDS = {"guard": "guard parameter", "device": "data of the device:"}
+"""Metadata that are a JSON object, and the kind of their fields in words."""
 
 
 # Events against records

@@ -18,7 +18,6 @@ from hapticbridge.audit import audit
 from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import RecordingError, StudyError, choices
 from hapticbridge.files import finite_or_null
-from hapticbridge.recording.seal import trusted_keys
 from hapticbridge.sweep import Interrupted, Table, Value, check_format, sweep
 
 FEW = 8
@@ -52,7 +51,7 @@ _UNITS = {
 
 _COLUMNS = (
     *("margin", "verdict", "environment", "certified", "exit_code", "slack_share", "is_cut"),
-    *("ticks", "duration", "port", "joules", "resimulation", "signature", "reason"),
+    *("ticks", "duration", "port", "joules", "resimulation", "reason"),
 )
 """Columns of a table that every report fills, in order."""
 
@@ -66,7 +65,6 @@ def audit_all(
     strict: bool = False,
     accepts_unverified: bool = False,
     in_process: bool = False,
-    trust: str | Path | None = None,
     jobs: int | None = None,
     executor: Executor | None = None,
     scheduler: str | None = None,
@@ -78,16 +76,14 @@ def audit_all(
     ``AuditReport.margin``. A cut file is judged on the part that remains.
 
     Columns beside ``file``: ``margin``, ``verdict`` (also ``unreadable``), ``environment``,
-    ``certified`` (yes, no or unknown), ``trusted`` (yes, no or not asked), ``exit_code``, the other
-    fields of ``AuditReport``, the energies at the end in J, and ``report``, the whole report as
-    JSON (empty if unreadable).
+    ``certified`` (yes, no or unknown), ``exit_code``, the other fields of ``AuditReport``, the
+    energies at the end in J, and ``report``, the whole report as JSON (empty if unreadable).
 
     Args:
         paths: Recordings; different files.
         strict: True accepts only (14) itself; see ``audit``.
         accepts_unverified: True counts ``unverified`` as a success; see ``audit``.
         in_process: True simulates without the limits of a child process; see ``audit``.
-        trust: File of public keys, which the workers must see too; see ``audit``.
         jobs: Largest number of processes; 1 uses the present process. The default is the number of
             cores, and 1 for fewer than 8 recordings.
         executor: Executor to use instead of processes.
@@ -97,13 +93,11 @@ def audit_all(
 
     Raises:
         StudyError: The workers cannot be started or reached.
-        RecordingError: ``paths`` is empty, or ``trust`` holds no key.
+        RecordingError: ``paths`` is empty.
         Interrupted: Ctrl-C was pressed; its table holds the finished rows in this order.
     """
     if not paths:
         raise RecordingError("audit needs at least one recording")
-    if trust is not None:
-        trusted_keys(trust)
     if jobs is None and len(paths) < FEW:
         jobs = 1
     try:
@@ -113,7 +107,6 @@ def audit_all(
                 strict=strict,
                 accepts_unverified=accepts_unverified,
                 in_process=in_process,
-                trust=None if trust is None else Path(trust).absolute(),
             ),
             [{"file": str(path.absolute() if scheduler else path)} for path in paths],
             chunk=1,
@@ -133,7 +126,6 @@ def audit_point(
     strict: bool,
     accepts_unverified: bool = False,
     in_process: bool = False,
-    trust: Path | None = None,
 ) -> dict[str, Value]:
     """Audits one recording; returns its row."""
     try:
@@ -142,7 +134,6 @@ def audit_point(
             strict=strict,
             accepts_unverified=accepts_unverified,
             in_process=in_process,
-            trust=trust,
         )
     except (RecordingError, ForeignSceneError) as error:
         return {
@@ -155,7 +146,6 @@ def audit_point(
     known: dict[str, Value] = {name: getattr(report, name) for name in _COLUMNS}
     known["environment"] = report.environment or ""
     known["certified"] = {True: "yes", False: "no", None: "unknown"}[report.certified]
-    known["trusted"] = {True: "yes", False: "no", None: "not asked"}[report.is_trusted]
     if report.damping_margin is not None:
         known["damping_margin"] = report.damping_margin
     if report.tick is not None:

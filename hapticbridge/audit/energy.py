@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -28,7 +28,7 @@ from hapticbridge.kernel.parameters import RunParameters
 
 SLACK_SHARE = 0.5
 """Share of the slack that counts with several laws per tick, without unit; equal to the assumption
-of ``certificate.required_damping``."""
+of ``loop_setting.required_damping``."""
 
 
 def dissipated_by_damping(
@@ -168,8 +168,13 @@ class EnergyBalance:
             (n,) in J. Zero for an unknown damping or several laws per tick. With a coupling law,
             energy created by the environment is not included; it belongs to the other port.
         net_energy: Energy given to the hand beyond what the device's damping burned, less what the
-            scene's storage has lost since the start, (n,) in J; zero without a hand. It is what the
-            guard's energy limit bounds. An unknown damping burns nothing here.
+            scene's storage had lost since the start before the tick, (n,) in J; zero without a
+            hand. It is what the guard's energy limit bounds, with the damping that the guard takes.
+        unpaid_energy: Energy given to the hand beyond what may have paid for it before the tick,
+            (n,) in J (``hand_energy.HandEnergy``); zero without a hand.
+        springs: Energy at the hand that the coupling's springs held at the start and after each
+            reset, in J.
+        scene_loss: Energy in J that the scene's storage has lost after the last of these ticks.
         contact_tank: Energy that may pay for the depenetration of rigid contacts, (n,) in J; zero
             with the contacts of the scene.
         sums: Cumulative energies after the last of these ticks, for ``AuditState``.
@@ -183,6 +188,9 @@ class EnergyBalance:
     slack: Array
     excess_device_energy: Array
     net_energy: Array
+    unpaid_energy: Array
+    springs: float
+    scene_loss: float
     contact_tank: Array
     sums: dict[str, float]
 
@@ -223,15 +231,17 @@ class EnergyBalance:
         totals["discarded"] = discarded
         totals |= _device_energies(block, events, delay)
         in_springs: Array | float = 0.0  # with a delay the device is elsewhere
-        at_start = _springs_at_start(parameters, gains, motion) * (ticks["tick"] == 0)
+        is_reset = events.is_reset(ticks["tick"])
+        at_start = _springs_at_start(parameters, gains, motion)
+        at_start = at_start * ((ticks["tick"] == 0) | is_reset)
         totals["start_springs"] = _summed(at_start, before["start_springs"])
         if parameters.has_law and not delay:
             in_springs = stored_in_springs(parameters, gains, (motion.stretch, motion.twist))
             in_springs = in_springs - totals["start_springs"]
         excess = _device_excess(parameters, totals, created, in_springs)
-        lost = np.minimum(stored - others_work, 0.0)
-        net = totals["device_energy"] - totals["device_dissipation"]
-        net = net + parameters.force_scale / parameters.scale * lost
+        totals |= {"stored": stored - others_work, "taken": created + coupling_work}
+        ratio = parameters.force_scale / parameters.scale
+        net, unpaid = _hand_energies(ratio, totals, before, is_reset)
         # D_k = min(cap, D_{k-1} - E_k) is the lowest cap + Σ E so far, or 0, minus Σ E
         ceiling = np.minimum(
             np.minimum.accumulate(parameters.tank_cap + created), before["tank_ceiling"]
@@ -246,6 +256,9 @@ class EnergyBalance:
             slack=totals["slack"],
             excess_device_energy=excess,
             net_energy=net * parameters.guarding.has_hand,
+            unpaid_energy=unpaid * parameters.guarding.has_hand,
+            springs=float(ratio * totals["start_springs"][-1]),
+            scene_loss=max(-float(stored[-1]), 0.0),
             contact_tank=(ceiling - created) * (parameters.is_rigid and not parameters.scene_ticks),
             sums={name: float(total[-1]) for name, total in totals.items()},
         )
@@ -263,6 +276,28 @@ def _device_excess(
     excess = totals["delayed_device_energy"] - totals["device_dissipation"]
     excess = excess - totals["unfelt_work"]
     return np.asarray(excess + parameters.force_scale / parameters.scale * (lost + released))
+
+
+def _hand_energies(
+    ratio: float,
+    totals: dict[str, Array],
+    before: dict[str, float],
+    is_reset: NDArray[np.bool_],
+) -> tuple[Array, Array]:
+    """Returns ``EnergyBalance.net_energy`` and ``unpaid_energy`` of a hand, (n,) each in J.
+
+    Both hold at the tick's sample, so the scene counts as it was after the last step. Storage that
+    a reset has put back in stays lost.
+    """
+    stored, taken = (
+        np.concatenate([[before[name]], totals[name][:-1]]) for name in ("stored", "taken")
+    )
+    lost = np.minimum(stored, 0.0)
+    totals["forgotten"] = _summed(np.where(is_reset, lost, 0.0), before["forgotten"])
+    lost = np.where(is_reset, 0.0, lost) + totals["forgotten"]
+    net = totals["hand_energy"] + ratio * lost
+    released = np.maximum(totals["start_springs"] - taken, 0.0)
+    return net, totals["hand_energy"] - totals["unfelt_work"] - ratio * released
 
 
 def _summed(values: Array, before: float) -> Array:
@@ -293,7 +328,15 @@ def _device_energies(block: AuditedBlock, events: RunEvents, delay: int) -> dict
             parameters, late_moved, late_turned, block.interval, ~block.is_first
         )
         dissipation = _summed(parts, before["device_dissipation"])
+    guarding = parameters.guarding
+    assumed = replace(
+        parameters,
+        device_damping=guarding.assumed_damping,
+        device_rotational_damping=guarding.assumed_rotational_damping,
+    )
+    burned = dissipated_by_damping(assumed, moved, turned, block.interval, ~block.is_first)
     return {
+        "hand_energy": _summed(work - burned, before["hand_energy"]),
         "device_energy": _summed(work, before["device_energy"]),
         "device_throughput": _summed(np.abs(work), before["device_throughput"]),
         "delayed_device_energy": _summed(late, before["delayed_device_energy"]),

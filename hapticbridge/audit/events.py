@@ -218,6 +218,10 @@ SUMS = (
     "tank_ceiling",
     "discarded",
     "start_springs",
+    "hand_energy",
+    "stored",
+    "taken",
+    "forgotten",
 )
 """Names of the cumulative energies."""
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
+from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag, has_flag
 
 Array = NDArray[np.float64]
@@ -135,13 +136,31 @@ class Motion:
         return position - tool[:, :3], turn_between(tool[:, 3:], orientation)
 
 
-def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: Motion) -> Array:
+def torque_across(gains: Array, parameters: RunParameters) -> Array:
+    """Returns the largest torque across the motion that b_r pays for, (n,) in N m/rad.
+
+    With w = K_r + 2 B'_r/T, the a of which |K_r + B'_r/T + ja| + |B'_r/T + ja| = √(2 w b_r/T).
+    ``gains`` holds K, B', K_r and B'_r, (n, 4).
+    """
+    k_r, rate = gains[:, 2], gains[:, 3] / parameters.period
+    b = parameters.guarding.twist_damping * parameters.scale / parameters.force_scale
+    if b == np.inf:
+        return np.full(len(gains), np.inf)
+    whole = k_r + 2 * rate
+    square = np.maximum(2 * whole * b / parameters.period, whole**2)
+    near = (square - k_r * whole) / (2 * np.sqrt(np.maximum(square, 1e-300)))
+    return np.where(k_r > 0, np.sqrt(np.maximum(near**2 - rate**2, 0.0)), np.inf)
+
+
+def wrench_by_law(
+    ticks: NDArray[np.void], gains: Array, parameters: RunParameters, motion: Motion
+) -> Array:
     """Returns the coupling's wrench on the tool, (n, 6) in N and N m.
 
     Each record has one law; its flags select the rule of the torque. ``gains`` holds K, B', K_r and
     B'_r, (n, 4).
     """
-    step, turn = motion.stretched
+    (step, turn), period = motion.stretched, parameters.period
     k, b, k_r, b_r = (gains[:, column, None] for column in range(4))
     force = k * motion.stretch + b / period * step
     torque = k_r * motion.twist + b_r / period * turn
@@ -152,5 +171,11 @@ def wrench_by_law(ticks: NDArray[np.void], gains: Array, period: float, motion: 
         spring = 0.5 * (motion.twist + rotate(carried, motion.twist_before))
         midway = 0.5 * (motion.handle_turn + rotate(carried, motion.handle_turn)) - motion.tool_turn
         midpoint = k_r * spring + (b_r / period + 0.5 * k_r) * midway
-        torque = np.where(is_midpoint[:, None], midpoint, torque)
+        twists = np.stack([motion.twist, motion.twist_before])
+        across = 0.25 * gains[:, 2] * np.linalg.norm(twists, axis=2).max(axis=0)
+        most = torque_across(gains, parameters)
+        share = np.divide(most, across, out=np.ones_like(across), where=across > most)
+        torque = np.where(
+            is_midpoint[:, None], torque + share[:, None] * (midpoint - torque), torque
+        )
     return np.concatenate([force, torque], axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,8 +21,9 @@ from hapticbridge.commands import EventApplier
 from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
+from hapticbridge.kernel.codes import WARNINGS
 from hapticbridge.kernel.hands import simulate_hands
-from hapticbridge.kernel.mujoco_c import without_timers
+from hapticbridge.kernel.mujoco_c import quiet, warning_of, without_timers
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
@@ -40,6 +42,7 @@ from hapticbridge.run_description import (
     versions,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.scene.compile import clause
 from hapticbridge.slow_scene import SlowScene
 
 # Attached scene
@@ -152,9 +155,12 @@ class Resimulator:
         # an error inside the C function would end the process; the first step in Python raises
         start = recording.attachments[STATE_ATTACHMENT]
         method = method_of(recording.meta)
-        restore_state(model, data, start)
-        method.step(model, data)
-        restore_state(model, data, start)
+        try:
+            restore_state(model, data, start)
+            method.step(model, data)
+            restore_state(model, data, start)
+        except mujoco.FatalError as error:
+            raise RecordingError(f"MuJoCo stopped in its first step: {clause(error)}") from None
         self.hands = BoundHands(model, data, every) if others else None
         self.binding = self.hands.hands[0] if self.hands else BoundKernel(model, data, parameters)
         self._slow: SlowScene | None = None
@@ -172,6 +178,7 @@ class Resimulator:
         return self.binding.slack
 
     @without_timers()
+    @quiet()
     def add(self, ticks: NDArray[np.void]) -> NDArray[np.void]:
         """Simulates the next ticks.
 
@@ -293,12 +300,14 @@ class ReplayOutcome:
         tick: First tick that disagrees, or None.
         field: First field of that tick that disagrees.
         difference: Size of the disagreement.
+        warning: Reason for which MuJoCo's warnings stop the run there; empty without one.
     """
 
     agreement: str
     tick: int | None = None
     field: str = ""
     difference: float = 0.0
+    warning: str = ""
 
     @property
     def has_run(self) -> bool:
@@ -396,7 +405,9 @@ def _compared(hands: Sequence[AuditedHand], worker: Worker) -> ReplayOutcome:
             break
     run.finish()
     if first is None and run.is_over:
-        return ReplayOutcome("disagrees", run.done, "tool_position", float("nan"))
+        return ReplayOutcome(
+            "disagrees", run.done, "tool_position", math.nan, WARNINGS.get(warning_of(run.data), "")
+        )
     if first is None:
         return ReplayOutcome("bit for bit")
     worst = max(off[name] / max(largest[name], 1.0) for name in names)

@@ -1,4 +1,4 @@
-"""Structure checks of a recording: damage, digest, gaps, numbers, times and flags."""
+"""Structure checks of a recording: damage, gaps, numbers, times and flags."""
 
 from __future__ import annotations
 
@@ -97,8 +97,6 @@ def file_fault(recording: RecordingFile) -> Fault | None:
     """Returns a fault of the file as a whole, or None."""
     if recording.problems:
         return Fault("the file is damaged: " + "; ".join(recording.problems))
-    if recording.seal_fault:
-        return Fault(recording.seal_fault)
     if not recording.count:
         return Fault("the recording is empty: the run had no tick")
     last = recording.last_tick

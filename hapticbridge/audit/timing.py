@@ -6,7 +6,8 @@ device and N = K T/2 + B', the energy of each kind of axis is
 
     A_k = max(0, A_{k−1} + 3 (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
 
-p is what the device's damping burned beyond N, less what it paid for late samples. To it comes what
+p is what the device's damping burned beyond N, less what it paid for late samples and for a torque
+across the motion (``kernel.law.twist_price``). To it comes what
 late samples cost and the springs could not pay, C_k = max(0, C_{k−1} + c_k − V_k), up to what the
 wrenches gave the hand beyond what b burned; V is the energy of the springs after the sample.
 """
@@ -19,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
-from hapticbridge.audit.motion import Array, turn_between
+from hapticbridge.audit.motion import Array, torque_across, turn_between
 from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
+from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag, has_flag
 
@@ -114,7 +116,10 @@ class TimingTally:
             gains = events.gains(ticks["tick"])[:, 2 * kind : 2 * kind + 2]
             square = np.where(block.is_first, 0.0, np.sum(steps**2, axis=1))
             needed = 0.5 * gains[:, 0] + gains[:, 1] / parameters.period
-            late = (needed - np.maximum(b, needed * parameters.period) / block.interval) * square
+            across = _price_across(block, events) if kind else 0.0
+            late = (
+                needed + across - np.maximum(b, needed * parameters.period) / block.interval
+            ) * square
             lent = np.concatenate([self.lent[kind : kind + 1], _drained(late, self.lent[kind])])
             half = 0.5 * gains[:, 0]
             price = np.divide(half**2, needed, out=np.zeros_like(half), where=needed > 0)
@@ -150,6 +155,23 @@ class TimingTally:
         self.longest_silence = max(self.longest_silence, int(np.diff(ends).max()))
         self.newest_result = int(ends[-2])
         self.scene_steps = int(ticks["scene_step"][-1])
+
+
+def _price_across(block: AuditedBlock, events: RunEvents) -> Array:
+    """Returns the damping b_r/T in N m/rad that a torque across the motion costs, (n,)."""
+    ticks, motion, parameters = block.ticks, block.motion, events.parameters
+    is_whole = parameters.guarding.twist_damping == np.inf
+    if parameters.scheme != Scheme.MIDPOINT or parameters.scene_ticks or is_whole:
+        return np.zeros(len(ticks))
+    gains = events.gains(ticks["tick"])
+    k_r, rate = gains[:, 2], gains[:, 3] / parameters.period
+    twist = turn_between(motion.tool_before[:, 3:], motion.handle_before[:, 3:])
+    across = np.minimum(
+        0.25 * k_r * np.linalg.norm(twist, axis=1), torque_across(gains, parameters)
+    )
+    sides, whole = np.hypot(k_r + rate, across) + np.hypot(rate, across), k_r + 2 * rate
+    price = np.divide(sides**2, 2 * whole, out=np.zeros_like(whole), where=whole > 0) - 0.5 * whole
+    return np.where(across > 0, price, 0.0)
 
 
 def _drained(steps: Array, start: float) -> Array:

@@ -39,15 +39,15 @@ from hapticbridge.certificate import (
 )
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
+from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
 from hapticbridge.loop_setting import fresh_share
 from hapticbridge.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.recording.seal import SignatureCheck, check_signature
 from hapticbridge.rendering import Method, RunCoupling
 from hapticbridge.run_description import meta_start, requested_of
 from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import RunTimes, Timekeeping, motors_pushed
+from hapticbridge.timekeeping import RunTimes, Timekeeping
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]
@@ -60,7 +60,7 @@ class AuditReport:
     Attributes:
         path: The recording.
         verdict: ``passive``, ``active`` or ``invalid``; ``unverified`` if the records alone are
-            passive, but the run was not simulated again or no trusted key signed the file.
+            passive, but the run was not simulated again.
         environment: ``strict`` (Σ E_k <= 0 held), ``within slack`` or ``active``; None if invalid.
         certified: True if the recorded device bears the coupling and the run kept its time; None if
             its damping is unknown or its motion is prescribed.
@@ -74,10 +74,6 @@ class AuditReport:
         is_cut: True if the file lacks the end of its run, or did before a repair; the verdict is on
             the rest.
         cut: Reasons for that, as a sentence; else empty.
-        signature: Result of the signature's check, as a sentence; without a key, what only a key
-            would prove.
-        is_trusted: True if a trusted key signed exactly this file, False if not; such a run is
-            never passive. None if no trusted key was named.
         ticks: Number of records.
         duration: Time of the run's clock at the last record in s, with missed deadlines. If the
             recorded times are impossible, the number of records times the period.
@@ -95,8 +91,7 @@ class AuditReport:
             needed than available; None if b is unknown or the motion prescribed.
         energies: Energies at the end, in J.
         start_potential: Potential energy before the first tick in J; its zero is arbitrary.
-        max_net_energy: Largest energy in J that the hand had got beyond what it put in and what
-            the device's damping burned; of several hands that of the one with most.
+        hand_energies: Energy that each hand got and what paid for it; empty if invalid.
         events: Number of events of each kind.
         findings: Faults of the scene of which the run warned, as sentences.
         accepts_unverified: True if ``unverified`` counts as a success in ``exit_code``.
@@ -117,8 +112,6 @@ class AuditReport:
     resimulation: str = ""
     is_cut: bool = False
     cut: str = ""
-    signature: str = ""
-    is_trusted: bool | None = None
     ticks: int = 0
     duration: float = 0.0
     conditions: tuple[str, ...] = ()
@@ -129,7 +122,7 @@ class AuditReport:
     damping_margin: float | None = None
     energies: dict[str, float] = field(default_factory=dict)
     start_potential: float = 0.0
-    max_net_energy: float = 0.0
+    hand_energies: tuple[HandEnergy, ...] = ()
     events: dict[str, int] = field(default_factory=dict)
     findings: tuple[str, ...] = ()
     accepts_unverified: bool = False
@@ -143,20 +136,25 @@ class AuditReport:
     def to_json(self) -> str:
         """Returns the report as one JSON object; a number that is not finite becomes null."""
         values = asdict(self) | {"path": str(self.path), "margin": self.margin}
+        values["max_net_energy"] = self.max_net_energy
         if not self.hands:
             del values["hands"]
         return json.dumps(finite_or_null(values), indent=2, allow_nan=False)
 
     @property
-    def has_pushed(self) -> bool:
-        """True if motors of the scene may have given the hand energy; see ``motors_pushed``."""
-        return motors_pushed(self.energies.get("actuator_work", 0.0), self.max_net_energy)
+    def max_net_energy(self) -> float:
+        """Largest net energy to a hand in J."""
+        return max((each.net for each in self.hand_energies), default=0.0)
+
+    @property
+    def hand_energy(self) -> HandEnergy:
+        """Energy of the hand that decides (``hand_energy.worst_of``)."""
+        return worst_of(self.hand_energies or (HandEnergy(),))
 
     @property
     def exit_code(self) -> int:
         """0 if passive (or unverified, if accepted) and not known to lack damping, else 1."""
-        is_accepted = self.accepts_unverified and self.is_trusted is not False
-        accepted = ("passive", "unverified")[: 1 + is_accepted]
+        accepted = ("passive", "unverified")[: 1 + self.accepts_unverified]
         return 0 if self.verdict in accepted and self.certified is not False else 1
 
     @property
@@ -231,11 +229,11 @@ class PassivityTally:
     """Energies of a recording against their bounds, collected block by block.
 
     Attributes:
-        is_watched: True if the device port is judged by its energy. A device that meets its
-            condition behind a coupling law is proven safe without it.
+        is_watched: True if the device port is judged by any excess of its energy. A device that
+            meets its condition behind a coupling law is judged by unpaid energy alone.
         energies: Energies after the newest tick, in J.
         slack_share: Largest share of the slack that was used.
-        max_net_energy: Largest net energy to the hand in J (``EnergyBalance.net_energy``).
+        hand_energy: Energy that the hand got and what paid for it.
         unstrict: First tick beyond (14) itself, with the energy created.
         active: First tick beyond the slack, with the energy beyond it.
         excess: First tick in which the device received excess energy, and that energy.
@@ -244,7 +242,7 @@ class PassivityTally:
     is_watched: bool
     energies: dict[str, float] = field(default_factory=dict)
     slack_share: float = 0.0
-    max_net_energy: float = 0.0
+    hand_energy: HandEnergy = field(default_factory=HandEnergy)
     unstrict: tuple[int, float] | None = None
     active: tuple[int, float] | None = None
     excess: tuple[int, float] | None = None
@@ -257,13 +255,23 @@ class PassivityTally:
         allowed = balance.slack + rounding
         used = float(np.max(np.where(is_unstrict, created / allowed, 0.0)))
         self.slack_share = max(self.slack_share, used)
-        self.max_net_energy = max(self.max_net_energy, float(np.max(balance.net_energy)))
         self.unstrict = self.unstrict or _first(is_unstrict, created, start)
         self.active = self.active or _first(created > allowed, created - balance.slack, start)
         if self.is_watched:
             excess = balance.excess_device_energy
             self.excess = self.excess or _first(excess > rounding, excess, start)
+        else:
+            unpaid = balance.unpaid_energy
+            self.excess = self.excess or _first(unpaid > INSTANT, unpaid, start)
         last = ticks[-1]
+        self.hand_energy = HandEnergy(
+            net=max(self.hand_energy.net, float(np.max(balance.net_energy))),
+            unpaid=max(self.hand_energy.unpaid, float(np.max(balance.unpaid_energy))),
+            springs=balance.springs,
+            scene=balance.scene_loss,
+            motors=float(last["actuator_work"]),
+            inputs=float(last["external_work"]),
+        )
         self.energies = {name: float(last[name]) for name in _RECORDED} | {
             "coupling_work": float(balance.coupling_work[-1]),
             "environment_energy": float(created[-1]),
@@ -313,8 +321,7 @@ def decide(
     Args:
         fault: Fault that makes the recording invalid, or None.
         energies: Energies of a recording without a fault.
-        gap: Clause with the reason why the run is not called passive: it was not simulated again,
-            or no trusted key signed the file. Empty without such a reason.
+        gap: Clause with the reason why the run was not simulated again; empty if it was.
         strict: True accepts only (14) itself, not the slack that the device condition leaves.
     """
     found = _decide_on_records(fault, energies, strict=strict)
@@ -365,7 +372,6 @@ def _decide_on_records(
 @np.errstate(all="ignore")  # numbers of a damaged file may overflow; the result is then a fault
 def verdict_on(
     path: str | Path,
-    trusted: Mapping[str, str] | None,
     *,
     strict: bool,
     accepts_unverified: bool,
@@ -373,21 +379,16 @@ def verdict_on(
 ) -> AuditReport:
     """Judges a recording; implements ``audit.audit``.
 
-    ``trusted`` holds the comments of trusted public keys; None checks no signature.
-
     Raises:
         RecordingError: The file is not a recording.
         ForeignSceneError: Its scene crashed MuJoCo, or takes too much memory or time.
     """
     recordings = open_hands(path)
     recording = recordings[0]
-    signature = check_signature(recording.seal, _unsignable(recording), trusted)
     facts: dict[str, Any] = {
         "path": recording.path,
         "is_cut": bool(recording.cut_sentence),
         "cut": recording.cut_sentence,
-        "signature": signature.sentence,
-        "is_trusted": signature.is_trusted,
         "ticks": recording.count,
         "events": _event_counts(recording),
         "findings": tuple(
@@ -421,7 +422,9 @@ def verdict_on(
                     fault = _replay_fault(outcome)
     except RecordingError as error:
         fault = Fault(str(error))
-    gap = _gap(signature, outcome)
+    gap = "" if outcome.has_run else f"the run was {outcome.agreement}; in its records alone"
+    if any(event.get("unsound") for event in recording.events):
+        gap = "MuJoCo could not simulate the scene to the end; until then"
     found = asdict(decide_on_hands(fault, energies, gap=gap, strict=strict))
     if fault is None:
         if not outcome.has_run:
@@ -431,13 +434,13 @@ def verdict_on(
     return AuditReport(**facts, **found)
 
 
-def _motor_words(work: float, net: float) -> str:
-    """Returns a clause on motors of the scene that pushed the hand; empty if none did."""
-    if not motors_pushed(work, net):
-        return ""
-    return (
-        f"the scene's motors did {format_energy(work)} of work and the hand got up to "
-        f"{format_energy(net)} beyond what it put in, which only --energy-limit bounds"
+def _hand_words(facts: Mapping[str, Any]) -> str:
+    """Returns a clause for each hand that got more than ``INSTANT``; empty without one."""
+    grips = facts.get("hands") or ("",)
+    return "; ".join(
+        f"net to the hand{f' at {grip!r}' if grip else ''} {energy.sentence}"
+        for grip, energy in zip(grips, facts["hand_energies"], strict=True)
+        if energy.net > INSTANT
     )
 
 
@@ -498,19 +501,6 @@ def _hands_fault(hands: Sequence[AuditedHand]) -> Fault | None:
     return None
 
 
-def _unsignable(recording: RecordingFile) -> str:
-    """Returns why a file cannot be what was signed; empty if it can."""
-    return recording.cut_sentence or recording.seal_fault or "; ".join(recording.problems)
-
-
-def _gap(signature: SignatureCheck, outcome: ReplayOutcome) -> str:
-    """Returns why the run is not called passive, as the beginning of a sentence, or nothing."""
-    reasons = [signature.sentence] if signature.is_trusted is False else []
-    if not outcome.has_run:
-        return "; ".join([*reasons, f"the run was {outcome.agreement}; in its records alone"])
-    return f"{reasons[0]}; apart from that" if reasons else ""
-
-
 def _fault_in_ticks(
     hands: Sequence[AuditedHand],
     energies: Sequence[PassivityTally],
@@ -530,9 +520,9 @@ def _fault_in_ticks(
     fault, facts["duration"] = _check_records(hands, energies, timings)
     facts["energies"] = _energies_of_hands(energies)
     facts["start_potential"] = meta_start(hands[0].recording.meta, "start_potential")[0]
-    facts["max_net_energy"] = max(each.max_net_energy for each in energies)
-    for hand, own, timing in zip(hands, of_hands, timings, strict=True):
-        own.update(_time_facts(hand.run, hand.recording, timing, own["certified"]))
+    facts["hand_energies"] = tuple(each.hand_energy for each in energies)
+    for hand, own, timing, tally in zip(hands, of_hands, timings, energies, strict=True):
+        own.update(_time_facts(hand, timing, own["certified"], tally.hand_energy))
         fault = fault or first_contradiction(event_statements(hand.recording, timing))
     return fault
 
@@ -540,11 +530,13 @@ def _fault_in_ticks(
 def _notes(facts: Mapping[str, Any], events: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """Returns what a reason adds on a recording without a fault, in clauses; some are empty."""
     kept = facts.get("timekeeping")
-    doubt = "" if kept is None else kept.fault
-    if facts["certified"] is False and not (kept and kept.refutation):
-        doubt = "the device has less damping than the coupling needs"
-    pushed = _motor_words(facts["energies"]["actuator_work"], facts["max_net_energy"])
-    return kept.silence if kept else "", doubt, pushed, unusual_end(events), facts["unchecked"]
+    energy = worst_of(facts["hand_energies"])
+    cause = kept.refutation(energy) if kept else ""
+    doubt = kept.fault if kept else ""
+    if facts["certified"] is False and cause in ("", energy.fault):
+        doubt = cause or (kept.lack if kept else "the device has less than the coupling needs")
+    silence = kept.silence if kept else ""
+    return silence, doubt, _hand_words(facts), unusual_end(events), facts["unchecked"]
 
 
 def _check_records(
@@ -607,6 +599,9 @@ def _block_fault(block: AuditedBlock, balance: EnergyBalance, events: RunEvents)
 def _replay_fault(outcome: ReplayOutcome) -> Fault | None:
     if not outcome.disagrees:
         return None
+    if outcome.warning:
+        reason = f"simulated again, tick {outcome.tick} is refused: {outcome.warning}"
+        return Fault(reason, outcome.tick, outcome.field)
     return Fault(
         f"simulated again, tick {outcome.tick} differs in {outcome.field} by "
         f"{outcome.difference:.3g}: the recording was changed, or the scene was changed during "
@@ -654,9 +649,10 @@ def _device_facts(run: AuditedRun, recording: RecordingFile) -> dict[str, Any]:
 
 
 def _time_facts(
-    run: AuditedRun, recording: RecordingFile, timing: TimingTally, certified: bool | None
+    hand: AuditedHand, timing: TimingTally, certified: bool | None, energy: HandEnergy
 ) -> dict[str, Any]:
     """Returns the time that a run kept, and its device's verdict and margin at this time."""
+    run, recording = hand.run, hand.recording
     times = RunTimes(
         ticks=timing.ticks,
         fresh=fresh_share(run.info, run.parameters.period, timing.fresh, timing.due),
@@ -675,7 +671,7 @@ def _time_facts(
     )
     conditions = run_conditions(run.info, run.worst, run.method) if run.method.has_law else ()
     kept = Timekeeping.from_times(times, run.worst, conditions)
-    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified)}
+    facts: dict[str, Any] = {"timekeeping": kept, "certified": kept.certified(certified, energy)}
     if kept.conditions:
         facts["damping_margin"] = damping_margin(kept.conditions)
     return facts

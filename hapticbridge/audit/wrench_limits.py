@@ -153,7 +153,7 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     ticks, parameters = block.ticks, events.parameters
     yield from _handle_deviations(block, events)
     if parameters.has_law and parameters.law_evaluations == 1:
-        law = wrench_by_law(ticks, events.gains(ticks["tick"]), parameters.period, block.motion)
+        law = wrench_by_law(ticks, events.gains(ticks["tick"]), parameters, block.motion)
         for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
             law[:, part] = _shortened(law[:, part], limit)
         yield Deviation.between(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from hapticbridge.arguments import Arguments
 from hapticbridge.certificate import UNKNOWN_DAMPING
 from hapticbridge.check.cost import CostMeter, processor_costs
-from hapticbridge.check.observe import Playback, Setting, quiet
+from hapticbridge.check.observe import Playback, Setting
 from hapticbridge.check.perception import FeltError, felt_error
 from hapticbridge.check.simplify import (
     OTHER_MOTIONS,
@@ -27,6 +27,7 @@ from hapticbridge.check.simplify import (
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.device import Motion
 from hapticbridge.errors import HapticBridgeError, SceneError
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource
 
 # Judgement of one version of a scene

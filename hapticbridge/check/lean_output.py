@@ -1,147 +1,24 @@
-"""MJCF file of the leanest version, read back and judged again."""
+"""Leanest version of a scene: JSON facts, and an MJCF file that is read back and judged again."""
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from operator import attrgetter
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
 
 import mujoco
-import numpy as np
 
-from hapticbridge.check.lean import (
-    CREATES,
-    IS_FELT,
-    MAY_GO,
-    NOT_BORNE,
-    SAVES_NOTHING,
-    WARNS,
-    Lean,
-    VariantVerdict,
-)
-from hapticbridge.check.observe import quiet
+from hapticbridge.check.lean import Lean, VariantVerdict
 from hapticbridge.check.perception import FeltError
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.check.version import SceneVariant
 from hapticbridge.errors import SceneError
-from hapticbridge.plotting import new_figure
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene import SceneSource, read_scene
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-
-# Plot of cost against felt error
-
-
-_COLOURS = {
-    MAY_GO: "#26a269",
-    SAVES_NOTHING: "#5e5c64",
-    IS_FELT: "#c01c28",
-    CREATES: "#c64600",
-    WARNS: "#986a44",
-    NOT_BORNE: "#813d9c",
-}
-_MARKERS = {MAY_GO: "o", SAVES_NOTHING: "s", IS_FELT: "^", CREATES: "X", WARNS: "P", NOT_BORNE: "v"}
-_PATH = "#1a5fb4"
-
-LINEAR = 0.01
-"""Felt error in JND below which the axis is linear, so that zero can be shown."""
-
-LINE = 0.19
-"""Height of a name in inches: 8 points and a gap."""
-
-NAMES = 1.04
-"""Left edge of the column of names, in widths of the axes."""
-
-
-def draw_lean(lean: Lean, name: str) -> Figure:
-    """Draws cost against felt error of every version that was tried."""
-    tried = [trial for trial in lean.alone if trial.error is not None]
-    points = [(trial.name, trial, _COLOURS[trial.verdict]) for trial in tried]
-    points += [(f"{k}: {trial.name}", trial, _PATH) for k, trial in enumerate(lean.together, 1)]
-    figure = new_figure(8.0, max(4.2, 1.3 + LINE * len(points)))
-    axes = figure.add_subplot()
-    axes.set_yscale("symlog", linthresh=LINEAR)
-    budget = lean.judge.budget
-    axes.set_ylim(-0.35 * LINEAR, 2.5 * max([budget, *(trial.jnd for _, trial, _ in points)]))
-    axes.set_xlim(0.0, 1.06 * max([104.0, *(trial.percent for _, trial, _ in points)]))
-    axes.axvline(100.0, color="0.8", linewidth=1.0, zorder=0)
-    for verdict in dict.fromkeys(trial.verdict for trial in tried):
-        those = [trial for trial in tried if trial.verdict == verdict]
-        axes.plot(
-            [trial.percent for trial in those],
-            [trial.jnd for trial in those],
-            _MARKERS[verdict],
-            color=_COLOURS[verdict],
-            markersize=6,
-            alpha=0.8,
-            label=f"alone: {verdict}",
-        )
-    axes.plot(
-        [100.0, *(trial.percent for trial in lean.together)],
-        [0.0, *(trial.jnd for trial in lean.together)],
-        "D-",
-        color=_PATH,
-        markersize=6,
-        zorder=3,
-        label="taken together, in order" if lean.together else None,
-    )
-    axes.axhline(
-        budget, color="black", linewidth=1.0, linestyle="--", label=f"budget: {budget:g} JND"
-    )
-    _write_names(axes, points)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel("cost (processor time, % of the scene as it is)")
-    axes.set_ylabel("felt error (just noticeable differences)")
-    axes.set_title(f"{name}: what could go without being felt", loc="left", fontsize=11)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    return figure
-
-
-def _write_names(axes: Axes, points: list[tuple[str, VariantVerdict, str]]) -> None:
-    """Writes the names in a column beside the axes, each with a line to its point.
-
-    Names at the points would overlap, because many points coincide.
-    """
-    order = sorted(points, key=lambda point: (point[1].jnd, -point[1].percent))
-    heights = np.linspace(0.0, 1.0, len(order)) if len(order) > 1 else np.array([0.5])
-    for height, (name, trial, colour) in zip(heights, order, strict=True):
-        axes.annotate(
-            name,
-            xy=(trial.percent, trial.jnd),
-            xytext=(NAMES, float(height)),
-            textcoords="axes fraction",
-            fontsize=8,
-            color=colour,
-            va="center",
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "alpha": 0.5},
-        )
-
-
-# Results of a search as JSON facts and CSV
-
-TABLE_ENDING = ".csv"
-
-Row = dict[str, str | float | int | None]
-
-
-def lean_rows(lean: Lean) -> list[Row]:
-    """Returns one row per trial: each alone, those combined, and the final version.
-
-    ``step`` is empty for single trials and counts the combined ones.
-    """
-    steps = [("", trial) for trial in lean.alone]
-    steps += [(str(k), trial) for k, trial in enumerate(lean.together, 1)]
-    return [{"step": step, **trial_facts(trial)} for step, trial in [*steps, ("all", lean.result)]]
-
-
-def trial_facts(trial: VariantVerdict) -> Row:
+def trial_facts(trial: VariantVerdict) -> dict[str, str | float | int | None]:
     """Returns one trial as a dictionary; values that a failed trial lacks are None."""
     error = trial.error
     return {
@@ -189,43 +66,6 @@ def lean_facts(lean: Lean, written: VariantVerdict | None = None) -> dict[str, o
         "substeps": lean.draft.setting.substeps,
         "written": None if written is None else trial_facts(written),
     }
-
-
-def check_table(path: Path, scenes: Iterable[Path]) -> None:
-    """Checks that a table can be written, before the search starts.
-
-    ``scenes`` are MJCF files, existing or to be written.
-
-    Raises:
-        SceneError: Its name does not end in .csv, its folder does not exist, or it would be read as
-            a scene's hand motion.
-    """
-    if path.suffix.lower() != TABLE_ENDING:
-        raise SceneError(f"cannot write the table to '{path}': its name must end in {TABLE_ENDING}")
-    if not path.absolute().parent.is_dir():
-        raise SceneError(f"cannot write the table to '{path}': its folder does not exist")
-    for scene in scenes:
-        if path.resolve() == scene.with_suffix(TABLE_ENDING).resolve():
-            raise SceneError(
-                f"'{path}' would be taken for the hand's motion in '{scene.name}'; choose another "
-                "name"
-            )
-
-
-def write_table(lean: Lean, path: Path) -> None:
-    """Writes the trials as CSV.
-
-    Raises:
-        SceneError: The file cannot be written.
-    """
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            rows = lean_rows(lean)
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
-    except OSError as error:
-        raise SceneError(f"cannot write the table to '{path}': {error.strerror}") from None
 
 
 ENDING = ".xml"

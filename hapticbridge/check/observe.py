@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -15,7 +14,8 @@ from numpy.typing import NDArray
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
 from hapticbridge.jit import direct
-from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.codes import OK, WARNINGS, warning_words
+from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.rigid_contact import DEPENETRATION, SOFTNESS
 from hapticbridge.kernel.state import BoundKernel
@@ -243,7 +243,12 @@ def rehearse(scene: Scene, samples: NDArray[np.void], setting: Setting) -> Playb
 
 
 def not_finite(scene: Scene, tick: int, ticks: int) -> SceneError:
-    """Returns the error for a motion that became not finite at a tick."""
+    """Returns the error for a motion with a result that is not usable at a tick."""
+    code = warning_of(scene.data)
+    if code in WARNINGS:
+        return SceneError(
+            f"scene '{scene.name}', tick {tick} of {ticks} of the motion: {warning_words(code)}"
+        )
     return SceneError(
         f"scene '{scene.name}' is not finite after tick {tick} of {ticks} of the motion"
     )
@@ -400,17 +405,6 @@ def observe(
         environment=ledger.environment,
         slack_share=ledger.slack_share,
     )
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Suppresses MuJoCo's printed warnings and its file MUJOCO_LOG.TXT; counters still count."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _note_contacts(

@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import Setting, quiet, rehearsal_parameters
+from hapticbridge.check.observe import Setting, rehearsal_parameters
 from hapticbridge.coupling import Coupling
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SUBSTEPS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step

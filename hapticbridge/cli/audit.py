@@ -157,10 +157,6 @@ class Audit:
     in_process: bool = False
     """Simulate in this process, for recordings of a known origin: without the child process whose
     memory and time are limited."""
-    trust: Annotated[Path | None, tyro.conf.arg(metavar="KEY")] = None
-    """File of public ed25519 keys (KEY.pub), one a line; needs the extra 'sign'. What none of them
-    signed ('hapticbridge run --sign'), or was changed or cut since, is 'unverified', never passive,
-    with exit code 1."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print the reports as a JSON list."""
     plot: Path | None = None
@@ -203,8 +199,6 @@ class Audit:
         if self.jobs is not None or self.scheduler is not None:
             err.print("note: --jobs and --scheduler are for several recordings; here is one")
         if self.what_if:
-            if self.trust is not None:
-                raise RecordingError("--trust judges the recording, --what-if other runs: one each")
             return self._ask(files[0])
         first = "the first audit on a machine compiles for up to a minute"
         with working(f"auditing {plain(str(files[0]))} ({first})"):
@@ -213,7 +207,6 @@ class Audit:
                 strict=self.strict,
                 accepts_unverified=self.accept_unverified,
                 in_process=self.in_process,
-                trust=self.trust,
             )
         if self.as_json:
             out.print_json(json.dumps([json.loads(report.to_json())]))
@@ -251,10 +244,11 @@ class Audit:
             remedy = cause.remedy
         else:
             created = report.energies.get("environment_energy", 0.0)
-            remedy = trip_remedy(report.reason, work, created)
+            inputs = report.energies.get("external_work", 0.0)
+            remedy = trip_remedy(report.reason, work, created, input_work=inputs)
         if remedy:
             out.print(f"what to change: {plain(remedy)}")
-        page = "active-verdict" if cause is not None or report.has_pushed else "faults"
+        page = "active-verdict" if cause is not None or report.hand_energy.limit else "faults"
         out.print(f"next: hapticbridge guide {page}")
 
     def _audit_many(self, files: list[Path]) -> int:
@@ -269,7 +263,6 @@ class Audit:
                     strict=self.strict,
                     accepts_unverified=self.accept_unverified,
                     in_process=self.in_process,
-                    trust=self.trust,
                     jobs=self.jobs,
                     scheduler=self.scheduler,
                     progress=show,
@@ -379,13 +372,11 @@ def _print_report(report: AuditReport) -> None:
     if not report.conditions and report.verdict != "invalid":
         out.print(f"  {_without_condition(report)}")
     if kept is not None and report.conditions:
-        out.print(f"  {kept.device_words(report.certified, has_pushed=report.has_pushed)}")
+        out.print(f"  {kept.device_words(report.certified, report.hand_energy)}")
     if report.is_cut:
         mend = f"'hapticbridge repair {shlex.quote(str(report.path))} OUTPUT' makes it whole"
         hint = f"; {mend}" if CUT in report.cut else ""
         out.print(plain(f"  {report.cut}: the verdict is on what it holds{hint}"))
-    if report.signature not in report.reason:
-        out.print(f"  {plain(report.signature)}")
     unusual = {name: count for name, count in report.events.items() if name not in _USUAL_EVENTS}
     if unusual:
         listed = ", ".join(f"{name} ({count})" for name, count in unusual.items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,21 +22,13 @@ from hapticbridge.lab.chart.setting import (
     rate_settings,
     settings_for,
 )
-from hapticbridge.lab.chart.work import (
-    WORK_ENDINGS,
-    measure_loops,
-    measure_work,
-    write_work,
-)
 from hapticbridge.lab.chart.workload import Workload
 from hapticbridge.lab.engines.base import available_engines, caught_prints, open_engine
 from hapticbridge.lab.maps import MAPS, MapFiles, StabilityMap, run_map
 
 ALL = "all"
 
-WORK, SLOW_SCENE = "work", "slow_scene"
-QUICK_SIZE = 30
-"""Largest scene of a quick chart of work."""
+SLOW_SCENE = "slow_scene"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +37,8 @@ class Chart:
 
     The scene is point_mass, spinning_body, spring_arm, tap, rod_impact, sliding_block, stack, jam,
     hex_socket or peg_in_hole, which have references of their own, or any scene with a hand path
-    beside it, which is compared with finer steps. slow_scene is 'beads' with --scene-rates. 'work'
-    in place of a scene charts what a tick costs as a scene grows. Writes SCENE.png, .svg, .csv and
-    .json into the folder.
+    beside it, which is compared with finer steps. slow_scene is 'beads' with --scene-rates. Writes
+    SCENE.png, .svg, .csv and .json into the folder.
 
     Example:
         hapticbridge chart peg_in_hole --out charts
@@ -73,15 +64,12 @@ class Chart:
     def execute(self) -> int:
         """Measures the chart; returns the exit code."""
         is_rates = self.scene_rates or self.scene == SLOW_SCENE
-        if is_rates or self.scene == WORK:
-            if self.methods is not None or self.steps is not None or self.engines:
-                name = "--scene-rates" if self.scene_rates else f"'{self.scene}'"
-                raise StudyError(
-                    f"{name} has settings of its own; it takes neither --methods nor --steps nor "
-                    "--engines"
-                )
-            if not is_rates:
-                return self._execute_work()
+        if is_rates and (self.methods is not None or self.steps is not None or self.engines):
+            name = "--scene-rates" if self.scene_rates else f"'{self.scene}'"
+            raise StudyError(
+                f"{name} has settings of its own; it takes neither --methods nor --steps nor "
+                "--engines"
+            )
         with err.status("preparing references …"):
             workload, settings, periods = self._rates() if is_rates else self._usual()
         paths = prepared_files(self.out, workload.name)
@@ -108,20 +96,6 @@ class Chart:
         scene = "beads" if is_named else self.scene
         workload = SceneRates(scene, SLOW_SCENE if is_named else f"{Path(scene).stem}_rates")
         return workload, rate_settings(), []
-
-    def _execute_work(self) -> int:
-        paths = prepared_files(self.out, WORK, WORK_ENDINGS)
-        with progress(f"chart {WORK}") as show:
-            chart = measure_work(most=QUICK_SIZE if self.quick else None, progress=show)
-        with err.status("running whole loops …"):
-            chart = replace(chart, loops=measure_loops())
-        facts = write_work(chart, paths)
-        if self.as_json:
-            print_json(facts)
-        else:
-            out.print(plain(facts["paragraph"]))
-        err.print("wrote " + ", ".join(plain(str(path)) for path in paths.values()))
-        return 0
 
     def _peers(self) -> list[str]:
         """Returns the requested engines that are installed; prints which are not."""

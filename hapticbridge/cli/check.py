@@ -9,7 +9,7 @@ import textwrap
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import tyro
@@ -36,15 +36,7 @@ from hapticbridge.check.lean import (
     checked_budget,
     find_lean,
 )
-from hapticbridge.check.lean_output import (
-    check_table,
-    check_target,
-    draw_lean,
-    lean_facts,
-    write_lean,
-    write_table,
-)
-from hapticbridge.check.observe import quiet
+from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
 from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
@@ -52,14 +44,11 @@ from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.plotting import check_ending, write_picture
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import plain_model, read_scene, settings_from
 from hapticbridge.units import format_si
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 _HEADINGS = ("alone", "cost", "JND", "tool force, RMS", "peak", "tool torque, RMS", "tool off by")
 """Headings of the table of trials. JND is the felt error in just noticeable differences."""
@@ -304,7 +293,7 @@ class Check:
     knowing, such as what a run changes by itself, is nothing wrong.
 
     Example:
-        hapticbridge check my_tool.xml --lean --plot lean.png --write lean.xml
+        hapticbridge check my_tool.xml --lean --write lean.xml
     """
 
     FIRST_OPTIONS: ClassVar = (
@@ -347,16 +336,13 @@ class Check:
     """Edge in m of the cube that your device reaches; by default that of the largest table-top
     devices."""
     plot: Path | None = None
-    """Draw what the scene costs into this picture (.png, .svg or .pdf); with --lean instead cost
-    against felt error of everything that was tried."""
+    """Draw what the scene costs into this picture (.png, .svg or .pdf)."""
     lean: bool = False
     """Try what could go without being felt: each simplification alone, then greedily together."""
     budget: float | None = None
     """Felt error in just noticeable differences that --lean allows; by default 1."""
     write: Path | None = None
     """Write the leanest scene to this file (.xml), read it back, judge it again; implies --lean."""
-    table: Path | None = None
-    """Write all that --lean tried as a table (.csv); implies --lean."""
     overwrite: bool = False
     """Replace the scene of --write if the file exists."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
@@ -365,7 +351,7 @@ class Check:
     def execute(self) -> int:
         """Checks and prints; returns the exit code."""
         check_ending(self.plot)
-        wants_lean = self.lean or self.write is not None or self.table is not None
+        wants_lean = self.lean or self.write is not None
         if self.budget is not None and not wants_lean:
             raise SceneError("--budget goes with --lean")
         if self.overwrite and self.write is None:
@@ -376,10 +362,6 @@ class Check:
             plain_model(source)
         if self.write is not None:
             check_target(source, self.write, overwrite=self.overwrite)
-        if self.table is not None:
-            check_table(
-                self.table, [path for path in (source.path, self.write) if path is not None]
-            )
         period = None if self.rate is None else period_of(self.rate)
         with progress("leading it through its motion") as show:
             case = open_case(
@@ -415,10 +397,10 @@ class Check:
             facts = _facts(case, inventory, faults, cost)
             print_json(facts if lean is None else facts | {"lean": lean_facts(lean, written)})
         if self.plot is not None:
-            figure = _picture(case, cost, lean)
-            if figure is not None:
-                write_picture(figure, self.plot)
-            outcome = "wrote" if figure is not None else "there is nothing to draw in"
+            if cost is not None:
+                title = f"{case.scene.name}: what a tick costs"
+                write_picture(draw_cost(cost, title), self.plot)
+            outcome = "wrote" if cost is not None else "there is nothing to draw in"
             err.print(f"{outcome} {plain(str(self.plot))}")
         is_worse = written is not None and written.verdict not in (MAY_GO, SAVES_NOTHING)
         return 1 if not is_sound or is_worse or (wants_lean and lean is None) else 0
@@ -444,9 +426,6 @@ class Check:
         """Prints and writes what was found; returns the written scene's trial."""
         if not self.as_json:
             print_lean(lean)
-        if self.table is not None:
-            write_table(lean, self.table)
-            err.print(f"wrote {plain(str(self.table))}")
         if self.write is None:
             return None
         if not lean.together:
@@ -461,12 +440,6 @@ class Check:
         asked = {"stiffness": self.stiffness, "damping": self.damping}
         gains = {name: gain for name, gain in asked.items() if gain is not None}
         return replace(default_coupling(info, period, self.scale, self.scale), **gains)
-
-
-def _picture(case: SceneUnderCheck, cost: Cost | None, lean: Lean | None) -> Figure | None:
-    if lean is not None:
-        return draw_lean(lean, case.scene.name)
-    return None if cost is None else draw_cost(cost, f"{case.scene.name}: what a tick costs")
 
 
 def _facts(

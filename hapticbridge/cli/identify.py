@@ -31,7 +31,7 @@ from hapticbridge.identify.identify import (
     duration_at,
     measured_profile,
 )
-from hapticbridge.loop_setting import delay_ticks, whole_ticks
+from hapticbridge.loop_setting import Lag, delay_ticks, whole_ticks
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
@@ -136,7 +136,7 @@ def print_result(
     out.print(
         f"with the lower ends (b = {z.device_damping:.4g} N s/m) the largest safe stiffness "
         f"{'of a wall ' if z.delay else ''}is {z.limit[0]:.4g} N/m at B_law = 0 "
-        f"({z.corner_limited_by}){_with_more_damping(z)}"
+        f"({z.corner_limited_by}){_with_more_damping(z)}{_if_in_time(info, z.period)}"
     )
     out.print(f"use {coupling.sentences()[0]}")
     requested = coupling.requested
@@ -152,6 +152,12 @@ def _sheet_words(info: DeviceInfo, period: float) -> str:
     late = delay_ticks(info, period)
     ticks = "" if late is None else f"; the delay counts as {late} tick{'s' * (late != 1)}"
     return f"in a class of your own: DeviceInfo({listed}){ticks}"
+
+
+def _if_in_time(info: DeviceInfo, period: float) -> str:
+    """Returns a clause for a device that gives fewer samples than the loop that measured."""
+    count = Lag.of(info, period).ticks_per_sample
+    return f", if it gave a sample in every tick, not one in {count}" if count > 1 else ""
 
 
 def _with_more_damping(z: ZWidth) -> str:

@@ -210,7 +210,7 @@ class Export:
         if self.as_json:
             facts = {"files": [str(file) for file in done.files], "ticks": done.ticks}
             facts |= {"marks": marks, "is_cut": bool(found.cut_sentence)}
-            facts |= {"cut": found.cut_sentence, "damage": done.damage}
+            facts |= {"cut": found.cut_sentence, "damage": found.problems}
             print_json(facts)
         else:
             names = ", ".join(plain(str(file)) for file in done.files)
@@ -219,10 +219,10 @@ class Export:
                 out.print(f"marks at {', '.join(f'{time:.3f} s' for time in marks)}")
         if found.cut_sentence:
             err.print(f"[yellow]warning:[/yellow] {found.cut_sentence}; this is what it holds")
-        if done.damage:
-            damage = plain("; ".join(done.damage))
+        if found.problems:
+            damage = plain("; ".join(found.problems))
             err.print(f"[yellow]warning:[/yellow] the recording is damaged: {damage}")
-        return 1 if done.damage else 0
+        return 1 if found.problems else 0
 
     def _write_dataset(self) -> int:
         """Writes a data set; returns the exit code."""

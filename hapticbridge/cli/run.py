@@ -53,7 +53,6 @@ from hapticbridge.options import (
     steady_stiffness,
 )
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
-from hapticbridge.recording.seal import Signer
 from hapticbridge.rehearsal import static_load
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.scene import (
@@ -326,9 +325,6 @@ class Run:
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
-    sign: Annotated[Path | None, tyro.conf.arg(metavar="KEY")] = None
-    """Sign the recording with this private ed25519 key; needs the extra 'sign'. To make KEY and
-    KEY.pub: ssh-keygen -t ed25519 -N '' -f KEY. 'hapticbridge audit --trust KEY.pub' checks it."""
     method: str | None = None
     """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
     carried over; second order away from contact. 'implicit', the default with substeps: all of the
@@ -424,10 +420,6 @@ class Run:
             raise HapticBridgeError(
                 "--overwrite goes with --record FILE; nothing would be recorded"
             )
-        if self.sign is not None:
-            if self.record is None:
-                raise HapticBridgeError("--sign goes with --record FILE; nothing would be signed")
-            Signer.load(self.sign)  # refused before anything is opened
         if self.record is not None and self.record.exists() and not self.overwrite:
             raise RecordingError(f"'{self.record}' exists; choose another file or add --overwrite")
         clock = SimulatedClock() if self.fast else RealClock()
@@ -715,7 +707,6 @@ class Run:
             tool_weight=self.tool_weight,
             live=not self.as_json and (err.is_terminal or not (self.fast or self._is_viewed)),
             realtime=self.realtime or None,
-            sign=self.sign,
         )
 
     def _window(self) -> Window:

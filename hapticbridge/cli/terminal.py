@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
+from hapticbridge.errors import SceneError
 from hapticbridge.files import finite_or_null, printable
 
 if TYPE_CHECKING:
@@ -64,7 +65,11 @@ def compiling(scene: str) -> Iterator[None]:
 
 @contextmanager
 def warnings_in_a_sentence() -> Iterator[None]:
-    """Prints Python's and MuJoCo's warnings; MuJoCo would write MUJOCO_LOG.TXT beside the user."""
+    """Prints Python's and MuJoCo's warnings; MuJoCo would write MUJOCO_LOG.TXT beside the user.
+
+    Raises:
+        SceneError: MuJoCo stopped, for example because its stack is full.
+    """
     import mujoco  # noqa: PLC0415 - messages of the command line itself need none
 
     before = mujoco.get_mju_user_warning()
@@ -73,6 +78,8 @@ def warnings_in_a_sentence() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment] # names differ
             yield
+    except mujoco.FatalError as error:
+        raise SceneError(f"MuJoCo stopped: {' '.join(str(error).split())}") from None
     finally:
         mujoco.set_mju_user_warning(before)
 

@@ -176,6 +176,11 @@ class Zwidth:
                 for name, value in numbers.items()
             }
             delay = delay_ticks(info, period) or 0
+            if (count := Lag.of(info, period).ticks_per_sample) > 1:
+                notify(
+                    f"the lines hold for a sample in every tick; this device gives one in {count}: "
+                    "--rate lowers the loop's, and 'hapticbridge bound --device' counts it"
+                )
         if numbers["damping"] is None:
             missing = "the device's is unknown" if info else "it is missing"
             raise HapticBridgeError(
@@ -260,7 +265,7 @@ def _measured_facts(measured: MeasuredWidth | None) -> dict[str, object]:
 
 def _print_measured(measured: MeasuredWidth) -> None:
     """Prints what was borne beside what theory says."""
-    headings = ["B_law", "borne to K", "not borne from K", "safe for any hand"]
+    headings = ["B_law", "borne to K", "not borne from K", "safe by theory"]
     table = Table(*headings, "without a hand", box=None, pad_edge=False)
     unheld = measured.unheld or (None,) * len(measured.limits)
     for limit, safe, free in zip(measured.limits, measured.predicted, unheld, strict=True):
@@ -395,7 +400,8 @@ class Bound:
     ) -> None:
         method = default_method()
         (sentence,) = shown.sentences()
-        out.print(f"{sentence}; the device needs b >= KT/2 + B_law")
+        needs = "" if b is None and self.device else "; the device needs b >= KT/2 + B_law"
+        out.print(f"{sentence}{needs}")
         table = Table("", "damping needed", "most at", box=None, pad_edge=False)
         if b is not None:
             table.add_column("holds")

@@ -175,6 +175,29 @@ JUMPED, BACKWARDS, STRETCHED, TWISTED, GAVE_ENERGY = 11, 12, 13, 14, 15
 """Reasons of the guard to refuse a tick: the device's pose jumped; time ran backwards; the coupling
 is too long; it is turned too far; the device received too much energy."""
 
+CONTACTS_FULL, CONSTRAINTS_FULL = 16, 17
+"""Warnings of MuJoCo that refuse a tick: contacts or constraint rows were dropped, because they do
+not fit into its memory."""
+
+WARNINGS = {
+    CONTACTS_FULL: "MuJoCo's memory holds no more contacts, so bodies would pass each other",
+    CONSTRAINTS_FULL: "MuJoCo's memory holds no more constraints, so nothing would be held",
+}
+"""Reasons in words, by result."""
+
+_MORE_MEMORY = 'give MuJoCo more memory in the scene, such as <size memory="100M"/>'
+WARNING_REMEDIES = {
+    CONTACTS_FULL: _MORE_MEMORY,
+    CONSTRAINTS_FULL: _MORE_MEMORY,
+}
+"""Remedies by result, for ``WARNINGS``."""
+
+
+def warning_words(code: int) -> str:
+    """Returns reason and remedy of a result in ``WARNINGS``, as a sentence."""
+    return f"{WARNINGS[code]}; {WARNING_REMEDIES[code]}"
+
+
 HAND_CODES = 100
 """Factor of a hand's number in the result of a tick that was refused for one of several hands."""
 

@@ -82,10 +82,12 @@ COUPLING_DTYPE = np.dtype(
         ("owed", "<f8", 2),  # energy in J that late samples have put into the springs
         ("hold", "<f8", 2),
         ("idle", "<f8", 2),
+        ("twist_damping", "<f8"),
     ]
 )
 """Sub-record ``coupling``, written by this module alone. ``hold`` is the most force in N and torque
-in N m along axes without motor, ``idle`` those while the hand is let go."""
+in N m along axes without motor, ``idle`` those while the hand is let go. ``twist_damping`` in
+N m s/rad, seen at the tool, is the damping that pays for a torque across the motion."""
 
 _GAINS = 10  # numbers per actuator in actuator_gainprm and actuator_biasprm (mjNGAIN, mjNBIAS)
 
@@ -111,7 +113,7 @@ def slack_gains(parameters: RunParameters) -> tuple[float, float]:
     evaluation of the law per tick g = K + B'/T.
 
     With n > 1 evaluations g = ½ (K/n + B'/T), which is the ``SLACK_SHARE`` of each evaluation's
-    slack ½ (K + nB'/T) ‖δx_i‖² (``certificate.required_damping``). A record holds only δx_k, the
+    slack ½ (K + nB'/T) ‖δx_i‖² (``loop_setting.required_damping``). A record holds only δx_k, the
     sum of all δx_i. For a given sum the slack is least if all δx_i are equal, so that g bounds it
     from below.
     """
@@ -147,6 +149,7 @@ def bind_coupling(coupling: Part, parameters: RunParameters, gains: tuple[float,
     coupling["lacks_motors"] = guarding.motors != ALL_MOTORS
     coupling["hold"] = guarding.hold_force, guarding.hold_torque
     coupling["idle"] = guarding.idle_force, guarding.idle_torque
+    coupling["twist_damping"] = guarding.twist_damping * parameters.scale / parameters.force_scale
 
 
 def set_tuning_goal(
@@ -188,6 +191,39 @@ def law_wrench(
         scaled(k.rotational_damping * rate, subtract(handle_turn, turned)),
     )
     return force, torque
+
+
+# A torque across the motion
+#
+# About a twist φ the midpoint form of the rotational spring differs from the law by a part across
+# the motion δφ_h − δφ_x, of a = K_r φ/4 in N m/rad. ``theory.bounds.midpoint_damping`` has what it
+# costs; here it is solved for the a that the device's damping pays for.
+
+
+@compiled
+def twist_price(s: State, twist: float) -> float:
+    """Returns the damping b_r/T in N m/rad that a twist in rad costs beyond K_r/2 + B'_r/T."""
+    k, rate = s.coupling.rotational_stiffness, s.coupling.rotational_damping / s.run.period
+    across = min(0.25 * k * twist, torque_across(s))
+    if across <= 0.0 or s.coupling.twist_damping == np.inf:
+        return 0.0
+    far = math.sqrt((k + rate) ** 2 + across**2) + math.sqrt(rate**2 + across**2)
+    return float(far * far / (2.0 * (k + 2.0 * rate)) - (0.5 * k + rate))
+
+
+@compiled
+def torque_across(s: State) -> float:
+    """Returns the largest a in N m/rad for which the device's damping pays."""
+    k, rate = s.coupling.rotational_stiffness, s.coupling.rotational_damping / s.run.period
+    b = s.coupling.twist_damping / s.run.period
+    if k <= 0.0 or b == np.inf:
+        return np.inf
+    whole = k + 2.0 * rate
+    if b <= 0.5 * whole:
+        return 0.0
+    root = math.sqrt(2.0 * whole * b)  # p + q
+    near = 0.5 * (root - k * whole / root)  # q
+    return math.sqrt(max(near * near - rate * rate, 0.0))
 
 
 @compiled
@@ -321,26 +357,28 @@ def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float,
         interval: Time t since the last new sample in s.
 
     Returns:
-        K, K/2 + B'/T, K/2 + B'/T − b/t and ‖d‖². b is the device's damping seen at the handle, at
-        least what the condition needs.
+        K, K/2 + B'/T, K/2 + B'/T + c − b/t and ‖d‖². b is the device's damping seen at the handle,
+        at least what the condition needs; c is what a torque across the motion costs.
     """
     k, run, pose = s.coupling, s.run, s.pose
-    stiffness, damping = k.stiffness, k.damping
+    stiffness, damping, across = k.stiffness, k.damping, 0.0
     b, d = run.device_damping / (run.force_scale * run.scale), vector_of(pose.handle_step)
     if kind == 1:
         stiffness, damping = k.rotational_stiffness, k.rotational_damping
         b = run.device_rotational_damping * run.scale / run.force_scale
         d = vector_of(pose.handle_turn)
+        if run.scheme == Scheme.MIDPOINT:
+            across = twist_price(s, norm(vector_of(s.lossless.twist)))
     b = max(b, 0.5 * stiffness * run.period + damping)
     needed = 0.5 * stiffness + damping / run.period
-    return stiffness, needed, needed - b / interval, dot(d, d)
+    return stiffness, needed, needed + across - b / interval, dot(d, d)
 
 
 @compiled
 def charge_lateness(s: State, interval: float) -> None:
     """Charges the springs with the energy that a late sample may have put in.
 
-        D = (K/2 + B'/T − b/t) ‖d‖²,    b >= K T/2 + B'
+        D = (K/2 + B'/T + c − b/t) ‖d‖²,    b >= K T/2 + B' + c T
 
     d is the handle's step in m, t the time in s since the last sample, T the period. The hand has
     felt a held force while the spring was stretched by d; the device burned b ‖d‖²/t. D is below

@@ -21,6 +21,10 @@ changes keep S. B' is equal on both sides, so one device condition covers both. 
 contact, a device with just enough damping for free motion would bounce off the wall again and again
 (``theory.bounds``).
 
+About a large twist the midpoint torque would ask more damping of the device than the law does.
+Beyond the twist for which the device's reserve pays, it turns into the law's own torque
+(``midpoint_torque``). Nothing else of the step changes, so its balance holds as before.
+
 Springs and dampers of the tool's joints and tendons are taken at the midpoint too
 (``kernel.springs``).
 
@@ -49,7 +53,7 @@ from hapticbridge.kernel.codes import (
 from hapticbridge.kernel.explicit_bias import take_back, write_bias
 from hapticbridge.kernel.force_level import limited_wrench, limited_wrench_after_step
 from hapticbridge.kernel.handle import handle_of_step, note_tool, tool_after_step
-from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains, torque_across
 from hapticbridge.kernel.ledger import (
     add_body_wrenches,
     set_kinetic_energy,
@@ -83,6 +87,7 @@ from hapticbridge.pose import (
     Vector,
     add,
     conjugate,
+    norm,
     product,
     quaternion_exp,
     quaternion_of,
@@ -366,19 +371,22 @@ def _take_back(s: State, kinetic: float, own: float) -> float:
 
 
 @compiled
-def midpoint_torque(s: State, tool: Quaternion, turned: Vector) -> Vector:
+def midpoint_torque(s: State, tool: Quaternion, turned: Vector, law: Vector) -> Vector:
     """Returns the coupling's torque on the tool, in the world frame, by the midpoint rule.
 
     In the tool's frame, with B_r = B'_r + K_r T/2,
 
         τ = K_r (φ_k + φ_{k−1})/2 + (B_r/T) [½ (R_kᵀ + R_{k−1}ᵀ) δφ_h − R_kᵀ δφ_x]
 
-    The force keeps its law: K (e_k + e_{k−1})/2 + (B/T) δe = K e_k + (B'/T) δe in translation.
+    The force keeps its law: K (e_k + e_{k−1})/2 + (B/T) δe = K e_k + (B'/T) δe in translation. In
+    rotation this torque differs from the law's by K_r φ/4 times the motion, across it. Beyond the
+    twist for which the device's damping pays (``law.torque_across``) the difference grows no more.
 
     Args:
         s: The bound state, still with the tool's orientation before the step.
         tool: Its orientation after it.
         turned: Its rotation vector δφ_x in rad.
+        law: The torque K_r φ_k + (B'_r/T) (δφ_h − δφ_x) in N m.
     """
     to_before, to_after = conjugate(quaternion_of(s.pose.tool_quaternion)), conjugate(tool)
     before, after = vector_of(s.lossless.twist), twist_in_tool(s, tool)
@@ -389,7 +397,12 @@ def midpoint_torque(s: State, tool: Quaternion, turned: Vector) -> Vector:
     ) / s.run.period
     spring = scaled(0.5 * s.coupling.rotational_stiffness, add(after, before))
     damper = scaled(rate, subtract(handles, rotated(to_after, turned)))
-    return rotated(tool, add(spring, damper))
+    torque = rotated(tool, add(spring, damper))
+    across = 0.25 * s.coupling.rotational_stiffness * max(norm(before), norm(after))
+    most = torque_across(s)
+    if across <= most:
+        return torque
+    return add(law, scaled(most / across, subtract(torque, law)))
 
 
 @compiled
@@ -436,8 +449,8 @@ def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
     half_force, half_torque = rotated(handle_frame, half[0]), rotated(handle_frame, half[1])
     position, orientation, moved, turned = tool_after_step(s)
     tool = position, orientation
-    force, torque = law_wrench(s, handle_of_step(s, True), tool, moved, turned)
-    torque = midpoint_torque(s, orientation, turned)
+    force, law = law_wrench(s, handle_of_step(s, True), tool, moved, turned)
+    torque = midpoint_torque(s, orientation, turned, law)
     # the torque is carried in the tool's frame, so that it turns with the tool
     to_before = conjugate(quaternion_of(s.pose.tool_quaternion))
     store_vector(lossless.applied_half[0:3], half_force)

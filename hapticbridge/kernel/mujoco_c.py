@@ -23,8 +23,13 @@ from mujoco.introspect import ast_nodes, structs
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError
-from hapticbridge.jit import Deferred, compiled, external, intrinsic
-from hapticbridge.kernel.codes import Part
+from hapticbridge.jit import Deferred, compiled, direct, external, intrinsic
+from hapticbridge.kernel.codes import (
+    BAD_RESULT,
+    CONSTRAINTS_FULL,
+    CONTACTS_FULL,
+    OK,
+)
 
 
 def library_path() -> Path:
@@ -170,30 +175,55 @@ def pointer_at(address: int) -> int:
     return int(wide_ints(address, 1)[0])
 
 
-_DIVERGED = tuple(
-    int(kind)
-    for kind in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-        mujoco.mjtWarning.mjWARN_BADCTRL,
-    )
-)
-_FIRST_DIVERGED, _LAST_DIVERGED = min(_DIVERGED), max(_DIVERGED)
+_KINDS = int(mujoco.mjtWarning.mjNWARNING)
+_FULL_OF_CONTACTS = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
+_FULL_OF_CONSTRAINTS = int(mujoco.mjtWarning.mjWARN_CNSTRFULL)
+_SINGULAR = int(mujoco.mjtWarning.mjWARN_INERTIA)
 
 
 @compiled
-def has_warned(mj: Part) -> bool:
-    """Returns True if MuJoCo found a position, velocity, acceleration or control that is no number.
+def warning_at(address: int) -> int:
+    """Returns the result for MuJoCo's warnings since they were forgotten; ``OK`` without one.
 
-    MuJoCo also counts values above mjMAXVAL = 1e10, which are finite but no motion.
+    ``BAD_RESULT`` is a position, velocity, acceleration or control that is no number, or beyond
+    mjMAXVAL = 1e10, which is finite but no motion. A singular inertia, of which a solver with few
+    iterations warns too, does not count: 'check' counts it. ``address`` is that of
+    ``mjData.warning``.
     """
     # mjWarningStat: two integers, the second is the count
-    counts = ints(mj.warnings, 2 * _LAST_DIVERGED + 2)
-    total = 0
-    for kind in range(_FIRST_DIVERGED, _LAST_DIVERGED + 1):
-        total += counts[2 * kind + 1]
-    return total > 0
+    counts, total = ints(address, 2 * _KINDS), 0
+    for kind in range(_KINDS):
+        total += counts[2 * kind + 1] if kind != _SINGULAR else 0
+    if total == 0:
+        return OK
+    if counts[2 * _FULL_OF_CONTACTS + 1] > 0:
+        return CONTACTS_FULL
+    if counts[2 * _FULL_OF_CONSTRAINTS + 1] > 0:
+        return CONSTRAINTS_FULL
+    return BAD_RESULT
+
+
+def warning_of(data: mujoco.MjData) -> int:
+    """Returns the result for MuJoCo's warnings on a scene, as ``warning_at``."""
+    address = field_address(data, "warning")
+    return int(direct(warning_at, address)(address))
+
+
+def forget_warnings(data: mujoco.MjData) -> None:
+    """Sets the counts of MuJoCo's warnings to zero."""
+    for warning in data.warning:
+        warning.number = 0
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppresses MuJoCo's printed warnings and its file MUJOCO_LOG.TXT; counters still count."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 _SCALARS: dict[str, Any] = {

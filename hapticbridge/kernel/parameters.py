@@ -84,6 +84,9 @@ class GuardParameters:
         swing_energy: Energy in J that a late force would give within 0.3 s, at a limit of 10 N or
             0.5 N m, above which the watch suspects the device (``kernel.swing_watch``).
         runaway_speed: Speed in m/s gained against a limit of 10 N above which it does.
+        twist_damping: Damping in N m s/rad that pays for a torque across the motion
+            (``kernel.law.torque_across``); 0 if the device's is unknown or it answers late, inf if
+            no torque acts on a hand.
         stated_delay: Delay in s that the device states; 0 without a statement.
         delay_margin: Time in s by which a delay must exceed the stated one to be a finding.
 
@@ -116,6 +119,7 @@ class GuardParameters:
     idle_torque: float = math.inf
     swing_energy: float = math.inf
     runaway_speed: float = math.inf
+    twist_damping: float = math.inf
     stated_delay: float = 0.0
     delay_margin: float = math.inf
 
@@ -128,6 +132,10 @@ class GuardParameters:
                 raise HapticBridgeError(
                     f"guard: {_words(name)} is {value!r}; it must be finite and >= 0"
                 )
+        if not is_number(self.twist_damping) or not self.twist_damping >= 0:
+            raise HapticBridgeError(
+                f"guard: twist damping is {self.twist_damping!r}; it must be >= 0"
+            )
         for name in (*_POSITIVE, *_TRIPS):
             value = getattr(self, name)
             if not is_number(value) or not value > 0:

@@ -12,6 +12,7 @@ import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
+from hapticbridge.kernel.law import pulled, spring_energy
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, norm, scaled
 
@@ -54,6 +55,9 @@ OBSERVER_DTYPE = np.dtype(
         ("net_device_energy", "<f8"),
         ("guarded_energy", "<f8"),
         ("max_guarded_energy", "<f8"),
+        ("hand_energy", "<f8"),
+        ("springs", "<f8"),
+        ("max_unpaid_energy", "<f8"),
         ("created_energy", "<f8"),
         ("previous_created", "<f8"),
         ("previous_net_storage", "<f8"),
@@ -66,7 +70,9 @@ OBSERVER_DTYPE = np.dtype(
 )
 """Sub-record ``observer``, written by this module alone; symbols in ``observe_energy``. Dampings in
 N s/m and N m s/rad, energies in J, velocities in m/s and rad/s. ``max_guarded_energy`` is the
-largest ``guarded_energy`` so far. ``reversals`` holds one bit per tick."""
+largest ``guarded_energy`` so far. ``hand_energy`` is Σ (w·δp − b ‖δp‖²/t − W_u), ``springs`` the
+energy of the coupling's springs at the start and after each reset, ``max_unpaid_energy`` the
+largest unpaid energy (``hand_energy.HandEnergy``). ``reversals`` holds one bit per tick."""
 
 
 def bind_observer(observer: Part, guarding: GuardParameters) -> None:
@@ -77,6 +83,16 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
     observer["max_damping"] = guarding.max_damping
     observer["max_rotational_damping"] = guarding.max_rotational_damping
     observer["energy_credit_limit"] = guarding.energy_credit_limit
+
+
+@compiled
+def credit_springs(s: State) -> None:
+    """Adds the present energy of the coupling's springs to what may reach the hand."""
+    k, level = s.coupling, s.level.level
+    stretch, twist = pulled(s)
+    held = spring_energy(k.stiffness, norm(stretch), level[0])
+    held += spring_energy(k.rotational_stiffness, norm(twist), level[1])
+    s.observer.springs += held
 
 
 def observe_reset(s: State, stored_before: float) -> None:
@@ -192,6 +208,8 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         ``created_energy``: Σ E_k of the environment minus its slack, and at least −A_max.
         ``guarded_energy``: result of the function of that name. If a motor in the scene
         pushes the hand, that energy counts as excess, and so does unfelt work.
+        ``max_unpaid_energy``: largest Σ (w·δp − b ‖δp‖²/t − W_u) − q max(V_0 − Σ E − W_c, 0), with
+        the springs' energy V_0 and the coupling's work W_c.
 
     Valid for a wrench that is held constant between ticks. A certified device keeps A <= 0.
 
@@ -226,9 +244,14 @@ def observe_energy(s: State, moved: Vector, turned: Vector, interval: float) -> 
         a[i] = max(a[i] + linear, -limit)
         a[3 + i] = max(a[3 + i] + angular, -limit)
         delivered += linear + angular
-    gained -= unfelt_work(s, moved, turned)
+    unfelt = unfelt_work(s, moved, turned)
+    gained -= unfelt
     observer.observed_energy = max(observer.observed_energy + delivered + gained, -limit)
     observer.net_device_energy += delivered
+    observer.hand_energy += delivered - unfelt
+    released = observer.springs - energy.environment_energy - energy.coupling_work
+    paid = (s.run.force_scale / s.run.scale) * max(released, 0.0)
+    observer.max_unpaid_energy = max(observer.max_unpaid_energy, observer.hand_energy - paid)
     observer.guarded_energy = guarded_energy(s)
     observer.max_guarded_energy = max(observer.max_guarded_energy, observer.guarded_energy)
     for i in range(6):

@@ -88,7 +88,7 @@ SHOWN_DTYPE = np.dtype(
     [
         ("is_shown", "<i8"),
         ("is_beside", "<i8"),
-        ("has_failed", "<i8"),
+        ("failure", "<i8"),
         ("waits", "<i8"),
         ("scene_step", "<i8"),
         ("age", "<i8"),
@@ -115,7 +115,8 @@ SHOWN_DTYPE = np.dtype(
     ]
 )
 """Sub-record ``shown``, written by this module alone. ``is_beside`` is 1 in the
-scene's own loop, which writes ``before`` alone. ``waits`` is 1 while the scene has a handle,
+scene's own loop, which writes ``before`` alone. ``failure`` is the result of a step of the scene
+that is not usable, else ``OK``. ``waits`` is 1 while the scene has a handle,
 ``scene_step`` counts the scene's steps shown so far, ``age`` the ticks since the last handle was
 handed over, ``held_back`` those in which the tank was too low for y*, ``silence`` those since the
 newest result. ``lead`` in s is the age of the newest result when it was taken over. ``tank`` D,
@@ -148,9 +149,9 @@ def tool_geoms(model: mujoco.MjModel, grip_site: int) -> NDArray[np.int32]:
     return np.ascontiguousarray(is_tool, dtype=np.int32)
 
 
-def fail_scene(shown: Part) -> None:
-    """Notes that the scene has no usable result; the tick then trips."""
-    shown["has_failed"] = 1
+def fail_scene(shown: Part, code: int) -> None:
+    """Notes why the scene has no usable result, unless it is ``OK``; the tick then trips."""
+    shown["failure"] = code
 
 
 @compiled

@@ -73,11 +73,12 @@ from hapticbridge.kernel.ledger import (
     start_energies,
 )
 from hapticbridge.kernel.lossless import LOSSLESS_DTYPE, bind_lossless, note_twist, restart_lossless
-from hapticbridge.kernel.mujoco_c import MJ_DTYPE, model_addresses
+from hapticbridge.kernel.mujoco_c import MJ_DTYPE, forget_warnings, model_addresses
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.passivity_controller import (
     OBSERVER_DTYPE,
     bind_observer,
+    credit_springs,
     observe_reset,
 )
 from hapticbridge.kernel.rigid_contact import RIGID_DTYPE, bind_contact, restore_model
@@ -216,6 +217,7 @@ class BoundKernel:
         self.state = np.zeros(1, STATE_DTYPE) if place.state is None else place.state
         self.row = np.zeros(1, TICK_DTYPE) if place.row is None else place.row
         self._hand, self._meters_scene = place.hand, place.hand == 0 or place.state is None
+        forget_warnings(data)  # those of a start or a trial are not the run's
         # the addresses in the state point into them
         self._model, self._data, self._loop = model, data, loop
         self._grip = parameters.grip
@@ -310,6 +312,7 @@ class BoundKernel:
         after = float(s["energy"]["kinetic"] + s["energy"]["potential"])
         add_reset_work(s["energy"], after - before)
         observe_reset(s, before)
+        direct(credit_springs, s)(s)
         if self._loop is None:
             let_go(s["guard"])
         if s["run"]["scheme"] == Scheme.MIDPOINT:
@@ -411,6 +414,7 @@ class BoundKernel:
         else:
             direct(refresh_energies, s)(s)
         start_energies(s["energy"])
+        direct(credit_springs, s)(s)
         if parameters.scene_ticks:
             direct(start_shown, self.state)(self.state)
         elif parameters.scheme == Scheme.MIDPOINT:

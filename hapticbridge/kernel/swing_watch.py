@@ -34,6 +34,9 @@ Findings, for translation and rotation each; E is 8 mJ at a limit of 10 N or 0.5
     ms without a stated delay, with E_s >= E for 40 ms; or c <= 0 and p < 0.6 with c_s >= 0.4 for 12
     ms. The greatest ratio r of the lever between device and handle is halved, hence the stiffness
     quartered; again for each E_s >= E.
+    slammed: √(Σ W²/0.1 s) >= 0.3 of the limit, Σ W² >= 0.9 of that above 4 Hz, and Σ W·V <= b Σ
+    V²/2, for 0.3 s. r is halved. No hand swings so fast, and a passive scene drives no such swing
+    of a device that takes what its damping burns. A motor or a texture of the scene gives more.
     coarse: 3 steps within 0.3 s. r is halved. A step is a new sample that follows equal ones of 4
     ms and more, and over which the coupling pulls with half the limit, r K ‖δp‖ >= F/2.
 
@@ -66,18 +69,22 @@ in a rattling peg is taken for a fault. A hand that yields to torque as its own 
 swing has p = 0.9, c = −0.04, x > 0.6 and c_s = 0.76; faults have p < 0.6. They reach p = −0.95, c =
 −0.99, x = 0.99 and c_s = 0.9. Work alone cannot tell them apart: E_s of a firm hand is up to 200 E.
 
+Slams, of 15 to 80 g on a device 1 or 2 ms late, have 0.6 to 0.7 of the limit at 50 to 70 Hz. Honest
+hands, textures and light devices reach 0.2 for 0.3 s.
+
 Steps of 4 mm swing between two samples 40 to 90 times a second and give at most 17 mJ. A device
 that starts from rest moves by 0.1 mm in a tick of 1 ms: 10 N on 0.05 kg.
 
-Limits of the method: a motor that holds for 60 ms gives two fingers up to 0.4 J within one hold,
-before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12 to 20 ms
-late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms later than
-its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late is not
-found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s. A weak hand that follows
-a reversed force slowly looks like one that pushes. Exchanged axes and 300 N/m let an arm swing at 2
-Hz, where the watch sees little, and give up to 7.3 J. A hand stronger than any force, as a robot's,
-whose speed jumps is taken for a late device. A device with prescribed motion is not watched
-(``guard.guard_parameters_for``).
+Limits of the method: a slam gives up to 0.9 J before it is found, and one below 0.3 of the limit up
+to 0.04 W for as long as it lasts. A motor that holds for 60 ms gives two fingers up to 0.4 J within
+one hold, before a lower force could reach it, and 0.8 J where two throws were needed. A torque 12
+to 20 ms late gives two fingers up to 0.5 J within the throw in which it is found. A torque 2 ms
+later than its device states gives them up to 0.7 J. If a device states no delay, a force 2 ms late
+is not found; it lets light fingers swing, and they get up to 4.7 J within 2.5 s. A weak hand that
+follows a reversed force slowly looks like one that pushes. Exchanged axes and 300 N/m let an arm
+swing at 2 Hz, where the watch sees little, and give up to 7.3 J. A hand stronger than any force, as
+a robot's, whose speed jumps is taken for a late device. A device with prescribed motion is not
+watched (``guard.guard_parameters_for``).
 """
 
 from __future__ import annotations
@@ -143,6 +150,11 @@ BLOCKS = 3
 STEPS, STEP = 3.0, 0.5
 """Number of steps for a finding, and the least share of the limit that a step is worth; no unit. A
 lower share takes steps of 0.2 mm at 2400 N/m and a limit of 2 N, which can be felt, for a fault."""
+
+SLAM, PURE = 0.3, 0.9
+"""Least RMS value of a slam as a share of the limit, and least Σ W² as a share of that above
+``SLOWEST``; no unit. A swing of 25 Hz has the share 0.9, the shaking of a hand at 11 Hz up to 0.2.
+A lower ``SLAM`` finds smaller swings, and takes rattles of a weak device for slams."""
 
 ANSWERS, STRIDE = 6, 2
 """Number of lags of c_s, and blocks from one to the next: 8, 16 to 48 ms. A motor that holds for 60
@@ -217,6 +229,7 @@ WATCH_DTYPE = np.dtype(
         ("fast_speed", "<f8", 6),
         ("mean_wrench", "<f8", 3),
         ("change", "<f8", 3),
+        ("swing_square", "<f8", 2),
         ("wrench_square", "<f8", 2),
         ("speed_square", "<f8", 2),
         ("change_square", "<f8", 2),
@@ -232,7 +245,7 @@ WATCH_DTYPE = np.dtype(
         ("gained", "<f8", 2),
         ("still", "<i8", 2),
         ("steps", "<f8", 2),
-        ("counts", "<i8", 10),
+        ("counts", "<i8", 12),
         ("stray", "<f8", 6),
         ("step", "<f8", 6),
         ("stood", "<i8", 2),
@@ -250,12 +263,13 @@ N m, ``late_energy`` E in J. ``cap`` is the greatest ratio after all findings, `
 allowed now, ``returns_to`` the ratio before a probe; ``probe_end`` and ``rest_end`` in blocks.
 ``wrench`` and ``motion`` are sums over the block. ``wrench_square`` to ``across`` are the sums over
 W and A, ``whole_square`` that of all acceleration; ``believed`` and ``delayed`` are E_0 and E_s;
-``late_along`` are the sums over W_{k−s}·A, and ``past_means`` and ``past_squares`` rings of W and Σ
-W². ``still`` counts the equal samples before this one, and ``steps`` the coarse steps of late;
-``counts`` are blocks in a row of late, reversed, exchanged, answered late and τ_0. ``stray`` is the
-way from where the handle stands, ``step`` the one step that it may make, ``stood`` the ticks since;
-``is_right`` is 1 for an axis once it moved as a motor that is right lets it, ``is_held`` while r
-waits for it to leave; c_s does not count before the block ``rings_end``."""
+``swing_square`` is Σ W² above 4 Hz; ``late_along`` are the sums over W_{k−s}·A, and ``past_means``
+and ``past_squares`` rings of W and Σ W². ``still`` counts the equal samples before this one, and
+``steps`` the coarse steps of late; ``counts`` are blocks in a row of late, reversed, exchanged,
+answered late, τ_0 and slams. ``stray`` is the way from where the handle stands, ``step`` the one
+step that it may make, ``stood`` the ticks since; ``is_right`` is 1 for an axis once it moved as a
+motor that is right lets it, ``is_held`` while r waits for it to leave; c_s does not count before
+the block ``rings_end``."""
 
 
 def bind_watch(watch: Part, parameters: RunParameters) -> None:
@@ -568,9 +582,24 @@ def _late_answer(watch: Part, kind: int, least: float) -> float:
 
 
 @compiled
+def _is_slammed(s: State, kind: int) -> bool:
+    """Adds a block to Σ W² above 4 Hz; returns True if the wrench swings as in a slam."""
+    watch, square = s.watch, 0.0
+    for i in range(3):
+        slow_wrench = watch.ring[6 * (watch.blocks % RING) + 3 * kind + i]
+        square += slow_wrench * slow_wrench
+    swing = watch.kept[0] * watch.swing_square[kind] + watch.block * square
+    watch.swing_square[kind] = swing
+    slam = FAST_MEMORY * (SLAM * watch.limits[kind] * watch.cap) ** 2
+    burnt = _damping(s, kind) * watch.speed_square[kind]
+    is_fast = watch.wrench_square[kind] >= max(slam, PURE * swing) and slam > 0.0
+    return bool(is_fast and watch.power[kind] <= 0.5 * burnt)
+
+
+@compiled
 def _verdict(s: State, kind: int) -> int:
     """Returns ``RUNS_AWAY`` or ``SWINGING`` for a finding, ``PROBED`` for a suspicion, else 0."""
-    watch, counts, at = s.watch, s.watch.counts, 5 * kind
+    watch, counts, at = s.watch, s.watch.counts, 6 * kind
     late = 0.0
     for d in range(len(LAGS)):
         late = max(late, watch.delayed[len(LAGS) * kind + d])
@@ -606,11 +635,13 @@ def _verdict(s: State, kind: int) -> int:
     is_answered = is_answered and _late_answer(watch, kind, least) >= ANSWERED
     is_answered = is_answered and watch.blocks >= watch.rings_end[kind]
     counts[at + 3] = counts[at + 3] + 1 if is_answered else 0
+    counts[at + 5] = counts[at + 5] + 1 if _is_slammed(s, kind) else 0
     if counts[at + 1] >= BLOCKS or counts[at + 2] >= BLOCKS:
         return RUNS_AWAY
     has_swung = watch.flags & SWINGING != 0
     is_coarse = watch.steps[kind] >= STEPS
     is_found = max(counts[at], counts[at + 3]) >= BLOCKS or counts[at + 4] >= DELAY_BLOCKS
+    is_found = is_found or counts[at + 5] >= watch.ring_blocks
     if is_coarse or is_found or (has_swung and is_working):
         return SWINGING
     is_suspicious = late >= MUCH * enough or watch.gained[kind] >= watch.gain[kind]

@@ -80,7 +80,6 @@ from hapticbridge.kernel.lossless import (
 )
 from hapticbridge.kernel.mujoco_c import (
     floats,
-    has_warned,
     ints,
     mj_contact_force,
     mj_fwd_position,
@@ -92,6 +91,7 @@ from hapticbridge.kernel.mujoco_c import (
     mj_step2,
     pointer_at,
     release_fence,
+    warning_at,
 )
 from hapticbridge.kernel.passivity_controller import (
     control,
@@ -406,10 +406,16 @@ def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
 
 
 @compiled
-def _has_failed(s: State) -> bool:
-    if s.run.scheme == Scheme.SHOWN:  # another thread may be in MuJoCo's step
-        return bool(s.shown.has_failed)
-    return bool(has_warned(s.mj))
+def _failure(s: State, square: float) -> int:
+    """Returns the result for a step that is not usable, or ``OK``; ``square`` is |wrench|²."""
+    # another thread may be in the step of a slower scene
+    is_shown = s.run.scheme == Scheme.SHOWN
+    code = s.shown.failure if is_shown else warning_at(s.mj.warnings)
+    # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
+    is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
+    if code == OK and (not math.isfinite(square) or (s.run.holds_wrench and is_too_large)):
+        return BAD_RESULT
+    return int(code)
 
 
 @compiled
@@ -432,8 +438,9 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
     uniformly within a tick, so the mean does the same work on it as the single wrenches.
 
     Returns:
-        ``OK``; ``BAD_RESULT``, or ``GAVE_ENERGY`` if the wrench would pass the energy limit in the
-        next tick. Unless it is ``OK``, the wrench on the device is zero.
+        ``OK``; ``BAD_RESULT`` or the result of a warning of MuJoCo (``mujoco_c.warning_at``);
+        ``GAVE_ENERGY`` if the wrench would pass the energy limit in the next tick. Unless it is
+        ``OK``, the wrench on the device is zero.
     """
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
@@ -496,10 +503,10 @@ def send_wrench(s: State, row: NDArray[np.void], contacts: int) -> int:
     loop = s.loop
     force, torque = vector_of(loop.wrench_on_tool), vector_of(loop.wrench_on_tool[3:6])
     square = dot(force, force) + dot(torque, torque)
-    # MuJoCo ignores a control beyond its limit, so a wrench to be applied must stay below
-    is_too_large = square > LARGEST_CONTROL * LARGEST_CONTROL
-    if not math.isfinite(square) or (s.run.holds_wrench and is_too_large) or _has_failed(s):
-        return refuse_tick(s)
+    code = _failure(s, square)
+    if code != OK:
+        refuse_tick(s)
+        return code
     _render(s, force, torque)
     if foreseen_excess(s) > s.guard.max_energy:
         refuse_tick(s)

@@ -28,7 +28,8 @@ term is not paid, so it is summed here, for translation and rotation each, as
 
     A_k = max(0, A_{k−1} + 3 κ (t_d/T) D_k²/τ_k − (b − N τ_k/T) d_k²/τ_k)
 
-d is the handle's motion with the device, D the larger one of this tick and the last. Each joule
+d is the handle's motion with the device, D the larger one of this tick and the last. N has here
+what a torque across the motion costs (``law.twist_price``), but not in κ. Each joule
 that b burns is counted once: first against the cost of late samples, whose sum is ``lent``, then
 against A.
 """

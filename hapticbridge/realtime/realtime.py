@@ -30,6 +30,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.kernel.parameters import MAX_SCENE_TICKS
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
@@ -228,7 +229,7 @@ def busy_step_time(scene: Scene, method: Method, period: float) -> float:
     before = direct(before_step, bound.state, sample, bound.row, 0, 0.0)
     end = direct(after_step, bound.state, bound.row, 0)
     times = [at_start]
-    with suppress(mujoco.FatalError):  # what diverges here is said when the run does
+    with suppress(mujoco.FatalError), quiet():  # what diverges here is said when the run does
         for k in range(STIRRED_STEPS):
             angle = 2.0 * math.pi * k / STIRRED_STEPS
             shares = math.sin(3.0 * angle), math.sin(2.0 * angle), 0.5 * (math.cos(angle) - 1.0)

@@ -3,8 +3,7 @@
 Read ``format`` first, the definition of a recording. Records leave the loop through ``ring``,
 events through a pipe. ``recorder`` is the loop's end of both, ``recorder_process`` the other;
 ``ring`` also holds the scene's newest positions for a viewer. ``writer`` writes a file, and a file
-that was cut anew. ``reader`` reads one, whole or damaged, through ``container``. ``seal`` holds the
-digest of the contents, the hash chain over the file, and the signature.
+that was cut anew. ``reader`` reads one, whole or damaged, through ``container``.
 """
 
 from hapticbridge.recording.format import Attachment as Attachment

@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from hapticbridge.errors import RecordingError
-from hapticbridge.recording.seal import CHAIN, INDEX, Chain, new_hash
 
 # Random access to a file's bytes
 
@@ -91,13 +90,6 @@ class FileBytes:
         for at in range(start, stop, WINDOW):
             crc = zlib.crc32(self[at : min(at + WINDOW, stop)], crc)
         return crc
-
-    def hash(self, start: int, stop: int) -> bytes:
-        """Returns the hash of a stretch, as ``seal.new_hash`` computes it."""
-        found = new_hash()
-        for at in range(start, stop, WINDOW):
-            found.update(self[at : min(at + WINDOW, stop)])
-        return found.digest()
 
     def is_zero_from(self, start: int) -> bool:
         """Returns True if all bytes from a position on are zero."""
@@ -218,17 +210,12 @@ class Container:
     Attributes:
         is_cut: True if the end of the file is missing.
         problems: Damage, one sentence each; complete after ``records`` is exhausted.
-        hashes: Chain and index as a seal holds them, if the last record is the seal; then complete
-            too. Empty if not ``is_hashed``.
     """
 
-    def __init__(self, data: FileBytes, *, is_hashed: bool = True) -> None:
-        self._data, self._is_hashed = data, is_hashed
-        self._hashes: list[bytes] = []
-        self.hashes: dict[str, str] = {}
+    def __init__(self, data: FileBytes) -> None:
+        self._data = data
         self.problems: list[str] = []
         self._summary, self._end = 0, len(data)
-        self._index = len(data)
         footer = len(data) - len(MAGIC) - _FOOTER_SIZE
         self.is_cut = not (
             footer >= len(MAGIC)
@@ -274,10 +261,7 @@ class Container:
             ahead: deque[_Record | Future[Block]] = deque()
             count, room = 0, FREE_SIZE + MAX_RATIO * len(self._data)
             for opcode, body, stop in self._data_section():
-                start, place = body - _RECORD.size, len(self._hashes)
-                self._hashes.append(b"")
-                if opcode != Opcode.CHUNK and self._is_hashed:
-                    self._hashes[place] = self._data.hash(start, stop)
+                start = body - _RECORD.size
                 if opcode == Opcode.CHUNK:
                     count += 1
                     size = self._claimed_size(body, stop)
@@ -290,7 +274,7 @@ class Container:
                         continue
                     room -= size
                     label = f"chunk {count} (at byte {start})"
-                    ahead.append(pool.submit(self._unpack, label, start, stop, place))
+                    ahead.append(pool.submit(self._unpack, label, start, stop))
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
                     ahead.append(Block(f"the record at byte {start}", self._data[start:stop]))
                 elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
@@ -301,15 +285,6 @@ class Container:
                     yield self._finished(ahead.popleft())
             while ahead:
                 yield self._finished(ahead.popleft())
-        if self._is_hashed:
-            self.hashes = self._hash()
-
-    def _hash(self) -> dict[str, str]:
-        chain = Chain()
-        for record_hash in self._hashes[:-1]:
-            chain.add(record_hash)
-        index = self._data.hash(self._index, len(self._data))
-        return {CHAIN: chain.hexdigest(), INDEX: index.hex()}
 
     def _claimed_size(self, body: int, stop: int) -> int:
         head = self._data[body : min(body + _CHUNK.size, stop)]
@@ -330,10 +305,8 @@ class Container:
             self.problems.append(f"{record.label} is damaged: {record.fault}")
         return record
 
-    def _unpack(self, label: str, start: int, stop: int, place: int) -> Block:
+    def _unpack(self, label: str, start: int, stop: int) -> Block:
         record = self._data[start:stop]
-        if self._is_hashed:
-            self._hashes[place] = new_hash(record).digest()
         fields = Fields(record, _RECORD.size, len(record))
         try:
             _, _, size, crc = _CHUNK.unpack(fields.raw(_CHUNK.size))
@@ -351,7 +324,8 @@ class Container:
                 crc = Fields(self._data, body, stop).number(4) if stop - body >= 4 else 0
                 if crc and self._data.checksum(0, body - _RECORD.size) != crc:
                     self.problems.append("the data section's checksum does not match")
-                self._index = stop
+                if not self.is_cut and stop != (self._summary or self._end):
+                    self.problems.append("the index does not follow the data section")
                 return
             yield opcode, body, stop
         if not self.is_cut:

@@ -11,7 +11,6 @@ the scene. The metadata ``hands`` hold what differs from the first hand's (``fur
 - Topic ``/event``, encoding ``json``: one object per event, with ``event`` (its name) and
 ``time_ns`` (since the start of the run).
 - Topics with types of ROS 2 for other programs, which follow from the above (``ros_messages``).
-- The metadata record ``hapticbridge.digest`` comes last (see ``seal``).
 
 The log time of a message is ``epoch_ns`` (in the metadata: Unix time of the run's start) plus the
 tick's ``deadline_ns`` or the event's ``time_ns``.
@@ -45,7 +44,6 @@ PROFILE = "ros2"
 """Profile of the file, by which readers of ROS 2 know it."""
 
 METADATA_NAME = "hapticbridge"
-DIGEST_NAME = "hapticbridge.digest"
 EPOCH_KEY = "epoch_ns"
 
 

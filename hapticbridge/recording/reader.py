@@ -21,7 +21,6 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording import ros_messages
 from hapticbridge.recording.container import MAGIC, Block, Container, DamageError, Fields, FileBytes
 from hapticbridge.recording.format import Attachment
-from hapticbridge.recording.seal import DIGEST, Digest, seal_fault
 
 # Metadata, attachments, events and ticks of a container
 
@@ -53,10 +52,9 @@ class Contents:
     Attributes:
         problems: Damage, one sentence each; appended to.
         take: Called with each run of records of a hand, in order, and the hand's number.
-        events: Payload and JSON object of each event.
+        events: JSON object of each event.
         attachments: Attachments in order.
         meta: The metadata; None before they are read.
-        seal: Entries of the seal; None before it is read.
         refusal: Reason why the records cannot be read; None if they can.
         keeps_events: True to parse events, and to compare the messages for ROS 2.
         has_messages: True if there are such messages.
@@ -64,10 +62,9 @@ class Contents:
 
     problems: list[str]
     take: Take
-    events: list[tuple[bytes, dict[str, Any]]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     meta: dict[str, str] | None = None
-    seal: dict[str, str] | None = None
     refusal: str | None = None
     keeps_events: bool = True
     has_messages: bool = False
@@ -95,10 +92,6 @@ class Contents:
             if self.meta is not None:
                 raise DamageError(f"there is a second metadata record '{name}'")
             self.meta = entries
-        elif name == layout.DIGEST_NAME:
-            if self.seal is not None:
-                raise DamageError(f"there is a second metadata record '{name}'")
-            self.seal = entries
 
     def add_attachment(self, fields: Fields) -> None:
         """Adds an attachment.
@@ -216,7 +209,7 @@ class Contents:
             raise DamageError("an event is not JSON") from error
         if not isinstance(event, dict):
             raise DamageError("an event is not a JSON object")
-        self.events.append((payload, event))
+        self.events.append(event)
         if messages := self._expected():
             time = event.get("time_ns")
             time = time if isinstance(time, int) else 0
@@ -279,8 +272,6 @@ class RecordingFile:
         attachments: Attached files by name.
         is_cut: True if the end of the file is missing because recorder or machine died; everything
             up to the last whole chunk is available.
-        seal: Entries of the seal (``recording.seal``) at the end of the file; empty without one.
-        computed_seal: Digest, chain and index hash of what was read.
         problems: Damage, one sentence each; empty for an undamaged file, even a cut one.
         hand: Number of the hand, from 0, whose records and metadata these are.
         hands: Number of hands that held the scene.
@@ -295,8 +286,6 @@ class RecordingFile:
     meta: dict[str, str]
     attachments: dict[str, bytes] = field(repr=False)  # megabytes
     is_cut: bool
-    seal: Mapping[str, str] = field(default_factory=dict)
-    computed_seal: Mapping[str, str] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     hand: int = 0
     hands: int = 1
@@ -308,27 +297,12 @@ class RecordingFile:
         return self.hands > 1
 
     @property
-    def digest(self) -> str | None:
-        """SHA-256 stored at the end, or None."""
-        return self.seal.get(DIGEST)
-
-    @property
     def period(self) -> float:
         """T in s as the metadata state it; NaN if they are damaged."""
         try:
             return float(self.meta["period_s"])
         except (KeyError, ValueError):
             return math.nan
-
-    @property
-    def computed_digest(self) -> str:
-        """SHA-256 of the contents that were read."""
-        return self.computed_seal[DIGEST]
-
-    @property
-    def seal_fault(self) -> str:
-        """Sentence if a whole file is not as it was sealed, else empty."""
-        return "" if self.is_cut else seal_fault(self.seal, self.computed_seal)
 
     @property
     def cut_sentence(self) -> str:
@@ -433,9 +407,8 @@ def read_hands(path: str | Path) -> tuple[Recording, ...]:
 def open_recording(path: str | Path, hand: int | None = None) -> RecordingFile:
     """Opens a recording; its ticks are loaded only if there are few (``MAX_KEPT``).
 
-    The file is read once for its digest, events and damage. Memory has a limit for any length of
-    the run, except for events. Events are kept in memory; a run with
-    an input in every tick has one per tick.
+    The file is read once for its events and damage. Memory use does not grow with the run's length,
+    except for its events, which are kept; a run with an input in every tick has one per tick.
 
     Args:
         path: The recording.
@@ -492,13 +465,11 @@ def _read_through(
 
     ``runs`` receives the records of the hand unless there are more than ``max_kept``.
     """
-    digest = Digest()
     counts, last, flags = [0] * layout.MAX_HANDS, [-1] * layout.MAX_HANDS, 0
     chosen = hand or 0
 
     def take(run: NDArray[np.void], hand: int) -> None:
         nonlocal flags
-        digest.add_ticks(run, hand)
         counts[hand] += run.size
         last[hand] = int(run["tick"][-1]) if run.size else last[hand]
         if hand != chosen:
@@ -526,22 +497,17 @@ def _read_through(
     is_whole = not container.is_cut and not contents.problems
     if is_whole and (fault := contents.message_fault()):
         contents.problems.append(fault)
-    digest.describe(meta, contents.attachments)
-    for payload, _ in contents.events:
-        digest.add_event(payload)
     facts = {
         "path": path,
         "count": min(counts[:hands]),
         "last_tick": min(last[:hands]),
         "flags": flags,
-        "events": [event for _, event in contents.events],
+        "events": contents.events,
         "meta": meta | layout.further_hands(meta)[chosen - 1] if chosen else meta,
         "hand": chosen,
         "hands": hands,
         "attachments": {each.name: each.data for each in contents.attachments},
         "is_cut": container.is_cut,
-        "seal": contents.seal or {},
-        "computed_seal": {DIGEST: digest.hexdigest(), **container.hashes},
         "problems": tuple(dict.fromkeys(contents.problems)),
     }
     return facts, contents.attachments
@@ -579,8 +545,7 @@ def _read_parts(
         if data[: len(MAGIC)] != MAGIC:
             what = "it is empty" if not len(data) else "it does not start with the MCAP magic"
             raise RecordingError(f"{path} is not an MCAP file: {what}")
-        # only the first reading keeps events, and compares the seal
-        container = Container(data, is_hashed=keeps_events)
+        container = Container(data)
         contents = Contents(container.problems, take, keeps_events=keeps_events)
         contents.add_block(container.summary())
         for record in container.records():

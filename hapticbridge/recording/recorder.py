@@ -30,7 +30,6 @@ from hapticbridge.recording import format as layout
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import read_hands, read_with_attachments
 from hapticbridge.recording.ring import TAIL, Ring
-from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import check_contents, is_being_recorded, rewrite
 from hapticbridge.signals import deferring_stops
 
@@ -235,12 +234,11 @@ class Recorder:
         self._send()
         return not self._is_closed and self._process.poll() is None
 
-    def close(self, signer: Signer | None = None) -> None:
+    def close(self) -> None:
         """Waits until the process has written all records and finished the file.
 
         Call it after the last record and event. A second call, or a call after a raised error, does
-        nothing. The wait ends ``STANDSTILL`` after the last sign of life. The process gets the key
-        of ``signer`` only here, so that a bridge that dies leaves an unsigned file.
+        nothing. The wait ends ``STANDSTILL`` after the last sign of life.
 
         Raises:
             RecordingError: The process died, could not write the file, or stands still and is left
@@ -249,8 +247,7 @@ class Recorder:
         if self._is_closed or self._has_failed:
             self._reap()
             return
-        end = {"close": True, "seed": "" if signer is None else signer.seed.hex()}
-        self._outbox += json.dumps(end).encode() + b"\n"
+        self._outbox += b'{"close":true}\n'
         answer = self._last_answer()
         if "left" in answer:
             self._leave(answer["left"])
@@ -565,11 +562,10 @@ class RecordStream:
         """Returns copies of the newest ``count`` ticks, oldest first, with a record per hand."""
         return self._ring.latest(self._hands * count)
 
-    def close(self, signer: Signer | None = None, *, is_discarded: bool = False) -> None:
+    def close(self, *, is_discarded: bool = False) -> None:
         """Waits until the recorder has finished the file, and removes the shared memory.
 
-        ``signer`` signs the file. A run that never began has no recording (``is_discarded``): its
-        file is removed.
+        A run that never began has no recording (``is_discarded``): its file is removed.
 
         Raises:
             RecordingError: The recorder's process died, could not write the file, or stands still.
@@ -578,7 +574,7 @@ class RecordStream:
             if self.recorder is not None and is_discarded:
                 self._discard(self.recorder)
             elif self.recorder is not None:
-                self._close_recorder(self.recorder, signer)
+                self._close_recorder(self.recorder)
         finally:
             if self._observer is not None:
                 self._observer.close()
@@ -592,9 +588,9 @@ class RecordStream:
         if path is not None and is_opened and not is_being_recorded(path):
             remove_file(path)
 
-    def _close_recorder(self, recorder: Recorder, signer: Signer | None) -> None:
+    def _close_recorder(self, recorder: Recorder) -> None:
         try:
-            recorder.close(signer)
+            recorder.close()
         except RecordingError as error:
             if recorder.is_left:
                 raise  # it may still write the file

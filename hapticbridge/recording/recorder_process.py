@@ -32,7 +32,6 @@ from hapticbridge.files import remove_file
 from hapticbridge.record import TickFlag
 from hapticbridge.recording.format import Attachment, further_hands
 from hapticbridge.recording.ring import Ring
-from hapticbridge.recording.seal import Signer
 from hapticbridge.recording.writer import RecordingWriter
 from hapticbridge.units import format_energy, format_forces
 
@@ -235,7 +234,6 @@ class _Session:
         self._last_time = 0
         self._last_tick = -1
         self._has_reported_full = False
-        self._signer: Signer | None = None
 
     def run(self, inbox: SimpleQueue[dict[str, Any] | None]) -> None:
         """Records until the bridge closes or dies."""
@@ -256,7 +254,7 @@ class _Session:
             self.ring.unlink()
             self._write_event({"event": "bridge_died", "tick": self._last_tick}, self._last_time)
         if self._writer is not None:
-            self._writer.close(self._signer)
+            self._writer.close()
             if end == "died" and self._last_tick < 0:  # before its first tick
                 remove_file(self._path)
         if self._live is not None:
@@ -291,8 +289,6 @@ class _Session:
             if message is None:
                 return "died"
             if "close" in message:
-                seed = bytes.fromhex(message["seed"])
-                self._signer = Signer(seed) if seed else None
                 return "closed"
             self._write_event(message, message["time_ns"])
 

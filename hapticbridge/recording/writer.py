@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
 import errno
 import os
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from hapticbridge.errors import RecordingError
 from hapticbridge.record import FORMAT, TICK_DTYPE
 from hapticbridge.recording import format as layout
-from hapticbridge.recording import ros_messages, seal
+from hapticbridge.recording import ros_messages
 from hapticbridge.recording.format import Attachment
 from hapticbridge.recording.reader import Recording, read_hands, read_with_attachments
 
@@ -124,7 +123,6 @@ class Output:
     Attributes:
         is_full: True if no more space could be reserved; at most ``RESERVE`` bytes are then left.
             Always False on a file system without reservation.
-        chain: Hash chain over the records written so far; every call writes whole records.
 
     Raises:
         OSError: It cannot be opened, or another bridge is recording to it.
@@ -151,7 +149,6 @@ class Output:
         self._claims = self._is_regular and sys.platform == "linux"
         self._fallocate = _fallocate() if self._claims else None
         self.is_full = False
-        self.chain = seal.Chain()
 
     def write(self, data: bytes) -> int:
         """Writes all data, then extends the reserve; about three calls per second."""
@@ -160,7 +157,6 @@ class Output:
             written = self._file.write(view)
             view = view[written:]
         self._position += len(data)
-        self.chain.add_records(data)
         if self._claims and data:  # a reservation of zero bytes is an error
             self._claim()
         return len(data)
@@ -215,24 +211,6 @@ def _fallocate() -> Callable[..., int] | None:
     return None
 
 
-class _Rehearsal:
-    """Stream at a position of a file that keeps what would be written there."""
-
-    def __init__(self, position: int) -> None:
-        self._position, self.data = position, b""
-
-    def write(self, data: bytes) -> int:
-        self._position += len(data)
-        self.data += data
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-
-_DATA_END_SIZE = 13  # record head and checksum
-
-
 class RecordingWriter:
     """Writer of one recording, for the recorder's process and for ``repair``.
 
@@ -267,7 +245,6 @@ class RecordingWriter:
             layout.EPOCH_KEY: str(self._epoch),
         }
         check_contents(meta, attachments)
-        self._digest = seal.Digest(meta, attachments)
         self._messages = ros_messages.Messages(self._epoch, ros_messages.axes_of(meta))
         self._sequences = [0] * (1 + len(layout.further_hands(meta)))
         self._is_closed = False
@@ -340,7 +317,6 @@ class RecordingWriter:
         packed, size = payloads.tobytes(), payloads.itemsize
         # an impossible deadline (before 1970, after 2554) must not stop the recorder
         times = (rows["deadline_ns"].astype(np.uint64) + np.uint64(self._epoch % 2**64)).tolist()
-        self._digest.add_ticks(rows, hand)
         sequence = self._sequences[hand]
         try:
             for index, time in enumerate(times):
@@ -369,7 +345,6 @@ class RecordingWriter:
         """
         payload = layout.event_payload(event, time_ns)
         time = (self._epoch + int(time_ns)) % 2**64
-        self._digest.add_event(payload)
         try:
             self._mcap.add_message(self._events, time, payload, time)
             time, line = self._messages.of_event(payload, int(time_ns), event.get("event"))
@@ -377,10 +352,8 @@ class RecordingWriter:
         except OSError as error:
             raise self._failed(error) from error
 
-    def close(self, signer: seal.Signer | None = None) -> None:
-        """Finishes the file with last chunk, seal and index, and syncs it to the disk.
-
-        ``signer`` signs the file; None leaves it without a signature.
+    def close(self) -> None:
+        """Finishes the file with last chunk and index, and syncs it to the disk.
 
         Raises:
             RecordingError: The file cannot be written; it ends with its last whole chunk.
@@ -389,31 +362,12 @@ class RecordingWriter:
             return
         self._is_closed = True
         try:
-            self._mcap.flush()  # type: ignore[no-untyped-call]
-            self._mcap.add_metadata(layout.DIGEST_NAME, self._seal(signer))
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._output.sync()
         except OSError as error:
             raise self._refusal(error) from error
         finally:
             self._release()
-
-    def _seal(self, signer: seal.Signer | None) -> dict[str, str]:
-        """Returns the seal; the index behind it has a known size, so it is rehearsed."""
-        entries = {
-            seal.DIGEST: self._digest.hexdigest(),
-            seal.CHAIN: self._output.chain.hexdigest(),
-            seal.INDEX: seal.new_hash().hexdigest(),
-        }
-        complete = entries if signer is None else signer.signed(entries)
-        stream = _Rehearsal(self._output.tell())
-        known = {id(self._output): stream, id(self._index): self._index}
-        rehearsed = copy.deepcopy(self._mcap, known)
-        rehearsed.add_metadata(layout.DIGEST_NAME, complete)
-        end = len(stream.data) + _DATA_END_SIZE
-        rehearsed.finish()  # type: ignore[no-untyped-call]
-        entries[seal.INDEX] = seal.new_hash(stream.data[end:]).hexdigest()
-        return entries if signer is None else signer.signed(entries)
 
     def _failed(self, error: OSError) -> RecordingError:
         # nothing may follow a half-written chunk; the file then counts as cut there
@@ -464,7 +418,7 @@ def repair(path: str | Path, output: str | Path) -> Recording:
     """Writes a cut recording again as a whole one.
 
     Metadata, attachments, and all whole records and events are kept. An event ``repaired``
-    describes the repair, and the digest is computed anew.
+    describes the repair.
 
     Returns:
         The new recording, as read back; of several hands, that of the first.
@@ -503,9 +457,6 @@ def rewrite(
     """Writes a recording's metadata and attachments again, with these records and events.
 
     ``ticks`` are the records of each hand, equally many.
-
-    Digest, chain and index are computed anew. A signature is not kept, because it is of another
-    file.
 
     Raises:
         RecordingError: The file cannot be written, or exists and the access is ``exclusive``.

@@ -31,7 +31,6 @@ from hapticbridge.report.plots import (
     draw_timing,
 )
 from hapticbridge.run_description import meta_float
-from hapticbridge.timekeeping import MOTORS_PUSHED
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Facts of the run
@@ -194,7 +193,8 @@ def head_facts(report: AuditReport, evidence: Evidence) -> Facts:
     borne = {True: "bears the coupling", False: "does not bear it", None: "not judged"}
     words = borne[report.certified]
     if kept is not None and report.certified is not None:
-        words = words + kept.clause if report.certified else kept.refutation or words
+        refutation = kept.refutation(report.hand_energy)
+        words = words + kept.clause if report.certified else refutation or words
     facts.append(("device condition", words))
     if kept is not None and kept.remark:
         facts.append(("time kept", kept.remark))
@@ -369,12 +369,12 @@ def _device_notes(report: AuditReport) -> list[str]:
     kept = report.timekeeping
     if report.certified:
         clause = "" if kept is None or not kept.clause else f",{kept.clause}"
-        limit = f"; but {MOTORS_PUSHED}" if report.has_pushed else ""
+        limit = f"; but {report.hand_energy.limit}" if report.hand_energy.limit else ""
         return [f"The device bears this coupling, in any hand{clause}{limit}."]
     if report.certified is None:
         slowness = "" if kept is None else kept.slowness
         return [f"It is not known if the device bears this coupling in any hand{slowness}."]
-    if kept is not None and kept.refutation:  # the reason has the numbers
+    if kept is not None and kept.refutation(report.hand_energy):  # the reason has the numbers
         return ["The device is not certified. This run stayed passive; another one need not."]
     return [
         f"The device does not bear this coupling: {'; '.join(report.conditions)}. This run stayed "

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from hapticbridge.kernel.codes import coupling_ids, handle_ids
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.scene.source import SourceFile
 
 # Custom texts and numbers of a scene (``<custom>`` in MJCF), by name
@@ -67,7 +68,8 @@ def go_to_start(model: mujoco.MjModel, data: mujoco.MjData, grip: str) -> None:
     for body_id, site_id in handles(model, grip):
         data.mocap_pos[model.body_mocapid[body_id]] = data.site_xpos[site_id]
         data.mocap_quat[model.body_mocapid[body_id]] = data.site_xquat[site_id]
-    mujoco.mj_forward(model, data)
+    with quiet():
+        mujoco.mj_forward(model, data)
 
 
 def seat_handle(model: mujoco.MjModel, grip: str) -> None:

@@ -33,6 +33,7 @@ from hapticbridge.scene.handle import (
 from hapticbridge.scene.parameters import apply_parameters
 from hapticbridge.scene.scene import Scene
 from hapticbridge.scene.source import SourceFile, collect_sources
+from hapticbridge.units import format_si
 
 # Shipped scenes, by name
 
@@ -234,6 +235,11 @@ def plain_model(source: SceneSource) -> mujoco.MjModel:
         return compiled(source.spec.copy(), source.sources)
 
 
+LEAST_MEMORY = 13 << 20
+"""Memory in bytes that MuJoCo gives the smallest scene by default, for contacts and constraints. A
+scene with less in its file gets the default, because a full memory drops contacts."""
+
+
 def compile_scene(
     source: SceneSource,
     grip: str | Sequence[str] | None = None,
@@ -271,6 +277,11 @@ def compile_scene(
     changes = set_options(spec, as_is=as_is)
     with _refused(path):
         model = compiled(spec, source.sources)
+        if model.narena < LEAST_MEMORY:
+            before, spec.memory, spec.nstack, spec.njmax = model.narena, -1, -1, -1
+            model = compiled(spec, source.sources)
+            sizes = (format_si(size, "B") for size in (before, model.narena))
+            changes += (f"memory: {' → '.join(sizes)}",)
         if not as_is and (excluded := exclude_nested(spec, model, grips[0])):
             changes, model = changes + excluded, compiled(spec, source.sources)
         concerns = [*source.concerns, *about_grip]

@@ -11,11 +11,20 @@ import numpy as np
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import SceneError
-from hapticbridge.kernel.codes import HANDLE, WELD_NAME, coupling_ids, held_body, held_joint
+from hapticbridge.kernel.codes import (
+    HANDLE,
+    WARNINGS,
+    WELD_NAME,
+    coupling_ids,
+    held_body,
+    held_joint,
+    warning_words,
+)
 from hapticbridge.kernel.colliders import use_exact_points
+from hapticbridge.kernel.mujoco_c import warning_of
 from hapticbridge.kernel.rigid_contact import IMPRATIO, LARGEST_MARGIN, MARGIN, largest_margin
 from hapticbridge.pose import IDENTITY_POSE
-from hapticbridge.scene.compile import compiled, go_to_start
+from hapticbridge.scene.compile import clause, compiled, go_to_start
 from hapticbridge.scene.contacts import announce_soft_equalities
 from hapticbridge.scene.handle import add_weld, carry_over, set_weld_gains
 from hapticbridge.scene.source import SourceFile
@@ -138,8 +147,20 @@ class Scene:
         return self.path.stem
 
     def reset(self) -> None:
-        """Resets the scene to ``home`` or ``qpos0``, with the handle at the grip."""
-        go_to_start(self.model, self.data, self.grip)
+        """Resets the scene to ``home`` or ``qpos0``, with the handle at the grip.
+
+        Raises:
+            SceneError: MuJoCo stops there, or warns (``codes.WARNINGS``).
+        """
+        try:
+            go_to_start(self.model, self.data, self.grip)
+        except mujoco.FatalError as error:
+            raise SceneError(
+                f"MuJoCo stops at the start of scene '{self.name}': {clause(error)}"
+            ) from None
+        code = warning_of(self.data)
+        if code in WARNINGS:
+            raise SceneError(f"at the start of scene '{self.name}' {warning_words(code)}")
 
     def grip_pose(self) -> tuple[float, ...]:
         """Returns the grip's pose (x, y, z, qw, qx, qy, qz) in the world frame, positions in m.

@@ -41,6 +41,7 @@ comes to rest in the other, which is a limit cycle.
 
 from __future__ import annotations
 
+import math
 from typing import overload
 
 import numpy as np
@@ -304,9 +305,9 @@ def stiffest_late_coupling(
     """Returns K in N/m and B' in N s/m of the default coupling behind a device that is late.
 
     It is the stiffest one that needs ``NEEDED_SHARE`` of b, with B' of at least b/(4 n). For a
-    device in time that is ``stiffest_coupling``. Behind a delay the stiffest one has more damping,
-    because the damper lowers the need at low frequencies. Arguments and errors are those of
-    ``late_minimum_damping``; b in N s/m must be finite and > 0.
+    device in time that is ``stiffest_coupling`` within 1 %. Behind a delay the stiffest one has
+    more damping, because the damper lowers the need at low frequencies. Arguments and errors are
+    those of ``late_minimum_damping``; b in N s/m must be finite and > 0.
     """
     b = scalar("device damping", device_damping, "N s/m", positive=True)
     largest = 1.0 + ticks_per_sample**0.5 + delay / period
@@ -352,6 +353,25 @@ def maximum_stiffness(
             f"{available.flat[worst]:g} N s/m, so no stiffness is passive; lower the damping"
         )
     return plain(2 * (available - spent) / step)
+
+
+def midpoint_damping(stiffness: float, damping: float, period: float, twist: float) -> float:
+    """Returns the damping in N m s/rad that a midpoint torque needs about a twist in rad.
+
+        b_r >= T (p + q)²/(2 (K_r + 2 B'_r/T)),    a = K_r φ/4
+        p = |K_r + B'_r/T + ja|,    q = |B'_r/T + ja|
+
+    The midpoint form K_r (φ_k + φ_{k−1})/2 differs from the law K_r φ_k + (B'_r/T) δe_k by a part
+    A δe_k across the motion, ‖A‖ <= a. Summed by parts, the energy of the loop holds the term
+    δe_k·Cᵀ(d_k − d_{k+1}) with C = B'_r/T + A, and its least over δe_k gives the bound. It is
+    sufficient for any hand, any strict environment and any A_k, and exact for a constant A. A tool
+    that does not turn needs less: K_r T/2 + √(B'_r² + (K_r T φ/4)²) at small twists.
+
+    K_r in N m/rad, B'_r in N m s/rad and T in s must be finite, K_r and T > 0.
+    """
+    rate, across = damping / period, 0.25 * stiffness * twist
+    sides = math.hypot(stiffness + rate, across) + math.hypot(rate, across)
+    return period * sides**2 / (2.0 * (stiffness + 2.0 * rate))
 
 
 def stiffest_coupling(damping: float, rotational_damping: float, period: float) -> Coupling:

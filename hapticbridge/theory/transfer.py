@@ -286,7 +286,7 @@ def transmission_line_spectrum(
     Terminated by the device, the line is a wave port that counts the hand's work exactly. The
     reason is that the force is held and v is the mean velocity of the hold. With b >= Z it is
     passive for any hand and any discrete-time passive environment. Terminated in software, the line
-    delays. As for a delayed coupling, no damping then suffices for every passive environment; the
+    delays the force on both sides. No damping then suffices for every passive environment; the
     spectrum is that of a wall.
 
     Args:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.hand_energy import INSTANT
 from hapticbridge.kernel.codes import JOINT
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.record import due_times
@@ -24,7 +25,6 @@ from hapticbridge.report.evidence import (
 )
 from hapticbridge.report.page import moment_of, write_page
 from hapticbridge.report.plots import PAGE_BINS, PICTURE_BINS, decimated, finish
-from hapticbridge.timekeeping import INSTANT
 from hapticbridge.units import format_energy, format_share, format_si, shown_energies
 from hapticbridge.whatif.what_if import WhatIf, WhatIfRun
 
@@ -93,7 +93,7 @@ def sentences(run: WhatIfRun) -> Iterator[str]:
         yield f"tripped: {run.trip}"
     kept = run.report.timekeeping
     if run.report.certified is False and kept is not None:
-        yield kept.device_words(False)
+        yield kept.device_words(verdict=False, energy=run.report.hand_energy)
 
 
 def _certified(run: WhatIfRun) -> str:

@@ -27,7 +27,7 @@ from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.guard import trip_reason
 from hapticbridge.hands import Grasp
-from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED
+from hapticbridge.kernel.codes import GAVE_ENERGY, STRETCHED, TWISTED, WARNINGS
 from hapticbridge.loop_setting import delay_ticks
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import load_unpacked
@@ -287,7 +287,7 @@ def _solve_intent(
 
 # Repetition of a run's inputs, commands and pauses
 
-_BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY)
+_BY_STATE = (STRETCHED, TWISTED, GAVE_ENERGY, *WARNINGS)
 """Trips caused by the state after the previous tick, at any sample; that tick can be repeated."""
 
 Event = Mapping[str, Any]

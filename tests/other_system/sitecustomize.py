@@ -34,10 +34,11 @@ LACKS["win32"] = {
     ),
     "os": (
         *LACKS["darwin"]["os"], "fork", "forkpty", "getuid", "geteuid", "getgid", "getegid",
-        "getgroups", "fchmod", "fchown", "chown", "mkfifo", "mknod", "set_blocking",
-        "get_blocking", "killpg", "nice", "getpriority", "setpriority", "setsid", "getpgid",
+        "getgroups", "fchmod", "fchown", "chown", "mkfifo", "mknod", "killpg", "nice",
+        "getpriority", "setpriority", "setsid", "getpgid",
         "WNOHANG", "wait3", "wait4", "uname", "O_NONBLOCK", "O_CLOEXEC", "O_NOFOLLOW",
         "O_DIRECTORY", "O_NOCTTY", "O_SYNC", "statvfs", "sysconf", "openpty",
+        *(() if sys.version_info >= (3, 12) else ("set_blocking", "get_blocking")),
     ),
     "signal": (
         *LACKS["darwin"]["signal"], "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGKILL", "SIGSTOP",

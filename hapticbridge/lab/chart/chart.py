@@ -13,9 +13,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.check.observe import quiet
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, StudyError
+from hapticbridge.kernel.mujoco_c import quiet
 from hapticbridge.lab.chart import contact_bodies, free_bodies, peg, resting_bodies, scene_run
 from hapticbridge.lab.chart.engine_run import EngineRun
 from hapticbridge.lab.chart.setting import OWN, Setting, simulator_name

@@ -519,13 +519,12 @@ class ChartFiles:
     facts: Mapping[str, Any]
 
 
-def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) -> dict[str, Path]:
+def prepared_files(folder: Path, name: str) -> dict[str, Path]:
     """Makes the folder and proves that every file can be written, before anything is computed.
 
     Args:
         folder: Folder to write into.
         name: Name of the files, without ending.
-        endings: Endings of the files.
 
     Raises:
         StudyError: A file cannot be written, or a scene of this name lies there, whose hand path is
@@ -536,7 +535,7 @@ def prepared_files(folder: Path, name: str, endings: Sequence[str] = ENDINGS) ->
             f"'{folder}' holds the scene {name}.xml, and its hand path {name}.csv would be "
             "overwritten; name another folder"
         )
-    files = {ending: f"{name}.{ending}" for ending in endings}
+    files = {ending: f"{name}.{ending}" for ending in ENDINGS}
     prepared_folder(folder, files.values())
     return {ending: folder / file for ending, file in files.items()}
 
@@ -556,33 +555,15 @@ def write_chart(chart: Chart, paths: Mapping[str, Path]) -> ChartFiles:
         "csv": table_of(chart),  # the table first: computing it took the time
         "json": json.dumps(facts, indent=2, allow_nan=False) + "\n",
     }
-    write_files(paths, texts, draw_chart(chart))
-    return ChartFiles(dict(paths), facts)
-
-
-def write_files(paths: Mapping[str, Path], texts: Mapping[str, str], figure: Figure) -> None:
-    """Writes texts by ending, in their order, and then the picture as PNG and SVG.
-
-    Raises:
-        HapticBridgeError: A file cannot be written.
-    """
     for ending, text in texts.items():
         try:
             paths[ending].write_text(text, encoding="utf-8", newline="")
         except OSError as error:
             raise StudyError(f"cannot write '{paths[ending]}': {error.strerror}") from None
+    figure = draw_chart(chart)
     for ending in PICTURES:
         write_picture(figure, paths[ending])
-
-
-def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Returns rows as CSV with a header; a row that lacks a column leaves it empty."""
-    text = io.StringIO()
-    names = dict.fromkeys(name for row in rows for name in row)
-    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+    return ChartFiles(dict(paths), facts)
 
 
 def table_of(chart: Chart) -> str:
@@ -595,7 +576,12 @@ def table_of(chart: Chart) -> str:
         | {"on_front": int(id(each) in fronts[each.panel]), "machine": chart.machine}
         for each in chart.measurements
     ]
-    return csv_text(rows)
+    text = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def summary_of(chart: Chart) -> dict[str, Any]:

@@ -1,0 +1,107 @@
+"""Energy that a run gave to a hand, and what paid for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hapticbridge.units import format_energy
+
+INSTANT = 1e-3
+"""Energy in J that delays may give to the hand: 1 N over 1 mm, less than a key of a keyboard takes,
+and a fortieth of the guard's usual energy limit. A smaller value fails runs for one late force; a
+larger one can be felt."""
+
+
+@dataclass(frozen=True, slots=True)
+class HandEnergy:
+    """Energy to a hand beyond what it put in, and the stores and ports that may have paid for it.
+
+    With E the work of the wrench on the device less what the device's damping burned, every hand
+    behind a coupling law and a device that bears it gets
+
+        E <= q (S_0 − S + V_0 + W_m + W_i) + W_u
+
+    S is the scene's storage and S_0 that at the start, V_0 the energy of the coupling's springs at
+    the start and after each reset. W_m, W_i are the works of the scene's motors and inputs, other
+    hands included, W_u that of axes without a motor; q = force_scale / scale. What E exceeds the
+    right-hand side by is unpaid, but no more than E: what was created and stays in the scene is not
+    at the hand.
+
+    Up to ``INSTANT`` may be unpaid in a certified run, because late samples may give that much.
+    Nothing else needs an allowance. The inequality holds for the positions that were read, of which
+    the law made the forces: encoder steps and delays within the device cannot exceed it.
+
+    Attributes:
+        net: Largest E + q min(S − S_0, 0) in J; the guard's energy limit bounds it.
+        unpaid: Largest unpaid energy in J.
+        springs: q V_0 in J.
+        scene: Energy in J that the scene's storage has lost since the start.
+        motors: W_m in J of the scene; negative if motors took back more than they gave.
+        inputs: W_i in J of the scene: applied forces, moved mocap bodies, gravity compensation.
+
+    References:
+        Brown & Colgate 1997, eq. (6), as an identity over time.
+    """
+
+    net: float = 0.0
+    unpaid: float = 0.0
+    springs: float = 0.0
+    scene: float = 0.0
+    motors: float = 0.0
+    inputs: float = 0.0
+
+    @property
+    def _pushing(self) -> tuple[str, ...]:
+        """Names of the scene's ports that did work, if they paid for more than ``INSTANT``."""
+        ports = {"motors": abs(self.motors), "inputs": abs(self.inputs)}
+        if self.net - self.springs - max(self.unpaid, 0.0) <= INSTANT:
+            return ()
+        least = min(INSTANT, 0.5 * max(ports.values()))
+        return tuple(name for name, work in ports.items() if work > least)
+
+    @property
+    def limit(self) -> str:
+        """Limit of a certificate, which covers no energy from motors and inputs; or empty."""
+        if not self._pushing:
+            return ""
+        return (
+            f"{' and '.join(self._pushing)} of the scene pushed: what they give the hand, only "
+            "--energy-limit bounds"
+        )
+
+    @property
+    def fault(self) -> str:
+        """Clause on unpaid energy, for which no device is certified; or empty."""
+        if self.unpaid <= INSTANT:
+            return ""
+        return (
+            f"the hand got {format_energy(self.unpaid)} beyond what it put in, what the device's "
+            f"damping burned, and what was released: by the scene {format_energy(self.scene)}, by "
+            f"the coupling's springs {format_energy(self.springs)}, by motors "
+            f"{format_energy(self.motors)}, by inputs {format_energy(self.inputs)}"
+        )
+
+    @property
+    def sentence(self) -> str:
+        """Net energy and its origin, as far as it is known."""
+        text = f"{format_energy(self.net)} at most, beyond what it put in"
+        works = {"motors": self.motors, "inputs": self.inputs}
+        origins = [
+            f"the scene's {name} did {format_energy(works[name])} of work" for name in self._pushing
+        ]
+        if origins:
+            origins[-1] += ", and only --energy-limit bounds what they give the hand"
+        if self.springs > INSTANT:
+            springs = format_energy(self.springs)
+            origins.append(f"the coupling's springs held {springs} at the start or after resets")
+        if origins:
+            return f"{text}: {'; '.join(origins)}"
+        return f"{text} and what the device's damping burned"
+
+
+def worst_of(hands: Sequence[HandEnergy]) -> HandEnergy:
+    """Returns that of the hand with the most unpaid, else of one whose certificate is limited."""
+    return max(
+        hands, key=lambda each: (each.unpaid if each.fault else 0.0, bool(each.limit), each.net)
+    )

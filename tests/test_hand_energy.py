@@ -1,0 +1,206 @@
+"""Claims about the energy that a hand gets, and about what a certificate says of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+from audit_cases import SlowClock, recorded
+from random_hands import random_motion
+from two_hands import BAR
+
+from hapticbridge.audit import AuditReport, audit
+from hapticbridge.bridge import Bridge
+from hapticbridge.device import SimulatedDevice
+from hapticbridge.errors import SafetyTrip
+from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
+from hapticbridge.hands import Grasp
+from hapticbridge.options import Workspace
+from hapticbridge.summary import Summary
+from hapticbridge.units import format_energy
+
+SPHERE = """<mujoco><option timestep="0.001" gravity="0 0 {gravity}"/><worldbody>
+<body name="tool"><freejoint/><geom size=".02" mass="{mass}"/><site name="grip"/></body>
+</worldbody></mujoco>"""
+
+SLEDGE = """<mujoco><option timestep="0.001"/><worldbody><body name="sledge">
+<joint name="x" type="slide" axis="1 0 0" damping="{damping}"/>
+<geom type="box" size=".02 .02 .02" mass="0.3"/><site name="grip"/></body></worldbody>{motor}
+</mujoco>"""
+
+DRIVEN = SLEDGE.format(damping=0, motor='<actuator><motor name="puller" joint="x"/></actuator>')
+PUMP, BRAKE = (SLEDGE.format(damping=damping, motor="") for damping in (-10, 10))
+"""A sledge with negative damping, which creates energy, and one that takes it."""
+
+
+def ran(
+    folder: Path, text: str, device: Any = "simulated", duration: float = 1.5, **options: Any
+) -> tuple[Summary, AuditReport]:
+    """Runs a scene with all defaults; returns what the run says and what its audit says."""
+    scene, path = folder / "scene.xml", folder / "run.mcap"
+    scene.write_text(text)
+    options = {"limits": None, "controller": None} | options
+    summary = recorded(path, scene, device, duration=duration, **options)
+    return summary, audit(path)
+
+
+def push(bridge: Bridge, tick: int) -> None:
+    """A program that pushes the sphere to and fro with up to 1 N, at 50 Hz."""
+    if tick % 20 == 0:
+        force = math.sin(0.005 * tick)
+        bridge.set_input(body_wrench={"tool": (force, 0, 0, 0, 0, 0)})
+
+
+def drive(bridge: Bridge, tick: int) -> None:
+    """A motor that pulls for half a second."""
+    if tick in (100, 600):
+        bridge.set_input(ctrl={"puller": 1.0 if tick == 100 else 0.0})
+
+
+def start_twice_more(bridge: Bridge, tick: int) -> None:
+    if tick in (500, 1000):
+        bridge.repeat_commands([{"event": "reset", "tick": tick}])
+
+
+WEIGHT = SPHERE.format(gravity=-9.81, mass=0.9)
+FLOATING = SPHERE.format(gravity=0, mass=0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        (WEIGHT, {}),
+        (WEIGHT, {"workspace": Workspace(force_scale=0.5)}),
+        (WEIGHT, {"scene_rate": 250.0}),
+        (WEIGHT, {"substeps": 2}),
+        (WEIGHT, {"on_tick": start_twice_more}),
+        (WEIGHT, {"clock": SlowClock({200: 4}, dict.fromkeys(range(300, 900, 7), 0.3))}),
+        (FLOATING, {"on_tick": push}),
+        (DRIVEN, {"on_tick": drive}),
+        (PUMP, {"duration": 2.0, "controller": "off"}),
+    ],
+)
+def test_run_and_audit_meter_one_energy_and_print_one_line(
+    text: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    summary, report = ran(tmp_path, text, **options)
+    ours, theirs = summary.hand_energy, report.hand_energy
+    for field in fields(HandEnergy):
+        expected = pytest.approx(getattr(ours, field.name), rel=1e-9, abs=1e-12)
+        assert getattr(theirs, field.name) == expected, field.name
+    assert ours.net > INSTANT
+    assert f"net to the hand     {ours.sentence}" in str(summary)
+    assert f"; net to the hand {ours.sentence}" in report.reason
+    assert f'"net": {theirs.net!r}' in report.to_json()
+    assert summary.is_certified is report.certified
+
+
+def test_a_hand_that_got_what_nothing_released_holds_no_certified_device(tmp_path: Path) -> None:
+    for text, certified in ((PUMP, False), (BRAKE, True)):
+        summary, report = ran(tmp_path, text, duration=2.0, controller="off")
+        assert all("2 >= 1.7 N s/m" in line for line in summary.conditions[:1])
+        assert report.damping_margin == pytest.approx(0.15)
+        assert (summary.is_certified, report.certified) == (certified, certified)
+        assert (report.exit_code == 0) == certified
+        assert (summary.hand_energy.unpaid > INSTANT) is not certified
+        got = f"the hand got {format_energy(summary.hand_energy.unpaid)} beyond what it put in"
+        assert (f"device not certified: {got}" in str(summary)) is not certified
+        assert (got in report.reason) is not certified
+        for origin in ("by the scene", "by the coupling's springs", "by motors", "by inputs"):
+            assert (f"{origin} 0 J" in report.reason) is not certified
+
+
+def test_created_energy_that_stays_in_the_scene_is_not_at_the_hand(tmp_path: Path) -> None:
+    summary, report = ran(tmp_path, PUMP, duration=2.0, controller="off")
+    created = summary.energies["environment_energy"]
+    assert created > 2.0 * report.hand_energy.unpaid
+    assert report.hand_energy.unpaid == pytest.approx(report.hand_energy.net, rel=1e-9)
+
+
+def test_springs_that_hold_a_weight_at_the_start_may_give_it_back(tmp_path: Path) -> None:
+    summary, report = ran(tmp_path, WEIGHT)
+    held = (0.9 * 9.81) ** 2 / (2 * 2400.0)  # m²g²/2K
+    assert summary.hand_energy.springs == pytest.approx(held, rel=1e-6)
+    assert 0.9 * held < summary.hand_energy.net < held
+    assert summary.hand_energy.unpaid == 0.0
+    assert (summary.is_certified, report.certified, report.exit_code) == (True, True, 0)
+    assert "device certified: b >= KT/2 + B_law\n" in str(summary)  # without a limit
+    assert "beyond what it put in: the coupling's springs held 16.2 mJ" in str(summary)
+
+
+@pytest.mark.parametrize(
+    ("text", "on_tick", "name"),
+    [(FLOATING, push, "inputs"), (DRIVEN, drive, "motors")],
+)
+def test_what_pushed_limits_the_certificate(
+    text: str, on_tick: Callable[[Bridge, int], None], name: str, tmp_path: Path
+) -> None:
+    summary, report = ran(tmp_path, text, on_tick=on_tick)
+    limit = f"{name} of the scene pushed: what they give the hand, only --energy-limit bounds"
+    assert f"device certified: b >= KT/2 + B_law, but {limit}" in str(summary)
+    assert report.hand_energy.limit == limit
+    assert f"the scene's {name} did " in report.reason
+    assert (report.certified, report.exit_code) == (True, 0)
+    assert report.hand_energy.unpaid <= 1e-12
+
+
+def test_motors_that_took_their_work_back_still_pushed() -> None:
+    energy = HandEnergy(net=5e-3, motors=1e-5)
+    assert energy.limit.startswith("motors of the scene pushed")
+    assert not HandEnergy(net=5e-3, springs=4.5e-3, motors=1e-5).limit
+    assert not HandEnergy(net=5e-3, unpaid=4.5e-3, motors=1e-5).limit
+    assert HandEnergy(net=5e-3, motors=0.01, inputs=0.02).limit.startswith("motors and inputs of")
+    assert HandEnergy(net=5e-3, motors=0.01, inputs=1e-5).limit.startswith("motors of")
+
+
+@pytest.mark.parametrize("resolution", [0.0, 5e-5, 1e-3])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_honest_hand_is_accused_of_encoder_steps(
+    resolution: float, seed: int, tmp_path: Path
+) -> None:
+    device = SimulatedDevice(resolution=resolution, path=random_motion(seed, 1.5))
+    summary = recorded(tmp_path / "run.mcap", "peg_in_hole", device, duration=1.5)
+    report = audit(tmp_path / "run.mcap")
+    assert summary.hand_energy.unpaid <= 1e-12
+    assert report.hand_energy.unpaid <= 1e-12
+    assert abs(summary.energies["device_energy"]) > 1e-4  # and it was at work
+
+
+def test_energy_from_another_hand_is_paid(tmp_path: Path) -> None:
+    scene, path = tmp_path / "bar.xml", tmp_path / "run.mcap"
+    scene.write_text(BAR)
+    hands: Any = [
+        Grasp("left", SimulatedDevice(path=random_motion(4, 1.5))),
+        Grasp("right", SimulatedDevice(hand=None)),
+    ]
+    summary = recorded(path, scene, hands, duration=1.5, limits=None, controller=None)
+    report = audit(path)
+    got = [each.energies["device_energy"] for each in summary.hands]
+    assert got[1] > 1e-3  # moved by the other hand
+    for ours, theirs in zip(summary.hands, report.hand_energies, strict=True):
+        assert ours.hand_energy.unpaid <= 1e-12
+        assert theirs.unpaid == pytest.approx(ours.hand_energy.unpaid, abs=1e-12)
+        assert theirs.net == pytest.approx(ours.hand_energy.net, rel=1e-9, abs=1e-12)
+    assert (summary.is_certified, report.certified, report.verdict) == (True, True, "passive")
+
+
+def test_the_worst_hand_is_the_one_with_unpaid_energy() -> None:
+    pushed, kicked = HandEnergy(net=0.03, motors=0.05), HandEnergy(net=2e-3, unpaid=2e-3)
+    assert worst_of([pushed, kicked]) is kicked
+    assert worst_of([HandEnergy(net=0.1, springs=0.1), pushed]) is pushed
+
+
+def test_a_trip_by_inputs_names_them_and_not_the_stiffness(tmp_path: Path) -> None:
+    def shove(bridge: Bridge, tick: int) -> None:
+        if tick == 200:
+            bridge.set_input(body_wrench={"tool": (5, 0, 0, 0, 0, 0)})
+
+    with pytest.raises(SafetyTrip) as trip:
+        ran(tmp_path, FLOATING, on_tick=shove)
+    (note,) = trip.value.__notes__
+    assert note.startswith("the scene's inputs (applied forces, moved mocap bodies")
+    assert "--stiffness" not in note
