@@ -64,13 +64,19 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
 
     The machine code of its method is loaded here first: the child inherits it.
     """
-    method = method_of(recording.meta)
-    is_slow = parameters.scene_ticks > 0
-    load_machine_code(method.name, method.contact, is_slow, recording.has_several_hands)
+    load_machine_code(*machine_code_for(recording, parameters))
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
     }
+
+
+def machine_code_for(
+    recording: RecordingFile, parameters: RunParameters
+) -> tuple[str, str, bool, bool]:
+    """Returns the arguments of ``load_machine_code`` for a run."""
+    method, is_slow = method_of(recording.meta), parameters.scene_ticks > 0
+    return method.name, method.contact, is_slow, recording.has_several_hands
 
 
 @cache

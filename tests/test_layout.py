@@ -18,7 +18,7 @@ ORDER = (
     ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
     ("arguments", "clock", "confinement", "coupling", "files", "pose"),
     ("recording",),
-    ("kernel", "theory", "plotting", "sweep", "film"),
+    ("kernel", "theory", "plotting", "sweep"),
     ("scene", "inputs"),
     ("rendering", "device"),
     (
@@ -31,12 +31,12 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export", "dataset", "recorded_scene"),
+    ("guard", "summary", "timekeeping", "export", "recorded_scene"),
     ("testing",),
     ("commands", "check"),
     ("audit", "compare", "options"),
     ("hands",),
-    ("session", "film_process", "report"),
+    ("session", "film_process", "film", "dataset", "report"),
     ("bridge", "view"),
     ("whatif",),  # runs the bridge and the audit, which do not depend on each other
     ("lab",),

@@ -68,8 +68,6 @@ REASONS = {
     "view/window.py: time.sleep(HAND_INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
-    "film.py: lines.readline(LONGEST_LINE)": "a timer kills the process that draws",
-    "film_process.py: sys.stdin.readline()": "the caller's end closes it",
     "confinement.py: os.waitpid(self._child, 0)": "it was killed",
     "confinement.py: select.poll()": "makes the object, which waits with a limit",
     "confinement.py: os.waitpid(self._child, os.WNOHANG)": "it does not wait",
