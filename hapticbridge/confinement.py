@@ -1,6 +1,7 @@
 """Child process for foreign work, with limits on memory, time and files and without a network.
 
-The child is a fork: nothing is imported or read again. Linux gives these means to any user:
+The child is a fork, so nothing is imported or read again, or a fresh interpreter (``Fresh``).
+Linux gives these means to any user:
 
 - limits of resources (``setrlimit``);
 - a network of its own without an interface (``unshare``) and a filter that refuses sockets
@@ -17,6 +18,7 @@ import ctypes
 import faulthandler
 import json
 import os
+import pickle
 import platform
 import select
 import shutil
@@ -26,7 +28,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -55,6 +58,10 @@ keep its user waiting."""
 PATIENCE, SHARE = 10.0, 5.0
 """Time in s that a child may take beyond ``SHARE`` times its processor time. A child that waits
 uses no processor; on a busy machine an honest one has a fifth of it."""
+
+LONGEST = 4e5
+"""Largest processor time in s of a child; one without limits has it. No film takes four days, and
+the kernel waits up to 2e6 s, ``SHARE`` times as long. A child that hangs ends then."""
 
 LARGEST_FILE, MAX_FILES = 256 << 20, 256
 """Size in bytes of a file that the child may write, and number of files it may have open."""
@@ -164,6 +171,34 @@ Work = Callable[[Worker], object]
 # Child process
 
 
+@dataclass(frozen=True, slots=True)
+class Fresh:
+    """Start of a child as a fresh interpreter, for libraries that a fork would break.
+
+    The work and ``prepare`` are then pickled: functions of modules, with small arguments.
+
+    Attributes:
+        environment: Environment of the child.
+        prepare: Called before the child is limited, for what is not foreign.
+        is_limited: False sets no limits; a crash still ends the child alone.
+    """
+
+    environment: Mapping[str, str]
+    prepare: Callable[[], object]
+    is_limited: bool = True
+
+
+_FRESH = """
+import os, sys
+answer = os.dup(1)
+os.dup2(2, 1)
+sys.path.insert(0, sys.argv[1])
+from hapticbridge.confinement import work_fresh
+work_fresh(answer, sys.argv[2])
+"""
+# what a driver prints goes to the void
+
+
 class Confined:
     """Foreign work in a child process, which ends with it or with this process.
 
@@ -173,9 +208,9 @@ class Confined:
         work: Function to call in the child. It returns and tells what ``packed`` takes.
         what: Name of what is worked on, for the message.
         seconds: Processor time in s that the child has after ``Worker.allow_run``.
-        reads: Files and folders that the child may read besides programs.
-        writes: Folders in which it may also write.
-        on_error: Function that lets MuJoCo report an error that would end the child.
+        fresh: Start of the child if it is not a fork.
+        on_error: Function that lets MuJoCo report an error that would end a forked child.
+        **limits: As for ``confine``.
     """
 
     def __init__(
@@ -184,11 +219,13 @@ class Confined:
         what: str,
         *,
         seconds: float = 0.0,
-        reads: Iterable[str | Path] = (),
-        writes: Iterable[str | Path] = (),
+        fresh: Fresh | None = None,
         on_error: Callable[[Callable[[str], None]], None] | None = None,
+        **limits: Any,
     ) -> None:
         self._what, self._work = what, work
+        is_limited = fresh is None or fresh.is_limited
+        seconds = min(seconds, LONGEST) if is_limited else LONGEST
         self._folder = tempfile.mkdtemp(prefix="hapticbridge-")
         self._until = time.monotonic() + PATIENCE + SHARE * (COMPILE_TIME + seconds)
         self._patience = self._until - time.monotonic()
@@ -196,14 +233,28 @@ class Confined:
         if sys.platform == "win32":
             return
         self._reading, writing = os.pipe()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        self._child = os.fork()
-        if self._child == 0:
-            limits = _Limits(writing, seconds, (*writes, self._folder), tuple(reads))
-            if on_error is not None:
-                on_error(limits.fail)
-            limits.work_and_exit(work, self._folder)
+        limits["writes"] = (*limits.get("writes", ()), self._folder)
+        if fresh is not None:
+            job = pickle.dumps((work, seconds, limits, fresh, self._folder)).hex()
+            package = str(Path(__file__).resolve().parents[1])
+            # -P: a file in the user's working folder must not replace a module
+            command = [sys.executable, "-P", "-c", _FRESH, package, job]
+            void = (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0)
+            self._child = os.posix_spawn(
+                sys.executable,
+                command,
+                fresh.environment,
+                file_actions=[(os.POSIX_SPAWN_DUP2, writing, 1), void],
+            )
+        else:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            self._child = os.fork()
+            if self._child == 0:
+                limited = _Limits(writing, seconds, limits)
+                if on_error is not None:
+                    on_error(limited.fail)
+                limited.work_and_exit(work, self._folder)
         os.close(writing)
 
     def __enter__(self) -> Confined:
@@ -307,9 +358,10 @@ class _Limits:
     """Limits of this process, which is the child; implements ``Worker``."""
 
     def __init__(
-        self, answer: int, seconds: float, writes: tuple[str | Path, ...], reads: tuple[Any, ...]
+        self, answer: int, seconds: float, limits: dict[str, Any], fresh: Fresh | None = None
     ) -> None:
-        self._answer, self._seconds, self._writes, self._reads = answer, seconds, writes, reads
+        self._answer, self._seconds, self._limits, self._fresh = answer, seconds, limits, fresh
+        self._is_limited = fresh is None or fresh.is_limited
         self.means: dict[str, bool] = {}
 
     def work_and_exit(self, work: Work, folder: str) -> None:
@@ -321,7 +373,10 @@ class _Limits:
             _die_with_parent()
             os.closerange(3, self._answer)
             os.closerange(self._answer + 1, 1 << 20)
-            self.means = confine(reads=self._reads, writes=self._writes)
+            if self._fresh is not None:
+                self._fresh.prepare()
+            if self._is_limited:
+                self.means = confine(**self._limits)
             self._send(_DONE, work(self))
             os._exit(0)
         except BaseException as error:
@@ -345,11 +400,18 @@ class _Limits:
 
     def allow_run(self) -> None:
         """Implements ``Worker.allow_run``."""
-        allow_time(self._seconds)
+        if self._is_limited:
+            allow_time(self._seconds)
 
     def tell(self, value: object) -> None:
         """Implements ``Worker.tell``."""
         self._send(_TOLD, value)
+
+
+def work_fresh(answer: int, job: str) -> None:
+    """Does the job of a ``Fresh`` child and ends this process, which is the child."""
+    work, seconds, limits, fresh, folder = pickle.loads(bytes.fromhex(job))
+    _Limits(answer, seconds, limits, fresh).work_and_exit(work, folder)
 
 
 _NO_ROOM = (

@@ -22,7 +22,6 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -103,22 +102,19 @@ def episode_of(recording: RecordingFile, shot: Shot, progress: Progress | None =
     names = {
         STATE: POSE,
         ON_HAND: WRENCH,
-        QPOS: tuple(found["names"].tolist()),
-        CTRL: tuple(found["controls"].tolist()),
+        QPOS: tuple(found["names"]),
+        CTRL: tuple(found["controls"]),
         ACTION: (*POSE, *WRENCH),
     }
     if not found["ctrl"].shape[1]:
         del values[CTRL], names[CTRL]
-    ends = [0, *found["ends"].tolist()]
-    data = found["pictures"].tobytes()
-    pictures = [data[start:end] for start, end in pairwise(ends)]
     return Episode(
         name=name,
         scene=recording.meta.get("scene", ""),
         values={key: value.astype(np.float32) for key, value in values.items()},
         names=names,
         states=np.concatenate([found["qpos"], found["qvel"]], axis=1)[:-1],
-        pictures=tuple(pictures[:count]),
+        pictures=tuple(found["pictures"][:count]),
     )
 
 

@@ -1,30 +1,37 @@
 """Pictures and films of a recorded run, drawn without a display by the first renderer that works.
 
-MuJoCo reads its renderer from the environment once, when it is imported. Therefore a separate
-process draws (``film_process``). It reads one job in a line of JSON and answers in lines of JSON.
+A child process draws (``confinement``): a driver of graphics that crashes ends the child alone.
+It is a fresh interpreter, because MuJoCo chooses its renderer when it is imported, and no driver
+works in the fork of a process that has drawn.
 """
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import json
+import io
 import os
-import subprocess
-import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
+import mujoco
 import numpy as np
+from PIL import Image
 
+from hapticbridge import jit
 from hapticbridge.arguments import Arguments
-from hapticbridge.confinement import SHARE, ForeignSceneError, death
+from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import install_command
+from hapticbridge.film_process import Camera, Frame, Stage, film_ticks, write_film
+from hapticbridge.kernel.codes import added_actuators
+from hapticbridge.record import Timeline
+from hapticbridge.recorded_scene import load_machine_code, machine_code_for, seconds_for
+from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.run_description import parameters_of
 
 RENDERERS = ("egl", "osmesa")
 """Renderers without a display: EGL with a graphics card or Mesa, OSMesa on the processor alone."""
@@ -32,41 +39,26 @@ RENDERERS = ("egl", "osmesa")
 ENDINGS = (".mp4", ".png")
 """Endings of the files that ``draw`` writes: a film, a picture."""
 
-PATIENCE = 120.0
-"""Longest wait for a renderer in s. A machine that compiles the code first needs a minute."""
-
-LONGEST_LINE = 1 << 16
-"""Characters of an answer of the drawing process. A longer line is no answer, and would take this
-process's memory."""
-
 MAX_PIXELS = 4096
 """Longest side of a picture in pixels. Drivers refuse much larger ones."""
-
-_RENDERER = """
-from mujoco.rendering.classic.gl_context import GLContext
-GLContext(16, 16).free()
-"""
-_BOOTSTRAP = """
-print('{"ready": true}', flush=True)
-import sys
-sys.path.insert(0, sys.argv[1])
-from hapticbridge.film_process import run
-run()
-"""
-# the renderer first, so that a later failure is not mistaken for a renderer that fails
 
 _NONE_WORKS = (
     "neither EGL nor OSMesa works here, so nothing can be drawn off-screen; on Debian: apt install "
     "libegl1 libgl1-mesa-dri, or libosmesa6"
 )
 
-STATES = ".npz"
-"""Ending of a file of states: ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv),
-``ctrl`` (n, nu), ``names`` of positions, ``controls`` of ``ctrl``, and with a camera ``pictures``
-and ``ends``: all PNG in a row of bytes, and where each ends."""
-
 FREE_CAMERA = "free"
 """Name by which states are seen from the free camera, as the scene's file sets it."""
+
+GRAPHICS = (
+    *("/sys", "/etc/glvnd", "/etc/egl", "/etc/OpenCL", "/etc/drirc", "/etc/fonts", "/etc/passwd"),
+    *("/dev/dri", "/dev/nvidiactl", "/dev/nvidia0", "/dev/nvidia-uvm", "/dev/nvidia-modeset"),
+)
+"""Files and folders that drivers of graphics read besides programs."""
+
+FRAME_TIME, PIXEL_TIME = 2.0, 1e-5
+"""Processor time in s that a frame may take, and beyond it per pixel. Without a graphics card a
+frame of 800 x 600 takes 0.3 s; a scene of millions of triangles takes all."""
 
 Progress = Callable[[int, int], None]
 
@@ -153,33 +145,24 @@ def draw(
     """
     shot, target = shot or Shot(), Path(out)
     _check_target(target, shot)
-    job = {"recording": str(recording), "name": str(target), **asdict(shot)}
-    job["in_process"] = in_process
+    opened = open_recording(recording, 0)
     try:
         with tempfile.TemporaryDirectory(
             prefix=".drawing-", dir=target.absolute().parent, ignore_cleanup_errors=True
         ) as folder:
             drawn = Path(folder) / f"drawn{target.suffix.lower()}"
-            renderer = _draw_with_any(job | {"out": str(drawn)}, progress)
+            child = _Child(opened, shot, progress, drawn, in_process)
+            renderer, reason = child.drawn_with_any(partial(_draw, opened.path, drawn, shot))
+            if reason:
+                raise RecordingError(f"cannot write '{target}': {reason}")
             drawn.replace(target)
     except OSError as error:
         raise RecordingError(f"cannot write '{target}': {error.strerror or error}") from None
     return renderer
 
 
-def _draw_with_any(job: dict[str, Any], progress: Progress | None) -> str:
-    """Draws with the renderer of MUJOCO_GL, or the first that works; returns its name."""
-    requested = os.environ.get("MUJOCO_GL")
-    for renderer in [requested] if requested else RENDERERS:
-        if _draw_with(renderer, job, progress):
-            return renderer
-    if requested:
-        raise HapticBridgeError(f"MUJOCO_GL={requested} does not work here; try egl or osmesa")
-    raise HapticBridgeError(_NONE_WORKS)
-
-
 def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dict[str, Any]:
-    """Returns states of a run simulated again, ``shot.fps`` per second, in a confined process.
+    """Returns states of a run simulated again, ``shot.fps`` per second, from a confined process.
 
     Args:
         recording: The file.
@@ -187,21 +170,16 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
         progress: Called with the finished and all frames.
 
     Returns:
-        Arrays by name, as ``STATES`` has them.
+        ``rows`` (records, (n,)), ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``names`` of
+        positions, ``controls`` of ``ctrl``, and with a camera ``pictures``, a PNG each.
 
     Raises:
         HapticBridgeError: As ``draw``.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / f"states{STATES}"
-        job = {"recording": str(recording), "name": str(file), "out": str(file)}
-        job |= asdict(shot) | {"in_process": False}
-        if shot.camera is None:
-            _draw_with(None, job, progress)
-        else:
-            _draw_with_any(job, progress)
-        with np.load(file, allow_pickle=False) as found:
-            return dict(found)
+    opened = open_recording(recording, 0)
+    child, work = _Child(opened, shot, progress), partial(_states, opened.path, shot)
+    found = child.result(work) if shot.camera is None else child.drawn_with_any(work)[1]
+    return {**found, "rows": np.frombuffer(found["rows"], opened.record)}
 
 
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
@@ -236,92 +214,163 @@ def _check_target(target: Path, shot: Shot) -> None:
         raise HapticBridgeError(f"a film needs the extra 'view': {install_command('view')}")
 
 
-def _draw_with(renderer: str | None, job: dict[str, Any], progress: Progress | None) -> bool:
-    """Does a job in a separate process; returns False if its renderer does not work.
+class _Child:
+    """Child process that simulates a recording again, with the limits of a shot.
 
-    ``renderer`` is None for a job that draws nothing.
+    Args:
+        recording: The recording.
+        shot: Time, camera and size.
+        progress: Called with the finished and all frames.
+        out: File that the child may write; None for none.
+        is_trusted: True sets no limits.
     """
-    package = str(Path(__file__).resolve().parents[1])
-    # -P: a file in the user's working folder must not replace a module
-    begin = "" if renderer is None else _RENDERER
-    command = [sys.executable, "-P", "-c", begin + _BOOTSTRAP, package]
-    environment = {**os.environ, "MUJOCO_GL": renderer or "disable"}
-    # settings of another renderer, if this process tried one
-    environment.pop("PYOPENGL_PLATFORM", None)
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        env=environment,
-        text=True,
-        encoding="utf-8",
-        errors="replace",
-    )
-    watch = _Watch(process)
-    what = f"the scene of '{job['recording']}'"
-    is_ready = False
-    try:
-        watch.allow(PATIENCE)
-        print(json.dumps(job), file=cast(IO[str], process.stdin), flush=True)
-        for answer in _answers(cast(IO[str], process.stdout)):
-            if "ready" in answer:
-                is_ready = True
-            elif "seconds" in answer:
-                watch.allow(PATIENCE + SHARE * answer["seconds"])
-            elif "frame" in answer and progress is not None:
-                progress(answer["frame"], answer["frames"])
-            elif "error" in answer:
-                raise RecordingError(answer["error"])
-            elif "failure" in answer:
-                raise ForeignSceneError(f"{what} {answer['failure']}")
-            elif "done" in answer:
-                return True
-        status = process.wait(PATIENCE)  # its answers have ended
-    except BrokenPipeError:
-        return False  # the process ended before it read the job
-    else:
-        if is_ready:
-            end = "takes too long to draw" if watch.is_over else death(status)
-            raise ForeignSceneError(f"{what} {end}")
-        return False
-    finally:
-        # not by ``with process``, which after a ``StopSignal`` waits until the drawing is done
-        watch.cancel()
-        process.kill()
-        for stream in (process.stdin, process.stdout):
-            with contextlib.suppress(OSError):
-                cast(IO[str], stream).close()
-        process.wait(PATIENCE)
+
+    def __init__(
+        self,
+        recording: RecordingFile,
+        shot: Shot,
+        progress: Progress | None,
+        out: Path | None = None,
+        is_trusted: bool = False,
+    ) -> None:
+        self._what, self._progress = f"the scene of '{recording.path}'", progress
+        self._is_limited, self._is_ready = not is_trusted, False
+        parameters = parameters_of(recording.meta)
+        self._code = machine_code_for(recording, parameters)
+        seconds = seconds_for(recording, parameters)
+        pixels = shot.width * shot.height
+        frames = 1.0
+        if out is None or out.suffix != ".png":
+            length = Timeline(recording.blocks(), parameters.period).duration
+            span = (length if shot.stop is None else shot.stop) - shot.start
+            frames = max(1.0, min(span, length) * shot.fps / shot.speed)
+        devices = [path for path in GRAPHICS if path.startswith("/dev")]
+        self._bounds: dict[str, Any] = {
+            "seconds": seconds + frames * (FRAME_TIME + PIXEL_TIME * pixels),
+            "reads": (recording.path.absolute(), jit.cache_folder(), *GRAPHICS),
+            "writes": (*([] if out is None else [out.parent]), *devices),
+            "memory": MEMORY + 64 * pixels,
+        }
+
+    def drawn_with_any(self, work: Work) -> tuple[str, Any]:
+        """Does work with the renderer of MUJOCO_GL, or the first that works.
+
+        Returns:
+            The renderer's name, and the result.
+        """
+        requested = os.environ.get("MUJOCO_GL")
+        for renderer in [requested] if requested else RENDERERS:
+            try:
+                return renderer, self.result(work, renderer)
+            except ForeignSceneError:
+                if self._is_ready:
+                    raise
+        if requested:
+            raise HapticBridgeError(f"MUJOCO_GL={requested} does not work here; try egl or osmesa")
+        raise HapticBridgeError(_NONE_WORKS)
+
+    def result(self, work: Work, renderer: str | None = None) -> Any:
+        """Does work, which draws with a renderer if there is one; returns its result."""
+        environment = {**os.environ, "MUJOCO_GL": renderer or "disable"}
+        # settings of another renderer
+        environment.pop("PYOPENGL_PLATFORM", None)
+        prepare = partial(_load, renderer is not None, self._code)
+        fresh = Fresh(environment, prepare, self._is_limited)
+        work = partial(_ready, work)
+        with Confined(work, self._what, fresh=fresh, **self._bounds) as child:
+            return child.result(self._hear)
+
+    def _hear(self, news: object) -> None:
+        self._is_ready = True  # the renderer works
+        match news:
+            case [int(done), int(total)] if self._progress is not None:
+                self._progress(done, total)
 
 
-class _Watch:
-    """Time after which a process is killed."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self._process, self.is_over = process, False
-        self._timer: threading.Timer | None = None
-
-    def allow(self, seconds: float) -> None:
-        self.cancel()
-        self._timer = threading.Timer(min(seconds, threading.TIMEOUT_MAX), self._end)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def cancel(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-
-    def _end(self) -> None:
-        self.is_over = True
-        self._process.kill()
+# Work of the child
 
 
-def _answers(lines: IO[str]) -> Iterator[dict[str, Any]]:
-    while line := lines.readline(LONGEST_LINE):
-        answer = None
-        if line.startswith("{"):  # drivers print, too
-            with contextlib.suppress(ValueError, RecursionError):
-                answer = json.loads(line)
-        if isinstance(answer, dict):
-            yield answer
+def _load(draws: bool, code: tuple[str, str, bool, bool]) -> None:
+    """Loads the renderer, if the work draws, and machine code."""
+    if draws:
+        from mujoco.rendering.classic.gl_context import GLContext  # noqa: PLC0415 - if it draws
+
+        GLContext(16, 16).free()
+    load_machine_code(*code)
+
+
+def _ready(work: Work, worker: Worker) -> object:
+    """Tells that the renderer works, and does the work."""
+    worker.tell(None)
+    return work(worker)
+
+
+def _draw(path: Path, out: Path, shot: Shot, worker: Worker) -> str:
+    """Draws a picture or a film into a file; returns why it cannot be written, or an empty text."""
+    stage = Stage(open_recording(path, 0), worker.allow_run)
+    camera = Camera(stage, (shot.width, shot.height), shot.camera)
+    if out.suffix == ".png":
+        tick = stage.recording.count - 1 if shot.at is None else stage.tick_at(shot.at)
+        picture = Image.fromarray(camera.frame(tick))
+        try:
+            picture.save(out, optimize=True)
+        except OSError as error:
+            return error.strerror or str(error)
+        return ""
+    ticks = list(film_ticks(stage, shot.fps, shot.start, shot.stop, shot.speed))
+
+    def frames() -> Iterator[Frame]:
+        for number, tick in enumerate(ticks, start=1):
+            yield camera.frame(tick)
+            worker.tell([number, len(ticks)])
+
+    write_film(str(out), frames(), (shot.width, shot.height), shot.fps)
+    return ""
+
+
+def _states(path: Path, shot: Shot, worker: Worker) -> dict[str, Any]:
+    """Returns what ``states`` does, with the bytes of ``rows``."""
+    stage = Stage(open_recording(path, 0), worker.allow_run)
+    camera = None
+    if shot.camera is not None:
+        name = None if shot.camera == FREE_CAMERA else shot.camera
+        camera = Camera(stage, (shot.width, shot.height), name, has_forces=False)
+    model, ours = stage.model, added_actuators(stage.model)
+    own = [k for k in range(model.nactuator) if k not in ours]
+    ticks = list(film_ticks(stage, shot.fps))
+    rows, seen, pictures = [], [], []
+    for number, tick in enumerate(ticks, start=1):
+        stage.show(tick)
+        data = stage.data
+        rows.append(stage.row.tobytes())
+        seen.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[own].copy()))
+        if camera is not None:
+            buffer = io.BytesIO()
+            Image.fromarray(camera.frame(tick)).save(buffer, "PNG")
+            pictures.append(buffer.getvalue())
+        worker.tell([number, len(ticks)])
+    qpos, qvel, ctrl = (np.array(each) for each in zip(*seen, strict=True))
+    names = [
+        f"{model.joint(joint).name or joint}{f'_{k}' if size > 1 else ''}"
+        for joint in range(model.njnt)
+        for size in [_POSITIONS[int(model.jnt_type[joint])]]
+        for k in range(size)
+    ]
+    return {
+        "rows": b"".join(rows),
+        "qpos": qpos,
+        "qvel": qvel,
+        "ctrl": ctrl,
+        "names": names,
+        "controls": [model.actuator(k).name or str(k) for k in own],
+        "pictures": pictures,
+    }
+
+
+_POSITIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): 7,
+    int(mujoco.mjtJoint.mjJNT_BALL): 4,
+    int(mujoco.mjtJoint.mjJNT_SLIDE): 1,
+    int(mujoco.mjtJoint.mjJNT_HINGE): 1,
+}
+"""Numbers in ``qpos`` by joint type."""

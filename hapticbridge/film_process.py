@@ -1,41 +1,24 @@
-"""Process that draws a recorded run: the run simulated again, a camera, frames of a film.
-
-``hapticbridge.film`` starts it, writes one job in a line of JSON and reads one answer per line:
-``seconds`` that the work may take, ``frame`` while a film is drawn, ``done``, ``error`` with a
-sentence, or ``failure`` with what the scene did. Unless the recording is trusted, the process has
-the limits of ``confinement`` before MuJoCo sees the scene.
-"""
+"""Recorded run simulated again and drawn: stage, camera, frames of a film."""
 
 from __future__ import annotations
 
-import io
-import json
-import sys
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import Resimulator, obstacle
-from hapticbridge.confinement import MEMORY, allow_time, confine, failure
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.film import FREE_CAMERA, STATES
-from hapticbridge.kernel.codes import JOINT, added_actuators, held_body
+from hapticbridge.kernel.codes import JOINT, held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
-from hapticbridge.recorded_scene import bounds_for
-from hapticbridge.recording import RecordingFile, open_recording
+from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
 from hapticbridge.recording.ring import MAX_CONTACTS
-from hapticbridge.run_description import parameters_of
 
 PLACE = 1e-4
 """Largest distance in m between the tool, simulated again, and its record. It is less than a pixel.
@@ -491,130 +474,3 @@ def write_film(path: str, frames: Iterator[Frame], size: tuple[int, int], fps: i
 
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _answer(**answer: object) -> None:
-    print(json.dumps(answer), flush=True)
-
-
-GRAPHICS = (
-    *("/sys", "/etc/glvnd", "/etc/egl", "/etc/OpenCL", "/etc/drirc", "/etc/fonts", "/etc/passwd"),
-    *("/dev/dri", "/dev/nvidiactl", "/dev/nvidia0", "/dev/nvidia-uvm", "/dev/nvidia-modeset"),
-)
-"""Files and folders that drivers of graphics read besides programs."""
-
-FRAME_TIME, PIXEL_TIME = 2.0, 1e-5
-"""Processor time in s that a frame may take, and beyond it per pixel. Without a graphics card a
-frame of 800 x 600 takes 0.3 s; a scene of millions of triangles takes all."""
-
-
-def _confine(job: dict[str, Any], recording: RecordingFile) -> float:
-    """Confines this process for one job; returns the processor time in s that it may need."""
-    parameters = parameters_of(recording.meta)
-    bounds = bounds_for(recording, parameters)
-    pixels = job["width"] * job["height"]
-    frames = 1.0
-    if not job["out"].endswith(".png"):
-        length = Timeline(recording.blocks(), parameters.period).duration
-        span = (length if job["stop"] is None else job["stop"]) - job["start"]
-        frames = max(1.0, min(span, length) * job["fps"] / job["speed"])
-    out = tempfile.tempdir = str(Path(job["out"]).parent)
-    devices = [path for path in GRAPHICS if path.startswith("/dev")]
-    confine(
-        reads=(*bounds["reads"], *GRAPHICS),
-        writes=(out, *devices),
-        memory=MEMORY + 64 * pixels,
-    )
-    return float(bounds["seconds"] + frames * (FRAME_TIME + PIXEL_TIME * pixels))
-
-
-def _draw(job: dict[str, Any]) -> None:
-    recording, on_compiled = open_recording(job["recording"], 0), None
-    if not job["in_process"]:
-        seconds = _confine(job, recording)
-        _answer(seconds=seconds)
-        on_compiled = partial(allow_time, seconds)
-    stage = Stage(recording, on_compiled)
-    out, size = job["out"], (job["width"], job["height"])
-    if out.endswith(STATES):
-        camera = None
-        if job["camera"] is not None:
-            name = None if job["camera"] == FREE_CAMERA else job["camera"]
-            camera = Camera(stage, size, name, has_forces=False)
-        _write_states(out, stage, list(film_ticks(stage, job["fps"])), camera)
-        return
-    camera = Camera(stage, size, job["camera"])
-    if out.endswith(".png"):
-        tick = stage.recording.count - 1 if job["at"] is None else stage.tick_at(job["at"])
-        picture = Image.fromarray(camera.frame(tick))
-        try:
-            picture.save(out, optimize=True)
-        except OSError as error:
-            reason = error.strerror or error
-            raise RecordingError(f"cannot write '{job['name']}': {reason}") from None
-        return
-    ticks = list(film_ticks(stage, job["fps"], job["start"], job["stop"], job["speed"]))
-
-    def frames() -> Iterator[Frame]:
-        for number, tick in enumerate(ticks, start=1):
-            yield camera.frame(tick)
-            _answer(frame=number, frames=len(ticks))
-
-    write_film(out, frames(), size, job["fps"])
-
-
-def _write_states(out: str, stage: Stage, ticks: list[int], camera: Camera | None) -> None:
-    """Writes the states of some ticks, and their pictures, for ``hapticbridge.dataset``."""
-    rows, states, pictures = [], [], bytearray()
-    ends, model, ours = [], stage.model, added_actuators(stage.model)
-    own = [k for k in range(model.nactuator) if k not in ours]
-    for number, tick in enumerate(ticks, start=1):
-        stage.show(tick)
-        data = stage.data
-        rows.append(stage.row.copy())
-        states.append((data.qpos.copy(), data.qvel.copy(), data.ctrl[own].copy()))
-        if camera is not None:
-            buffer = io.BytesIO()
-            Image.fromarray(camera.frame(tick)).save(buffer, "PNG")
-            pictures += buffer.getvalue()
-            ends.append(len(pictures))
-        _answer(frame=number, frames=len(ticks))
-    qpos, qvel, ctrl = (np.array(each) for each in zip(*states, strict=True))
-    names = [
-        f"{model.joint(joint).name or joint}{f'_{k}' if size > 1 else ''}"
-        for joint in range(model.njnt)
-        for size in [_POSITIONS[int(model.jnt_type[joint])]]
-        for k in range(size)
-    ]
-    np.savez(
-        out,
-        rows=np.concatenate(rows),
-        qpos=qpos,
-        qvel=qvel,
-        ctrl=ctrl,
-        names=np.array(names),
-        controls=np.array([model.actuator(k).name or str(k) for k in own], str),
-        pictures=np.frombuffer(pictures, np.uint8),
-        ends=np.array(ends, np.int64),
-    )
-
-
-_POSITIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): 7,
-    int(mujoco.mjtJoint.mjJNT_BALL): 4,
-    int(mujoco.mjtJoint.mjJNT_SLIDE): 1,
-    int(mujoco.mjtJoint.mjJNT_HINGE): 1,
-}
-"""Numbers in ``qpos`` by joint type."""
-
-
-def run() -> None:
-    """Draws one job."""
-    job = json.loads(sys.stdin.readline())
-    try:
-        _draw(job)
-    except Exception as error:
-        words, is_refusal = failure(error)
-        _answer(**{"error" if is_refusal else "failure": words})
-    else:
-        _answer(done=True)

@@ -67,9 +67,7 @@ def bounds_for(recording: RecordingFile, parameters: RunParameters) -> dict[str,
 
     The machine code of its method is loaded here first: the child inherits it.
     """
-    method = method_of(recording.meta)
-    is_slow = parameters.scene_ticks > 0
-    load_machine_code(method.name, method.contact, is_slow, recording.has_several_hands)
+    load_machine_code(*machine_code_for(recording, parameters))
     return {
         "seconds": seconds_for(recording, parameters),
         "reads": (Path(recording.path).absolute(), jit.cache_folder()),
@@ -90,6 +88,14 @@ def report_errors(report: Callable[[str], None]) -> None:
     _HANDLERS.append(kind(lambda message: report(message.decode(errors="replace"))))
     pointer = ctypes.c_void_p.in_dll(ctypes.CDLL(str(library_path())), "mju_user_error")
     pointer.value = ctypes.cast(_HANDLERS[-1], ctypes.c_void_p).value
+
+
+def machine_code_for(
+    recording: RecordingFile, parameters: RunParameters
+) -> tuple[str, str, bool, bool]:
+    """Returns the arguments of ``load_machine_code`` for a run."""
+    method, is_slow = method_of(recording.meta), parameters.scene_ticks > 0
+    return method.name, method.contact, is_slow, recording.has_several_hands
 
 
 @cache

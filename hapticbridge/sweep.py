@@ -7,7 +7,6 @@ and a digest of the package's sources. Each other line holds one ``point`` with 
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import csv
 import functools
@@ -28,7 +27,6 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
 from dataclasses import dataclass
@@ -651,15 +649,7 @@ def _cluster(scheduler: str) -> Iterator[tuple[Executor, int]]:
     """
     distributed = import_extra("distributed", "a scheduler", "cluster", StudyError, "dask")
 
-    async def reach() -> None:
-        comm = await distributed.comm.connect(scheduler, timeout=_PATIENCE)
-        await comm.close()
-
     try:
-        # A refused client takes 10 s to give up and prints a traceback, so it is opened only after
-        # a port answers. A thread is used because this one may already run an event loop.
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()
         client = distributed.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except Exception as error:
         why = str(error) or f"nothing came within {_PATIENCE:g} s"
@@ -679,43 +669,30 @@ def _cluster(scheduler: str) -> Iterator[tuple[Executor, int]]:
         yield client.get_executor(pure=False), sum(client.ncores().values())
 
 
-class _Processes(ProcessPoolExecutor):
-    """Pool of processes with one thread for linear algebra each; they end with this process.
-
-    They are started afresh (spawn): a forked process would inherit the locks of the threads that
-    NumPy, MuJoCo and numba start.
-    """
-
-    def __init__(self, count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        super().__init__(count, context, _start_process, (context.Barrier(count),))
-
-    def submit(self, task: Callable[..., Any], /, *args: Any, **named: Any) -> Future[Any]:
-        """Hands a task over; a process that starts for it holds Ctrl-C back while it imports."""
-        missing = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
-        with holding_interrupts():
-            os.environ.update(missing)
-            try:
-                return super().submit(task, *args, **named)
-            finally:
-                for name in missing:
-                    del os.environ[name]
-
-
 @contextlib.contextmanager
 def _processes(function: Callable[[Any], Any], count: int) -> Iterator[Executor]:
-    """Opens the sweep's own pool of processes.
+    """Opens a pool of processes, each with one thread for linear algebra.
+
+    They end with this process. They are started afresh (spawn): a forked process would inherit the
+    locks of the threads that NumPy, MuJoCo and numba start. All start before the first point, and
+    hold Ctrl-C back while they import. Python 3.11 may wait without end for one that starts while
+    another dies.
 
     Raises:
         StudyError: The processes cannot start, or cannot import the function.
     """
-    pool = _Processes(count)
+    context = multiprocessing.get_context("spawn")
+    missing = {name: value for name, value in _ONE_THREAD.items() if name not in os.environ}
+    pool = ProcessPoolExecutor(count, context, _start_process, (context.Barrier(count),))
     try:
         try:
-            # All processes start before the first point. Python 3.11 may wait without end for one
-            # that starts while another dies.
             with holding_interrupts():
-                probes = [pool.submit(callable, function) for _ in range(count)]
+                os.environ.update(missing)
+                try:
+                    probes = [pool.submit(callable, function) for _ in range(count)]
+                finally:
+                    for name in missing:
+                        del os.environ[name]
             for probe in probes:
                 probe.result()
         except BrokenExecutor:

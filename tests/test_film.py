@@ -7,9 +7,11 @@ import re
 import signal
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import film_work
 import mujoco
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from report_runs import circling
 
 import hapticbridge as hb
 from hapticbridge.cli import main
+from hapticbridge.confinement import ForeignSceneError
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.film import Shot, draw, still
 from hapticbridge.film_process import Stage, film_ticks, force_colour, write_film
@@ -224,23 +227,43 @@ def test_a_changed_record_is_not_drawn(sway: Path, tmp_path: Path) -> None:
         Stage(rewritten(recording, tmp_path / "old.mcap", meta={"versions": versions}))
 
 
-BABBLE = """
-import json, sys
-job = json.loads(sys.stdin.readline())
-sys.stdout.buffer.write(b'{"ready": true}\\n\\xff\\n{"a\\n[1]\\n' + b'{"a":' * 100_000 + b'\\n')
-open(job["out"], "wb").write(b"drawn")
-print('{"done": true}')
-"""
-"""A driver that prints what is no answer; a process that a scene took over might."""
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Puts functions of ``film_work`` in the place of some of the drawing process."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(film_work.__file__).parent))
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+
+    def replace(**functions: Callable[..., object]) -> None:
+        for name, function in functions.items():
+            monkeypatch.setattr(f"hapticbridge.film._{name}", function)
+
+    return replace
 
 
 def test_what_is_no_answer_of_the_drawing_process_is_passed_over(
-    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sway: Path, tmp_path: Path, work: Callable[..., None]
 ) -> None:
-    monkeypatch.setattr("hapticbridge.film._RENDERER", "")  # which may not work here
-    monkeypatch.setattr("hapticbridge.film._BOOTSTRAP", BABBLE)
-    draw(sway, tmp_path / "a.png")
+    work(load=film_work.nothing, draw=film_work.babble)
+    heard: list[tuple[int, int]] = []
+    draw(sway, tmp_path / "a.png", progress=lambda *done: heard.append(done))
     assert (tmp_path / "a.png").read_bytes() == b"drawn"
+    assert heard == [(3, 4)]
+
+
+@pytest.mark.parametrize("is_trusted", [False, True])
+def test_a_driver_that_crashes_ends_its_own_process_alone(
+    is_trusted: bool, sway: Path, tmp_path: Path, work: Callable[..., None]
+) -> None:
+    target = tmp_path / "a.png"
+    target.write_bytes(b"an older picture")
+    work(load=film_work.crash)
+    with pytest.raises(HapticBridgeError, match="neither EGL nor OSMesa works"):
+        draw(sway, target, in_process=is_trusted)
+    work(load=film_work.nothing, draw=film_work.crash)
+    with pytest.raises(ForeignSceneError, match=r"crashed MuJoCo \(SIGSEGV\)"):
+        draw(sway, target, in_process=is_trusted)
+    assert target.read_bytes() == b"an older picture"
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_where_no_renderer_works_a_sentence_says_what_to_install(
@@ -258,10 +281,9 @@ def test_where_no_renderer_works_a_sentence_says_what_to_install(
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
 def test_a_signal_ends_the_drawing_at_once(
-    sway: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    sway: Path, tmp_path: Path, work: Callable[..., None], name: str
 ) -> None:
-    monkeypatch.setattr("hapticbridge.film._RENDERER", "")  # which may not work here
-    monkeypatch.setattr("hapticbridge.film._BOOTSTRAP", "import time; time.sleep(60)")
+    work(load=film_work.nothing, draw=film_work.sleep)
     main, number = threading.get_ident(), signal.Signals[name]
     timer = threading.Timer(0.3, signal.pthread_kill, (main, number))
     began = time.monotonic()

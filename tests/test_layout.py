@@ -27,7 +27,7 @@ ORDER = (
         "pose",
     ),
     ("recording",),
-    ("kernel", "theory", "plotting", "sweep", "film"),
+    ("kernel", "theory", "plotting", "sweep"),
     ("scene", "inputs"),
     ("rendering", "device"),
     (
@@ -40,7 +40,7 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export", "dataset"),
+    ("guard", "summary", "timekeeping", "export"),
     ("testing",),
     ("commands", "check"),
     ("options",),
@@ -48,7 +48,7 @@ ORDER = (
     ("request",),
     ("recorded_scene",),
     ("audit", "compare"),
-    ("session", "film_process", "report"),
+    ("session", "film_process", "film", "dataset", "report"),
     ("bridge", "view"),
     ("whatif",),  # runs the bridge and the audit, which do not depend on each other
     ("lab",),

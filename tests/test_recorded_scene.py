@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import gc
 import os
 import resource
 import signal
@@ -470,6 +471,23 @@ def test_a_child_has_the_time_that_it_is_allowed() -> None:
 
     before, after = in_bounds(work, "it", seconds=100.0)
     assert before <= confinement.COMPILE_TIME + 0.1 < 99.0 < after <= 100.1
+
+
+def limits_of(worker: Worker) -> object:
+    """Returns limits of this process, and if its timer runs and means confine it."""
+    worker.allow_run()
+    found = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE)]
+    return [found, signal.getitimer(signal.ITIMER_PROF)[0] > 0, bool(worker.means)]
+
+
+@pytest.mark.parametrize("is_limited", [True, False])
+def test_a_fresh_child_has_limits_unless_it_is_trusted(is_limited: bool) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    fresh = confinement.Fresh(environment, gc.collect, is_limited)
+    here = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE)]
+    with confinement.Confined(limits_of, "it", seconds=50.0, fresh=fresh) as child:
+        limits, has_timer, has_means = child.result()
+    assert (limits == here, has_timer, has_means) == (not is_limited, is_limited, is_limited)
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022])

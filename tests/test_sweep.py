@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import functools
 import math
@@ -122,6 +123,16 @@ def test_a_dask_cluster_of_two_workers_gives_the_same_bits() -> None:
     ) as cluster:
         table = sweep(functions.bound, POINTS, scheduler=cluster.scheduler_address, chunk=1)
         assert is_same(table, serial())
+
+
+def test_a_scheduler_that_does_not_answer_is_refused_beside_a_running_loop_too() -> None:
+    pytest.importorskip("distributed")
+
+    async def notebook() -> None:  # it runs a loop in the thread that sweeps
+        sweep(functions.bound, POINTS, scheduler="tcp://127.0.0.1:1")
+
+    with pytest.raises(StudyError, match=r"no dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
+        asyncio.run(notebook())
 
 
 def test_the_order_of_rows_is_that_of_points_whatever_ends_first() -> None:

@@ -68,8 +68,6 @@ REASONS = {
     "view/window.py: time.sleep(HAND_INTERVAL)": DAEMON,
     "view/window.py: self._outbox.get()": DAEMON,
     # pictures, foreign scenes
-    "film.py: lines.readline(LONGEST_LINE)": "a timer kills the process that draws",
-    "film_process.py: sys.stdin.readline()": "the caller's end closes it",
     "confinement.py: os.waitpid(self._child, 0)": "it was killed",
     "confinement.py: select.poll()": "makes the object, which waits with a limit",
     "confinement.py: os.waitpid(self._child, os.WNOHANG)": "it does not wait",
@@ -85,10 +83,6 @@ REASONS = {
     "sweep.py: pool.shutdown(wait=True, cancel_futures=True)": USERS,
     "sweep.py: barrier.wait()": "a worker ends with its parent",
     "sweep.py: connection.wait([parent.sentinel])": DAEMON,
-    "sweep.py: with ThreadPoolExecutor(1)": "asyncio.wait_for in it",
-    "sweep.py: thread.submit(asyncio.run, asyncio.wait_for(reach(), _PATIENCE)).result()": (
-        "asyncio.wait_for in it"
-    ),
     "compare.py: for line in stream": "no wait: records of a file",
     "testing/device_contract.py: bench.clock.wait()": "a clock's: at most one period",
     "testing/device_contract.py: self.clock.wait()": "a clock's: at most one period",

@@ -118,13 +118,15 @@ def _print_dim(line: str) -> None:
 def _print(files: ChartFiles) -> None:
     for panel in files.facts["panels"]:
         out.print(f"[bold]{plain(panel['title'])}[/], against {plain(panel['reference'])}")
-        for text in filter(None, (panel["recommendation"], panel["standing"])):
-            out.print(f"  {plain(text)}")
+        out.print(f"  {plain(panel['recommendation'])}")
+        if panel["standing"]:
+            out.print(f"  {plain(panel['standing'])}")
         out.print("  on the front, by cost:" if panel["front"] else "  nothing is on the front")
         for point in panel["front"]:
+            hazard = f" ({point['hazard']})" if point["hazard"] else ""
             out.print(
                 f"    {point['cost']:.2g} s per s, {point['error']:.3g} JND: "
-                f"{plain(point['setting'])}"
+                f"{plain(point['setting'] + hazard)}"
             )
     for note in files.facts["notes"]:
         out.print(f"  {plain(note)}")

@@ -51,10 +51,7 @@ digits that are printed."""
 IMPERCEPTIBLE = 0.1
 """Difference of two errors in JND that is not felt: a tenth of the least that is."""
 
-ALONE = " No other time step bears this out, so it may be luck."
-
-LEAST_ORDER = 0.5
-"""Order in the step below which an error is not extrapolated. Methods here have 1 or 2."""
+ALONE = "no other time step bears this out, so it may be luck"
 
 TOLERANCE = 1e-9
 """Relative tolerance of the rate: 1/(1 ms) is 1000 Hz but for rounding."""
@@ -97,61 +94,32 @@ def _is_default(setting: Setting) -> bool:
     return replace(setting, scene_ticks=0) == DEFAULT
 
 
-def recommendation(points: Sequence[Measurement], machine: str, *, is_truth: bool = True) -> str:
-    """States the recommendation and its reason, or the nearest point and its faults.
-
-    Args:
-        points: Points of one panel.
-        machine: Description of the machine.
-        is_truth: True if errors are counted from the truth (``Panel.is_truth``). If not, the text
-            states that they are only the distance from each method's own limit.
-    """
-    best = recommended(points)
-    goal = f"For {RATE / 1000:g} kHz on this machine ({machine}) and an error below one JND"
-    if not is_truth:
-        goal += " (counted from the reference above, which is not the truth)"
+def recommendation(points: Sequence[Measurement]) -> str:
+    """States the recommended point and how to get it, or the nearest one and its faults."""
+    best, rate = recommended(points), f"{RATE / 1000:g} kHz"
     if best is not None:
-        alone = "" if is_borne_out(best, points) else ALONE
-        return (
-            f"{goal}, use {best.setting.label}: {_numbers(best)}. It is passive and has no hazard; "
-            f"no such point that costs up to {100 * SPARE:g} % of a core more errs noticeably less."
-            f"{alone} {_way_to(best, points)}"
-        )
+        alone = "" if is_borne_out(best, points) else f"; {ALONE}"
+        return f"for {rate}: {_numbers(best)}; {_way_to(best.setting)}{alone}"
     tried = [each for each in points if _is_at_rate(each) and np.isfinite(each.score.jnd)]
     if not tried:
-        return f"{goal}, nothing was tried that runs at this rate."
+        return f"for {rate}: nothing was tried that runs at this rate"
     nearest = min(tried, key=lambda each: (len(_objections(each, points)), each.score.jnd))
-    return (
-        f"{goal}, no point does it all. Nearest is {nearest.setting.label}: {_numbers(nearest)}; "
-        f"but {' and '.join(_objections(nearest, points))}. {_way_to(nearest, points)}"
-    )
+    faults = ", ".join(_objections(nearest, points))
+    return f"for {rate}: none; nearest {_numbers(nearest)}: {faults}"
 
 
-def _way_to(best: Measurement, points: Sequence[Measurement]) -> str:
-    """States how a user gets a point: the default, or options and why the default is not it."""
-    setting = best.setting
+def _way_to(setting: Setting) -> str:
+    """Returns the options of 'hapticbridge run' that choose a setting."""
     rate = f"--scene-rate {1 / setting.scene_period:g}" if setting.scene_ticks else ""
     if _is_default(setting):
-        chosen = f", which chooses the scene's rate; '{rate}' sets it" if rate else ""
-        return f"It is the default of 'hapticbridge run'{chosen}."
+        return "the default of 'hapticbridge run'" + (f" with {rate}" if rate else "")
     if setting.engine != OWN or setting.iterations is not None:
-        return "'hapticbridge run' does not offer it."
-    options = f"--method {setting.method.name}"
-    if setting.substeps > 1:
-        options += f" --substeps {setting.substeps}"
-    if rate:
-        options += f" {rate}"
-    if setting.contact_name != DEFAULT.contact_name:
-        options += " --contact scene"
-    default = _default_of(points)
-    if default is None:
-        return f"Choose it with '{options}'; the default was not measured."
-    faults = _objections(default, points)
-    why = f"but {' and '.join(faults)}" if faults else "which errs by more than that"
-    return (
-        f"Choose it with '{options}'; the default is {default.setting.label}, {why}: "
-        f"{_numbers(default)}."
-    )
+        return "'hapticbridge run' does not offer it"
+    options = [f"--method {setting.method.name}"]
+    options += [f"--substeps {setting.substeps}"] if setting.substeps > 1 else []
+    options += [rate] if rate else []
+    options += ["--contact scene"] if setting.contact_name != DEFAULT.contact_name else []
+    return " ".join(options)
 
 
 def _default_of(points: Sequence[Measurement]) -> Measurement | None:
@@ -181,56 +149,19 @@ def ahead_of_default(points: Sequence[Measurement]) -> list[Measurement]:
 
 
 def standing(points: Sequence[Measurement]) -> str:
-    """States if the default is on the front at ``RATE``, or who is ahead and what it would take."""
+    """States the numbers of the default at ``RATE``, and the best point that is ahead of it."""
     default = _default_of(points)
     if default is None:
         return ""
+    words = f"default: {_numbers(default)}"
+    if _objections(default, points):
+        words += f": {', '.join(_objections(default, points))}"
     ahead = ahead_of_default(points)
     if not ahead:
-        return (
-            f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is on the front: no "
-            "passive point errs less at its cost."
-        )
+        return f"{words}; on the front"
     best = min(ahead, key=lambda each: each.score.jnd)
-    error, cost = best.score.jnd / default.score.jnd, best.cost.median / default.cost.median
-    but = f"; but {best.setting.method.hazard}" if best.setting.method.hazard else ""
-    names = ", ".join(dict.fromkeys(each.setting.label for each in ahead))
-    return (
-        f"At {RATE / 1000:g} kHz the default, {default.setting.label}, is not on the front. Ahead: "
-        f"{names}. The best has {100 * error:.2g} % of its error at {100 * cost:.0f} % of its cost"
-        f"{but}. "
-        f"{_period_words(points, best.score.jnd)}"
-    )
-
-
-def _period_words(points: Sequence[Measurement], error: float) -> str:
-    """States the period at which the default's method reaches an error in JND.
-
-    Between two tried periods it is interpolated, below the finest extrapolated from the two
-    finest, both as a power of the period. An order below ``LEAST_ORDER`` is no convergence.
-    """
-    own = sorted(
-        (each.setting.period, each.score.jnd)
-        for each in points
-        if replace(each.setting, period=DEFAULT.period) == DEFAULT and 0 < each.score.jnd < math.inf
-    )
-    name = DEFAULT.method.name
-    # where a finer step misses the error, a coarser one meets it by luck
-    reached = next((k for k, (_, jnd) in enumerate(own) if jnd > error), len(own))
-    if reached and reached == len(own):
-        return f"'{name}' reaches that error at {1e3 * own[-1][0]:.2g} ms."
-    not_tried = f"'{name}' does not reach that error at any step that was tried"
-    first = max(reached - 1, 0)
-    if len(own) < 2 or error <= 0.0:
-        return f"{not_tried}."
-    (low, below), (high, above) = own[first : first + 2]
-    order = math.log(above / below) / math.log(high / low)
-    if not reached and order < LEAST_ORDER:
-        return f"{not_tried}, and its error hardly falls with the step."
-    step = f"{1e3 * low * (error / below) ** (1 / order):.2g} ms"
-    if reached:
-        return f"'{name}' reaches that error at a period of {step}."
-    return f"{not_tried}; as its error falls with the step, it would take a period of {step}."
+    hazard = best.setting.method.hazard
+    return f"{words}; ahead of it: {_numbers(best)}" + (f", but {hazard}" if hazard else "")
 
 
 def is_borne_out(each: Measurement, points: Sequence[Measurement]) -> bool:
@@ -298,8 +229,8 @@ def _objections(each: Measurement, points: Sequence[Measurement]) -> list[str]:
 def _numbers(each: Measurement) -> str:
     tick = 1e6 * each.cost.median * each.setting.period
     return (
-        f"an error of {each.score.jnd:.2g} JND at {tick:.3g} µs a tick, "
-        f"{100 * each.cost.median:.2g} % of a core"
+        f"{each.setting.label} ({each.score.jnd:.2g} JND, {tick:.3g} µs a tick, "
+        f"{100 * each.cost.median:.2g} % of a core)"
     )
 
 
@@ -592,9 +523,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
             "title": panel.title,
             "reference": panel.reference,
             "reference_is_truth": panel.is_truth,
-            "recommendation": recommendation(
-                chart.points_of(panel), chart.machine, is_truth=panel.is_truth
-            ),
+            "recommendation": recommendation(chart.points_of(panel)),
             "standing": standing(chart.points_of(panel)),
             "front": [
                 {
@@ -602,6 +531,7 @@ def summary_of(chart: Chart) -> dict[str, Any]:
                     "cost": each.cost.median,
                     "error": each.score.jnd,
                     "verdict": each.score.verdict,
+                    "hazard": each.setting.method.hazard,
                 }
                 for each in chart.front(panel)
             ],
