@@ -35,11 +35,19 @@ from hapticbridge.kernel.handle import (
     tool_after_step,
     tool_motion,
 )
-from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.law import (
+    applied_wrench,
+    is_bent,
+    law_wrench,
+    limited,
+    set_gains,
+    share_of_gains,
+    springs,
+)
 from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.kernel.rigid_contact import aim_again
-from hapticbridge.pose import Vector, norm, scaled
+from hapticbridge.pose import Vector, norm
 
 TOLERANCE = 1e-6
 """Largest error of the wrench within a saturated step, as a share of the level; no unit. The error
@@ -139,31 +147,21 @@ def spend_within_tank(s: State) -> None:
 
 
 @compiled
+def _is_bent(s: State, force: Vector, torque: Vector) -> bool:
+    linear, angular = springs(s)
+    return is_bent(linear, norm(force)) or is_bent(angular, norm(torque))
+
+
+@compiled
 def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     """Returns P_F of a force and a torque on the tool, and notes if one was limited.
 
     Numbers that are not finite stay, because they stop the run.
     """
-    level = s.level
-    level.flags = 0
-    size, size_r = norm(force), norm(torque)
-    if level.level[0] < size < np.inf:
-        force = scaled(level.level[0] / size, force)
-        level.flags = FORCE_LIMITED
-    if level.level[1] < size_r < np.inf:
-        torque = scaled(level.level[1] / size_r, torque)
-        level.flags = FORCE_LIMITED
-    return force, torque
-
-
-@compiled
-def _share_at_level(level: float, size: float, share: float, compliance: float) -> float:
-    """Returns c with c ‖u‖ = F for ‖u‖ = A/(1 + c σ), given one solution; at most 1."""
-    u = size / share
-    a = u * (1.0 + share * compliance)
-    if a <= level * (1.0 + compliance):
-        return 1.0
-    return level / (a - level * compliance)
+    linear, angular = springs(s)
+    new, new_torque = limited(linear, force), limited(angular, torque)
+    s.level.flags = FORCE_LIMITED if _is_bent(s, force, torque) else 0
+    return new, new_torque
 
 
 @compiled
@@ -174,7 +172,7 @@ def _is_at_level(s: State, count: int) -> bool:
     """
     level = s.level
     force, torque = applied_wrench(s, 1.0)
-    sizes = (norm(force), norm(torque))
+    sizes, both = (norm(force), norm(torque)), springs(s)
     is_done = True
     for ch in range(2):
         c, size = level.share[ch], sizes[ch]
@@ -184,7 +182,7 @@ def _is_at_level(s: State, count: int) -> bool:
             change = level.tried[ch] * u_last - size
             if abs(change) > 1e-12 * level.level[ch]:
                 level.compliance[ch] = max((u - u_last) / change, 0.0)
-        new = _share_at_level(level.level[ch], size, c, level.compliance[ch])
+        new = share_of_gains(both[ch], size, c, level.compliance[ch])
         if count > REPETITIONS // 2:
             new = 0.5 * (c + new)
         if abs(new - c) * u > TOLERANCE * level.level[ch]:
@@ -274,7 +272,7 @@ def limited_wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, 
     position, orientation, moved, turned = tool_after_step(s)
     handle = handle_of_step(s, is_last)
     force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-    if is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1]:
+    if is_reduced or _is_bent(s, force, torque):
         if level.is_solved:
             if not is_reduced and solve_level(s):
                 position, orientation, moved, turned = tool_after_step(s)
@@ -298,7 +296,7 @@ def _is_above(s: State) -> bool:
     handle = handle_of_step(s, True)
     force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
     is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
-    return bool(is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1])
+    return bool(is_reduced or _is_bent(s, force, torque))
 
 
 @compiled

@@ -31,7 +31,7 @@ from hapticbridge.kernel.force_level import (
     spend_within_tank,
 )
 from hapticbridge.kernel.handle import place_handle
-from hapticbridge.kernel.law import command_handle_velocity
+from hapticbridge.kernel.law import command_handle_velocity, slack_of_step
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
     add_slack,
@@ -130,7 +130,7 @@ def close_hands(states: NDArray[np.void], rows: NDArray[np.void]) -> int:
     refresh_energies(states[0])
     for i in range(states.size):
         add_coupling_work(states[i].energy, states[i].loop.law_work)
-        add_slack(states[i])
+        add_slack(states[i].energy, slack_of_step(states[i]))
     add_up_hands(states)
     if take_back(states[0], states[0].mj.qvel, 0.0):
         add_up_hands(states)

@@ -12,7 +12,7 @@ import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
-from hapticbridge.kernel.law import pulled, spring_energy
+from hapticbridge.kernel.law import held_energy, pulled
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, norm, scaled
 
@@ -88,11 +88,8 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
 @compiled
 def credit_springs(s: State) -> None:
     """Adds the present energy of the coupling's springs to what may reach the hand."""
-    k, level = s.coupling, s.level.level
     stretch, twist = pulled(s)
-    held = spring_energy(k.stiffness, norm(stretch), level[0])
-    held += spring_energy(k.rotational_stiffness, norm(twist), level[1])
-    s.observer.springs += held
+    s.observer.springs += held_energy(s, stretch, twist)
 
 
 def observe_reset(s: State, stored_before: float) -> None:

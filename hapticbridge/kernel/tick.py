@@ -60,12 +60,14 @@ from hapticbridge.kernel.law import (
     command_handle_velocity,
     felt,
     retune,
+    slack_of_step,
     slip,
 )
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
-    close_balance,
+    add_slack,
     end_mocap_moves,
+    judge_balance,
     meter_device,
     meter_ports,
     note_moved_mocap_bodies,
@@ -569,7 +571,8 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
     add_coupling_work(s.energy, loop.law_work)
     if s.run.scheme == Scheme.IMPLICIT:
         take_back(s, s.mj.qvel, 0.0)
-    if not close_balance(s):
+    add_slack(s.energy, slack_of_step(s))
+    if not judge_balance(s):
         return refuse_tick(s)
     fill_tank(s)
     if has_positions and not is_sound(s):
