@@ -1,6 +1,6 @@
 """Several hands in one scene: what each holds, with which device, and their devices as one.
 
-``kernel.hands`` is the arithmetic of their tick, ``session`` runs it.
+``kernel.tick`` is the arithmetic of their tick, ``session`` runs it.
 """
 
 from __future__ import annotations

@@ -438,11 +438,11 @@ class BoundKernel:
 
 
 class BoundHands:
-    """States of several hands, bound to one model and its data (``kernel.hands``).
+    """States of several hands, bound to one model and its data (``kernel.tick``).
 
     Attributes:
-        states: One element of ``STATE_DTYPE`` per hand; the first one meters the scene.
-        rows: One record of ``TICK_DTYPE`` per hand.
+        state: One element of ``STATE_DTYPE`` per hand; the first one meters the scene.
+        row: One record of ``TICK_DTYPE`` per hand.
         hands: The bound kernel of each hand.
     """
 
@@ -463,14 +463,14 @@ class BoundHands:
                 )
             if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
                 raise HapticBridgeError("all hands of a scene need one period and one contact")
-        self.states = np.zeros(len(parameters), STATE_DTYPE)
-        self.rows = np.zeros(len(parameters), TICK_DTYPE)
+        self.state = np.zeros(len(parameters), STATE_DTYPE)
+        self.row = np.zeros(len(parameters), TICK_DTYPE)
         self.hands = tuple(
             BoundKernel(
                 model,
                 data,
                 each,
-                place=Place(i, self.states[i : i + 1], self.rows[i : i + 1]),
+                place=Place(i, self.state[i : i + 1], self.row[i : i + 1]),
             )
             for i, each in enumerate(parameters)
         )
