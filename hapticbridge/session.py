@@ -290,7 +290,7 @@ class Session:
         stop: StopRequest,
     ) -> None:
         self._request, self._setups = request, tuple(setups)
-        setup = self.setup = setups[0]
+        self.setup = setups[0]
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
@@ -302,7 +302,8 @@ class Session:
         self._is_begun = self._is_held = self._has_warned = False
         self.slow: SlowScene | None = None
         self.inputs: deque[list[Write]] = deque()
-        self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
+        limits = {each.scene.grip: each.coupling_limits for each in self._setups}
+        self.commands = CommandQueue(limits, is_recorded=output.path is not None)
         with ExitStack() as resources:
             resources.callback(device.close)  # ``_open`` says why it is called twice
             self._open(resources)
@@ -350,25 +351,18 @@ class Session:
         self.hand_parameters = self._parameters(effective)
         self.parameters = self.hand_parameters[0]
         start = start_state(scene.model, scene.data).tobytes()
-        if isinstance(self.device, DeviceGroup):
-            hands = BoundHands(scene.model, scene.data, self.hand_parameters)
-            resources.callback(hands.release)
-            self.kernel.bind_hands(hands)
-            self.device.external_flags = hands.state["loop"]["external_flags"]
-        else:
-            self._bind_one(resources)
+        self._bind(resources)
         bound = self.kernel.bound
         self._refuse_stretched_start()
         if self.stream.is_read:
             self._start_stream()
         if self.output.observer is not None:
             self.commands.warm_up()
-        self._applier = EventApplier(
-            bound, scene.data, setup.method, self.parameters, start, self.slow
-        )
-        self.executor = CommandExecutor(
-            self.commands, self._applier, setup.guard.fade_ticks, self.event
-        )
+        bounds = (self.kernel.hands or bound).hands
+        parts = tuple(zip(bounds, self.hand_parameters, strict=True))
+        self._applier = EventApplier(parts, scene.data, setup.method, start, self.slow)
+        fade_ticks = max(each.guard.fade_ticks for each in self._setups)
+        self.executor = CommandExecutor(self.commands, self._applier, fade_ticks, self.event)
         self.mark: MarkButton | None = None
         if setup.mark:
             self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
@@ -412,9 +406,15 @@ class Session:
             self._update_scenes()
         return found
 
-    def _bind_one(self, resources: ExitStack) -> None:
-        """Binds the kernel of one hand, and the loop of a slower scene."""
+    def _bind(self, resources: ExitStack) -> None:
+        """Binds the kernel of all hands, or of one and the loop of a slower scene."""
         scene, parameters = self.setup.scene, self.parameters
+        if isinstance(self.device, DeviceGroup):
+            hands = BoundHands(scene.model, scene.data, self.hand_parameters)
+            resources.callback(hands.release)
+            self.kernel.bind_hands(hands)
+            self.device.external_flags = hands.state["loop"]["external_flags"]
+            return
         bound = BoundKernel(scene.model, scene.data, parameters)
         resources.callback(bound.release)
         if parameters.scene_ticks:

@@ -165,7 +165,8 @@ class Resimulator:
         self._slow: SlowScene | None = None
         if parameters.scene_ticks:
             self._slow = SlowScene(self.binding, model, data, parameters)
-        self._commands = EventApplier(self.binding, data, method, parameters, start, self._slow)
+        hands = tuple(zip((self.hands or self.binding).hands, every, strict=True))
+        self._commands = EventApplier(hands, data, method, start, self._slow)
         check_start(recording, self.binding.state)
         if self.hands is not None:
             for hand, (other, _) in enumerate(others, 1):

@@ -100,7 +100,8 @@ def observe_reset(s: State, stored_before: float) -> None:
         stored_before: Storage before the reset in J.
     """
     energy, observer = s["energy"], s["observer"]
-    start, ratio = float(energy["start_energy"]), s["run"]["force_scale"] / s["run"]["scale"]
+    start = float(energy["start_energy"] + energy["others_work"])
+    ratio = s["run"]["force_scale"] / s["run"]["scale"]
     after = float(energy["kinetic"] + energy["potential"])
     lost_before, lost_after = min(stored_before - start, 0.0), min(after - start, 0.0)
     observer["net_device_energy"] += ratio * (lost_before - lost_after)

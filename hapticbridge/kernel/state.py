@@ -228,6 +228,11 @@ class BoundKernel:
         self._start(parameters)
 
     @property
+    def hands(self) -> tuple[BoundKernel, ...]:
+        """The kernel of the only hand, as ``BoundHands`` has those of several."""
+        return (self,)
+
+    @property
     def _record(self) -> State:
         """The state as one record, whose sub-records are views."""
         return self.state[0]
@@ -456,9 +461,9 @@ class BoundHands:
             SceneError: As for ``BoundKernel``.
         """
         for each in parameters:
-            if each.scheme != Scheme.IMPLICIT or each.substeps != 1 or each.scene_ticks:
+            if not each.properties.allows_hands or each.substeps != 1 or each.scene_ticks:
                 raise HapticBridgeError(
-                    "several hands need method 'implicit' or 'compensated', one substep, and a "
+                    "several hands need a method that MuJoCo solves whole, one substep, and a "
                     "scene that steps in every tick"
                 )
             if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
