@@ -28,7 +28,7 @@ from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import install_command
 from hapticbridge.film_process import Camera, Frame, Stage, film_ticks, write_film
 from hapticbridge.kernel.codes import added_actuators
-from hapticbridge.record import Timeline
+from hapticbridge.record import TICK_DTYPE, Timeline
 from hapticbridge.recorded_scene import load_machine_code, machine_code_for, seconds_for
 from hapticbridge.recording import RecordingFile, open_recording
 from hapticbridge.run_description import parameters_of
@@ -179,7 +179,7 @@ def states(recording: Path, shot: Shot, progress: Progress | None = None) -> dic
     opened = open_recording(recording, 0)
     child, work = _Child(opened, shot, progress), partial(_states, opened.path, shot)
     found = child.result(work) if shot.camera is None else child.drawn_with_any(work)[1]
-    return {**found, "rows": np.frombuffer(found["rows"], opened.record)}
+    return {**found, "rows": np.frombuffer(found["rows"], TICK_DTYPE)}
 
 
 def still(recording: str | Path, shot: Shot, *, in_process: bool = False) -> bytes:
