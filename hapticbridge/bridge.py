@@ -337,7 +337,8 @@ class Bridge:
         repeated.
 
         Args:
-            command: A change of coupling or switches, a reset, a mark, or a stop.
+            command: A change of coupling or switches, a reset, a mark, or a stop. One for a single
+                hand of several names the hand's grip.
             by: Origin of the command, for the recording.
 
         Raises:
@@ -347,7 +348,6 @@ class Bridge:
         if isinstance(command, Stop):
             self.stop(by)
             return
-        self._refuse_several()
         if self._session is None or not self._session.is_open:
             raise CommandError(_NOT_OPEN)
         self._session.commands.offer(command, by)
@@ -361,12 +361,7 @@ class Bridge:
         Args:
             events: Events of the recording (``commands.CHANGES``), in order.
         """
-        self._refuse_several()
         self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
-
-    def _refuse_several(self) -> None:
-        if self.setup.scene.has_several_hands:
-            raise CommandError("a run of several hands takes no commands but to stop")
 
     def set_input(
         self,

@@ -1,6 +1,6 @@
 """Several hands in one scene: what each holds, with which device, and their devices as one.
 
-``kernel.hands`` is the arithmetic of their tick, ``session`` runs it.
+``kernel.tick`` is the arithmetic of their tick, ``session`` runs it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from hapticbridge.guard import Limits, limits_for
 from hapticbridge.kernel.codes import JOINT
 from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.rendering import METHODS, method_named
 from hapticbridge.scene import Scene, load_scene
 
 
@@ -250,12 +251,17 @@ def _workspace_of_joint(grasp: Grasp, options: BridgeOptions) -> Workspace:
     return grasp.workspace
 
 
+def _methods() -> list[str]:
+    """Returns the names of the methods that several hands may have."""
+    return [name for name, method in METHODS.items() if method.scheme.properties.allows_hands]
+
+
 def _refuse_unsuited(options: BridgeOptions) -> None:
     """Refuses options that several hands cannot have."""
     for is_chosen, sentence in (
         (
-            options.method not in ("implicit", "compensated"),
-            f"method '{options.method}' has one hand; several need 'implicit' or 'compensated'",
+            not method_named(options.method or "").scheme.properties.allows_hands,
+            f"method '{options.method}' has one hand; several need one of {choices(_methods())}",
         ),
         (options.substeps != 1, f"several hands take one substep, not {options.substeps}"),
         (

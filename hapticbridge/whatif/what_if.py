@@ -401,11 +401,9 @@ class _Experiment:
 
 def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     counts = Counter(event.get("event") for event in run.recording.events)
-    if counts["coupling"] and not repetition.keeps_couplings:
-        yield (
-            f"the coupling was changed {counts['coupling']} times in the recorded run; here it is "
-            "constant"
-        )
+    changes = (event for event in run.recording.events if event.get("event") == "coupling")
+    if lost := sum(not repetition.keeps_coupling(event) for event in changes):
+        yield f"the coupling was changed {lost} times in the recorded run; here it is constant"
     if counts["reset"] and not repetition.keeps_resets:
         yield f"{counts['reset']} resets in the recorded run, none here: there is nothing to reset"
     flags = run.recording.ticks["flags"]
