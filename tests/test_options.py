@@ -19,7 +19,7 @@ from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters
-from hapticbridge.options import BridgeOptions, OptionChanges, RunSetup, Workspace
+from hapticbridge.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, load_scene
 
 REAL = DeviceInfo(

@@ -187,7 +187,7 @@ def _quantity(name: str, table: object) -> Quantity:
             f"[{name}] must hold value and source, and optionally unit and interval, and no more"
         )
     if table.get("unit", UNITS[name]) != UNITS[name]:
-        raise DeviceError(f"[{name}] unit = {table['unit']!r}: must be {UNITS[name]!r}")
+        raise DeviceError(f"[{name}] unit is {table['unit']!r}; it must be {UNITS[name]!r}")
     source = table.get("source")
     if not isinstance(source, str) or not source:
         raise DeviceError(f"[{name}] needs a source: the origin of the number, as a text")
@@ -196,18 +196,18 @@ def _quantity(name: str, table: object) -> Quantity:
     if name == "workspace" and isinstance(raw, list):
         value = tuple(checked_number(name, part, "m", is_positive=True) for part in raw)
         if len(value) != 3:
-            raise DeviceError(f"[{name}] value = {raw!r}: must be three lengths in m")
+            raise DeviceError(f"[{name}] value is {raw!r}; it must be three lengths in m")
     elif raw != "unknown":
         value = checked_number(f"[{name}] value", raw, UNITS[name])
     if interval is None:
         return Quantity(value, source)
     if not isinstance(interval, list) or len(interval) != 2 or not isinstance(value, float):
         raise DeviceError(
-            f"[{name}] interval = {interval!r}: must be two numbers around a single value"
+            f"[{name}] interval is {interval!r}; it must be two numbers around a single value"
         )
     least, most = (float(end) if is_number(end) else math.nan for end in interval)
     if not least <= value <= most:
-        raise DeviceError(f"[{name}] interval = {interval!r}: must contain the value {value:g}")
+        raise DeviceError(f"[{name}] interval is {interval!r}; it must contain the value {value:g}")
     return Quantity(value, source, (least, most))
 
 

@@ -436,8 +436,8 @@ class Repetition:
 
     def _coupling(self, event: Event) -> Event:
         """Returns the change to an equal effective coupling under these settings."""
-        old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
-        if replace(new, scene=old.scene, controller=old.controller) == old:
+        old, new, period = self._run.settings, self.settings, 1.0 / self.settings.options.rate
+        if new.loop == old.loop:
             return event
         law = coupling_in(event, self._run.parameters)
         requested = old.method.requested_coupling(law, old.timestep)
