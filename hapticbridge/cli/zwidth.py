@@ -85,7 +85,7 @@ class Zwidth:
     resolution: float | None = shared(DeviceInfo, "resolution")
     """Step of the device's position in m; by default exact."""
     rate: float = shared(BridgeOptions, "rate")
-    delay: float = option(0.0, unit="s", least=0.0)
+    delay: float = 0.0
     """Time in s from position to force, beyond the hold; it counts as whole ticks."""
     filter_time: float = option(0.0, unit="s", least=0.0)
     """Time constant in s of a first-order low-pass behind the coupling's damper."""

@@ -161,15 +161,17 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
     texts = {name: raw.pop(name, "") for name in _TEXTS}
     for name, text in texts.items():
         if not isinstance(text, str) or (name in ("name", "device") and not text):
-            raise DeviceError(f"{name} = {text!r}: must be a text, and name and device not empty")
+            raise DeviceError(
+                f"{name} is {text!r}; it must be a text, and name and device not empty"
+            )
     axes = raw.pop("axes", None)
     if axes is not None and (
         not isinstance(axes, list) or not axes or [a for a in AXES if a in axes] != axes
     ):
-        raise DeviceError(f"axes = {axes!r}: must be of {', '.join(AXES)}, in this order")
+        raise DeviceError(f"axes is {axes!r}; it must be of {', '.join(AXES)}, in this order")
     models = raw.pop("models", [])
     if not isinstance(models, list) or not all(isinstance(m, str) and m for m in models):
-        raise DeviceError(f"models = {models!r}: must be a list of texts that are not empty")
+        raise DeviceError(f"models is {models!r}; it must be a list of texts that are not empty")
     if unknown := raw.keys() - UNITS.keys():
         raise DeviceError(f"unknown tables {choices(unknown)}; valid tables: {choices(UNITS)}")
     return Profile(
