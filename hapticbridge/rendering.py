@@ -418,11 +418,11 @@ def default_method(substeps: int = 1) -> Method:
 
     ``implicit`` dissipates some energy on the way to a contact and ``lossless`` does not, so energy
     created by the scene's own contacts uses more slack: at most 1.2 % instead of 1.1 % when
-    tapping, and equal shares with jamming pegs (``scripts/bench_methods --same device``). Rigid
+    tapping, and equal shares with jamming pegs (``scripts/bench methods --same device``). Rigid
     contacts create none by either. Near contact
     ``lossless`` adds K T to B', but reports K T/2. When tapping at 6 Hz it is 54 µm RMS off its
     reported effective coupling. ``implicit`` is 26 µm off its own report, B + K T/2, and 116 µm off
-    B (``scripts/bench_front``).
+    B.
     """
     return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
 
