@@ -29,8 +29,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import AXES, DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import (
-    JOINT,
     WELD_NAME,
+    Grip,
     Scheme,
     added_id,
 )
@@ -289,7 +289,7 @@ class RunCoupling:
 
         Any other grip's coupling stays as it is.
         """
-        if not grip.startswith(JOINT):
+        if not Grip.from_text(grip).is_joint:
             return self
         ratio = scale * force_scale
 
