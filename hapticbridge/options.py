@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import is_number, shown
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.physics import site_inertia
 from hapticbridge.clock import Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
@@ -64,6 +63,7 @@ from hapticbridge.rendering import (
     resolve_contact_stiffness,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.scene.physics import site_inertia
 
 # Options of a user
 
