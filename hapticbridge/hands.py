@@ -22,7 +22,7 @@ from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.recording.format import MAX_HANDS
 from hapticbridge.rendering import METHODS, method_named
@@ -127,7 +127,7 @@ class Grasp:
     def grips(self) -> tuple[str, ...]:
         """The grips of the device, one or, with a grip axis, two."""
         axis = self.grip_axis
-        return (self.grip,) if axis is None else (self.grip, f"{JOINT}{axis.joint}")
+        return (self.grip,) if axis is None else (self.grip, str(Grip(axis.joint, "joint")))
 
 
 def check_grasps(grasps: Sequence[Grasp]) -> tuple[str, ...]:

@@ -18,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticbridge.arguments import check_fields, is_number, option, shown
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.physics import site_inertia
 from hapticbridge.clock import RATE, Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
@@ -65,6 +64,7 @@ from hapticbridge.rendering import (
     resolve_contact_stiffness,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.scene.physics import site_inertia
 
 # Options of a user
 

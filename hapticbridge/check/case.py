@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -67,6 +67,11 @@ def length(value: float) -> str:
 def weight(mass: float) -> str:
     """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
     return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Formats the values of an attribute: ``0.9 0.95 0.001``."""
+    return " ".join(f"{value:g}" for value in values)
 
 
 def others(count: int) -> str:
@@ -160,6 +165,17 @@ class CompiledScene:
     def model(self) -> mujoco.MjModel:
         """Compiled scene with handle, at its running time step."""
         return self.scene.model
+
+    @property
+    def step(self) -> float:
+        """Time step h in s."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def tool_bodies(self) -> NDArray[np.bool_]:
+        """True for each body of the grip's tree, (nbody,)."""
+        tree = self.model.body_treeid[self.model.site(self.scene.grip).bodyid[0]]
+        return np.asarray(self.model.body_treeid == tree, dtype=bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

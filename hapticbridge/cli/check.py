@@ -27,6 +27,7 @@ from hapticbridge.check.case import (
     weight,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
+from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,
@@ -37,7 +38,6 @@ from hapticbridge.check.lean import (
     find_lean,
 )
 from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
-from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of

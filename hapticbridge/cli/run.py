@@ -23,7 +23,7 @@ from hapticbridge.certificate import (
     run_conditions,
 )
 from hapticbridge.check.case import DEFAULT_SECONDS
-from hapticbridge.check.model_faults import worst_faults
+from hapticbridge.check.findings import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json

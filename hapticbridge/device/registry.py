@@ -30,7 +30,7 @@ from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices, nearest
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene
 
 # Table of the hardware drivers; a driver is imported when one of its devices is opened
@@ -302,8 +302,8 @@ def device_for(
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
-    others = [each for each in scene.other_grips if each != f"{JOINT}{grip_axis}"]
-    grip = scene.grip.removeprefix(JOINT)
+    others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]
+    grip = Grip.from_text(scene.grip).name
     path = scene.path.with_name(f"{scene.name}_{grip}.csv" if others else f"{scene.name}.csv")
     if path.is_file():
         options["path"] = path

@@ -13,7 +13,7 @@ from hapticbridge.arguments import Rule, check_fields, checked_value, option, ru
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.codes import Scheme, SchemeProperties
+from hapticbridge.kernel.codes import Grip, Scheme, SchemeProperties
 from hapticbridge.pose import IDENTITY_POSE
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
@@ -296,6 +296,11 @@ class RunParameters:
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
             raise _no_rotation(self.axes)
+
+    @property
+    def is_joint(self) -> bool:
+        """True if the hand holds a joint, which has no handle in the scene."""
+        return Grip.from_text(self.grip).is_joint
 
     @property
     def tank_cap(self) -> float:

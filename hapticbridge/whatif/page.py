@@ -15,7 +15,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
 from hapticbridge.guard import Limits
 from hapticbridge.hand_energy import INSTANT
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.record import due_times
 from hapticbridge.rendering import RunCoupling
@@ -134,7 +134,7 @@ def figure_of(found: WhatIf, bins: int = PICTURE_BINS) -> Figure:
 def _draw_hand(found: WhatIf, hand: int, panels: NDArray[np.object_], bins: int) -> None:
     before = found.runs[0].recordings[hand]
     is_held = not is_motion_prescribed(before.meta)
-    is_joint = before.meta.get("grip", "").startswith(JOINT)
+    is_joint = Grip.from_text(before.meta.get("grip", "")).is_joint
     wrench = "wrench_on_device" if is_held else "wrench_on_tool"
     unit = 1.0 if is_joint else 1e3
     origin = before.ticks["handle_position"][0]

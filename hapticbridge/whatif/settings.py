@@ -10,7 +10,7 @@ from hapticbridge.arguments import rule_of, shown, types_of, value_from
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
 from hapticbridge.guard import Limits
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.rendering import Method, method_named
 from hapticbridge.request import RunRequest
@@ -192,14 +192,14 @@ def changed_of_hands(
                 f"and a name of {choices(OF_HAND)}, or the name alone for all"
             )
         for each in [grip] if is_named else hands:
-            if is_named or name not in OF_HAND or not each.startswith(JOINT):
+            if is_named or name not in OF_HAND or not Grip.from_text(each).is_joint:
                 chosen[each][setting] = value
     news = {grip: old.changed(chosen[grip]) for grip, old in hands.items()}
     rows = []
     for number, (grip, own) in enumerate(chosen.items()):
         old, new = hands[grip], news[grip]
         for name in own:
-            unit = "" if grip.startswith(JOINT) else _unit(name)
+            unit = "" if Grip.from_text(grip).is_joint else _unit(name)
             if name in OF_HAND:
                 rows.append((f"{name} at '{grip}'", unit, old.value(name), new.value(name)))
             elif number == 0:

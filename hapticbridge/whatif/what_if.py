@@ -24,7 +24,6 @@ from hapticbridge.device.registry import FINGERS_HAND
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import Recording
@@ -318,10 +317,9 @@ class _Experiment:
     def _closed(self, settings: Sequence[Settings]) -> WhatIfRun:
         def devices(scene: Scene) -> list[Device]:
             hand = scene_hand(scene.model, scene.path)
-            is_joint = [run.parameters.grip.startswith(JOINT) for run in self.hands]
             return [
-                IdentifiedDevice(run, FINGERS_HAND if is_finger else hand)
-                for run, is_finger in zip(self.hands, is_joint, strict=True)
+                IdentifiedDevice(run, FINGERS_HAND if run.parameters.is_joint else hand)
+                for run in self.hands
             ]
 
         return self._simulated(CLOSED, devices, SimulatedClock(), settings)
