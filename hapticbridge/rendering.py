@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
@@ -50,7 +50,9 @@ from hapticbridge.theory.bounds import (
     law_damping,
 )
 
-RIGID, SCENE = "rigid", "scene"
+Contact = Literal["rigid", "scene"]
+RIGID: Contact = "rigid"
+SCENE: Contact = "scene"
 CONTACTS = (RIGID, SCENE)
 """Contacts by name: rigid and strictly passive (``kernel.rigid_contact``), or MuJoCo's with the
 scene's own settings."""
@@ -123,7 +125,7 @@ class Method:
         return self.scheme in SLOW_SCHEMES
 
     @property
-    def contact(self) -> str:
+    def contact(self) -> Contact:
         """Contact by its name in ``CONTACTS``."""
         return RIGID if self.is_rigid else SCENE
 

@@ -18,6 +18,7 @@ from hapticbridge.check.observe import Observation, Setting, observe
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
+from hapticbridge.device.base import checked_number
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -261,8 +262,7 @@ def open_case(
         DeviceError: The motion cannot be read, or the period, scale or workspace is out of range.
         RecordingError: The recording cannot be read.
     """
-    if not math.isfinite(workspace) or workspace <= 0:
-        raise DeviceError(f"workspace is {workspace!r} m; it must be finite and > 0")
+    checked_number("workspace", workspace, "m", is_positive=True)
     has_chosen_period, period = period is not None, DEFAULT_PERIOD if period is None else period
     info = SimulatedDevice().info
     coupling = coupling or default_coupling(info, period, scale, scale)

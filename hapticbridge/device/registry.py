@@ -188,7 +188,7 @@ def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str,
             values[name] = kind(value.strip())
         except ValueError:
             number = "a whole number" if kind is int else "a number"
-            raise DeviceError(f"{name} = '{value.strip()}': must be {number}") from None
+            raise DeviceError(f"{name} is '{value.strip()}'; it must be {number}") from None
     return values
 
 
@@ -346,7 +346,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
         parameters["hand"] = None
     elif not isinstance(parameters["hand"], Hand | None):
         raise DeviceError(
-            f"hand = {parameters['hand']!r}: must be 'none'; {choices(_HAND_OPTIONS)} change it"
+            f"hand is {parameters['hand']!r}; it must be 'none'; {choices(_HAND_OPTIONS)} change it"
         )
     return SimulatedDevice(**parameters)
 

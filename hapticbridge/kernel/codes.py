@@ -154,6 +154,7 @@ class SchemeProperties:
         holds_wrench: True if the wrench is applied as a force during the next tick. The law is then
             evaluated once per tick, else once per MuJoCo step.
         may_split: True if MuJoCo's position stage may run ahead of the sample.
+        allows_hands: True if several hands may hold one scene.
         one_substep: Reason for which a tick has one MuJoCo step; empty if it may have several.
     """
 
@@ -161,6 +162,7 @@ class SchemeProperties:
     has_tool_mass: bool = True
     holds_wrench: bool = False
     may_split: bool = True
+    allows_hands: bool = False
     one_substep: str = ""
 
     def law_evaluations(self, substeps: int) -> int:
@@ -169,7 +171,7 @@ class SchemeProperties:
 
 
 _PROPERTIES = {
-    Scheme.IMPLICIT: SchemeProperties(),
+    Scheme.IMPLICIT: SchemeProperties(allows_hands=True),
     Scheme.ZERO_ORDER_HOLD: SchemeProperties(holds_wrench=True),
     Scheme.WELD: SchemeProperties(has_law=False, may_split=False),
     Scheme.MASSLESS: SchemeProperties(

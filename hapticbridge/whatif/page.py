@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import unit_of
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.guard import Limits
 from hapticbridge.hand_energy import INSTANT
 from hapticbridge.kernel.codes import Grip
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
@@ -34,8 +36,6 @@ if TYPE_CHECKING:
 
 # Table of a what-if's runs
 
-_PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}
-
 Row = tuple[str, tuple[str, ...]]
 
 
@@ -56,7 +56,7 @@ def rows(found: WhatIf) -> Iterator[Row]:
                 )
     yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
-        unit = _PEAK_UNITS[name.split()[0]]
+        unit = unit_of(Limits, name.split()[0])
         yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
     shown = [shown_energies(run.report.energies, run.report.start_potential) for run in runs]
     for name in shown[0]:

@@ -1,7 +1,7 @@
 """Processor time that commands take to start, relative to that of the libraries.
 
 One line per command: the median of user and system time, child processes included, over that of a
-process that imports numpy, mujoco, numba, tyro and rich. Byte code goes to a folder of its own; the
+process that imports numpy, mujoco, numba and rich. Byte code goes to a folder of its own; the
 first start on a machine compiles for longer.
 """
 
@@ -20,7 +20,7 @@ from measuring import in_turn
 
 REFERENCE = "reference"
 COMMANDS = {
-    REFERENCE: ["-c", "import numpy, mujoco, numba, tyro, rich"],
+    REFERENCE: ["-c", "import numpy, mujoco, numba, rich"],
     "version": ["-m", "hapticbridge", "--version"],
     "help": ["-m", "hapticbridge", "--help"],
     "run_help": ["-m", "hapticbridge", "run", "--help"],
