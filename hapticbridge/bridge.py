@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, Unpack
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -45,7 +45,6 @@ from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
-    OptionChanges,
     RunSetup,
     Workspace,
     device_for_run,
@@ -72,7 +71,7 @@ def _no_option(name: str) -> str:
     for option, holder in (("limits", Limits), ("workspace", Workspace)):
         if name in holder.__dataclass_fields__:
             return f"'{name}' belongs to the option {option}: write it in hb.{holder.__name__}(…)"
-    return f"a bridge has no option '{name}'; it has {choices(OptionChanges.__annotations__)}"
+    return f"a bridge has no option '{name}'; it has {choices(BridgeOptions.__dataclass_fields__)}"
 
 
 class Bridge:
@@ -122,9 +121,9 @@ class Bridge:
         clock: Clock | None = None,
         recording: str | Path | None = None,
         observer: RingObserver | None = None,
-        **changes: Unpack[OptionChanges],
+        **changes: Any,
     ) -> None:
-        for name in set(changes) - set(OptionChanges.__annotations__):
+        for name in changes.keys() - BridgeOptions.__dataclass_fields__.keys():
             raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)

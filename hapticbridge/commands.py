@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import Arguments, shown
+from hapticbridge.arguments import check_fields, rule_of, shared, shown
 from hapticbridge.certificate import StepCondition, assumed_damping
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import (
@@ -46,8 +46,6 @@ from hapticbridge.slow_scene import SlowScene
 LONGEST_LINE = 250
 """Largest size of a line in bytes; the longest command has about 170."""
 
-_ARGUMENTS = Arguments(CommandError)
-
 
 @dataclass(frozen=True, slots=True)
 class Couple:
@@ -65,22 +63,16 @@ class Couple:
         CommandError: A value is out of range.
     """
 
-    stiffness: float
-    damping: float
-    rotational_stiffness: float | None = None
-    rotational_damping: float | None = None
+    stiffness: float = shared(Coupling, "stiffness")
+    damping: float = shared(Coupling, "damping")
+    rotational_stiffness: float | None = shared(Coupling, "rotational_stiffness", None)
+    rotational_damping: float | None = shared(Coupling, "rotational_damping", None)
     grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        _ARGUMENTS.number("stiffness", self.stiffness, "N/m", least=0.0, is_open=True)
-        _ARGUMENTS.number("damping", self.damping, "N s/m", least=0.0)
-        turning = self.rotational_stiffness, self.rotational_damping
-        if turning == (None, None):
-            return
-        if turning[0] is None or turning[1] is None:
+        check_fields(self, CommandError)
+        if (self.rotational_stiffness is None) != (self.rotational_damping is None):
             raise CommandError("give rotational stiffness and damping together, or neither")
-        _ARGUMENTS.number("rotational stiffness", turning[0], "N m/rad", least=0.0)
-        _ARGUMENTS.number("rotational damping", turning[1], "N m s/rad", least=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +93,7 @@ class Switch:
     grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        for name in ("force", "clutch"):
-            value = getattr(self, name)
-            if value is not None and not isinstance(value, bool):
-                raise CommandError(f"{name} is {shown(value)}; it must be true or false")
+        check_fields(self, CommandError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +180,8 @@ SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no
 longer shows the hand where the tool is. A run that began softer may stay so."""
 
-UNITS = {"translation": ("N/m", "N s/m"), "rotation": ("N m/rad", "N m s/rad")}
+_GAINS = [rule_of(each).unit for each in fields(Coupling)]
+UNITS = {"translation": (_GAINS[0], _GAINS[1]), "rotation": (_GAINS[2], _GAINS[3])}
 """Units of stiffness and damping by kind of axis."""
 
 _PREFIX = {"translation": "", "rotation": "rotational "}

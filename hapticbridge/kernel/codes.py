@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import mujoco
 
@@ -42,16 +42,37 @@ def added_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     return int(mujoco.mj_name2id(model, kind, name))
 
 
-JOINT = "joint:"
-"""Start of a grip that is a joint, as in ``joint:hinge``: a hand moves it along its one axis."""
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """Site, body, point of a body, or joint that a hand holds.
+
+    Attributes:
+        name: Name of the site, body or joint.
+        kind: ``site`` (or a body's), or ``joint``, a hinge or slide that moves along its one axis.
+    """
+
+    name: str
+    kind: Literal["site", "joint"] = "site"
+
+    @classmethod
+    def from_text(cls, text: str) -> Grip:
+        """Returns the grip of its text: ``SITE``, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``."""
+        kind, is_kind, name = text.partition(":")
+        return cls(name, "joint") if is_kind and kind == "joint" else cls(text)
+
+    def __str__(self) -> str:
+        return f"joint:{self.name}" if self.is_joint else self.name
+
+    @property
+    def is_joint(self) -> bool:
+        """True for a joint, which has no handle in the scene."""
+        return self.kind == "joint"
 
 
 def held_joint(model: mujoco.MjModel, grip: str) -> int:
     """Returns the id of the joint that a grip names, or -1 if it names a site."""
-    name = grip.removeprefix(JOINT)
-    if name == grip or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, grip) >= 0:
-        return -1
-    return int(model.joint(name).id)
+    held = Grip.from_text(grip)
+    return int(model.joint(held.name).id) if held.is_joint else -1
 
 
 def held_body(model: mujoco.MjModel, grip: str) -> int:

@@ -445,8 +445,9 @@ class Repetition:
     def _coupling(self, event: Event) -> Event:
         """Returns the change to an equal effective coupling under these settings."""
         hand = self._hand_of(event)
-        old, new, period = self._hands[hand].settings, self._settings[hand], 1 / self.settings.rate
-        if replace(new, scene=old.scene, controller=old.controller) == old:
+        old, new = self._hands[hand].settings, self._settings[hand]
+        period = 1.0 / self.settings.options.rate
+        if new.loop == old.loop:
             return event
         law = coupling_in(event, self._hands[hand].parameters)
         requested = old.method.requested_coupling(law, old.timestep)
