@@ -23,6 +23,7 @@ import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import run_conditions
+from hapticbridge.certification import Standing
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.kernel.parameters import DAMPER
@@ -48,6 +49,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
+from hapticbridge.trip import Trip, TripCode
 from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")
@@ -101,12 +103,16 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
         False: "The device does not bear this coupling",
         None: "It is not known if the device bears this coupling in any hand.",
     }
+    found = passive.certification
+    assert found is not None
+    standings = {each.verdict: each for each in Standing}
     for certified, words in sentences.items():
-        judged = replace(passive, certified=certified)
+        judged = replace(passive, certification=replace(found, standing=standings[certified]))
         assert words in notes(judged)[-1]
         assert is_warned(judged) is (certified is False)
     assert not notes(replace(passive, verdict="active"))
-    stopped = replace(passive, reason=f"{passive.reason}; the guard tripped", events={"trip": 1})
+    trip = Trip(TripCode.JUMPED, 3)
+    stopped = replace(passive, remarks=(*passive.remarks, "the guard tripped"), trip=trip)
     write_report(read_recording(run_file), stopped, page)
     text = page.read_text(encoding="utf-8")
     assert '<section class="verdict warned">' in text

@@ -18,6 +18,7 @@ from hapticbridge import timekeeping
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import default_coupling, is_certified
+from hapticbridge.certification import Standing, certification_of
 from hapticbridge.check.cost import Cost, Growth, TimingStats
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
@@ -26,6 +27,7 @@ from hapticbridge.errors import SafetyTrip
 from hapticbridge.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.timing import DELAY_PRICE
 from hapticbridge.loop_setting import fresh_share
+from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
 from hapticbridge.summary import Summary
 
@@ -495,13 +497,29 @@ def kept_time() -> timekeeping.Timekeeping:
 
 
 def test_a_force_that_the_watch_lowered_refutes_a_device_that_is_not_judged() -> None:
-    kept = kept_time()
-    assert kept.certified(None, HandEnergy()) is None
-    assert replace(kept, watch="the force was lowered").certified(None, HandEnergy()) is False
+    device = ScriptedDevice(sway, damping=None)
+    with fast("point_mass", device) as bridge:
+        bridge.run(0.05)
+        run, method, info = bridge.session.parameters, bridge.setup.method, bridge.setup.info
+    times = timekeeping.RunTimes(
+        ticks=50,
+        fresh=1.0,
+        new_samples=50,
+        due=50,
+        mean_delay=0.0,
+        mean_jitter=0.0,
+        delay_energy=0.0,
+        is_realtime=False,
+    )
+    found = certification_of(info, run, method, times, HandEnergy())
+    assert (found.verdict, found.standing) == (None, Standing.DAMPING_UNKNOWN)
+    swung = replace(times, flags=int(TickFlag.SWINGING))
+    found = certification_of(info, run, method, swung, HandEnergy())
+    assert (found.verdict, found.standing) == (False, Standing.ALARM)
 
 
 def test_a_silence_of_the_device_is_the_cause_and_not_the_clock() -> None:
-    silent = replace(kept_time(), is_kept=False, silence="the device gave no new sample for 1 s")
-    assert "no new sample for 1 s; check its link" in silent.fault
+    silent = replace(kept_time(), is_kept=False, silence=timekeeping.Silence(1.0, 2.0))
+    assert "no new sample for 1 s (at 2.0 s), and the force faded; check its link" in silent.fault
     assert "doctor" not in silent.fault
     assert "doctor" in replace(silent, share=0.5).fault
