@@ -71,7 +71,8 @@ def default_coupling(
     uses B' without clipping. It needs 85 % of b. Behind a device that is late the ratio B'/K is the
     one with the largest K (``theory.bounds.stiffest_late_coupling``). If several evaluations per
     tick need more, or friction does not hold the encoder's steps, K and B' are lowered together;
-    both conditions are linear in both.
+    both conditions are linear in both. Without any friction no coupling is free of swings by steps,
+    so damping alone decides, and the condition says so.
 
     Args:
         info: The device; unknown damping is replaced as in ``assumed_damping``.

@@ -523,3 +523,62 @@ def test_a_silence_of_the_device_is_the_cause_and_not_the_clock() -> None:
     assert "no new sample for 1 s (at 2.0 s), and the force faded; check its link" in silent.fault
     assert "doctor" not in silent.fault
     assert "doctor" in replace(silent, share=0.5).fault
+
+
+def damping_for_ticks(stiffness: float, damping: float, share: float, ticks: int) -> float:
+    """Returns the least b/m of the form in ``kernel.timing`` for a sample in m ticks, T = 1.
+
+    ``share`` is t_d/(m T). The tool's motion in each of the ticks is free.
+    """
+    most, unit = 0.0, np.eye(2 + ticks, dtype=complex)
+    moved, uneven, tool = unit[0], unit[1], unit[2:]
+    for theta in np.geomspace(1e-3, np.pi, 100):
+        back = np.exp(-1j * theta)
+        stretched = [*(-tool[:-1]), moved - tool[-1]]
+        spring = sum(stretched) / (1 - back) * back
+        form = np.zeros((2 + ticks, 2 + ticks), complex)
+        for change, step in zip(stretched, tool, strict=True):
+            spring = spring + change
+            force = stiffness * spring + damping * change
+            form += _product(force, step)
+        early = share * moved + uneven
+        form -= _product(force * back, moved - early) + _product(force * back * back, early)
+        rest = form[:2, :2] - form[:2, 2:] @ np.linalg.solve(form[2:, 2:], form[2:, :2])
+        weights = np.array([1.0, 1.0 / (share * (1.0 - share))])
+        rest = rest / np.sqrt(np.outer(weights, weights))
+        most = max(most, float(np.linalg.eigvalsh(rest)[-1]))
+    return most
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 4, 8])
+@pytest.mark.parametrize("damping", [0.0, 0.1, 1.0, 5.0])
+@pytest.mark.parametrize("share", [1e-6, 0.1, 0.5])
+def test_a_sample_in_several_ticks_needs_no_more_than_is_charged(
+    ticks: int, damping: float, share: float
+) -> None:
+    stiffness, needed = 2.0, 1.0 + damping
+    kappa = (stiffness / 2.0) ** 2 / needed
+    charged = needed + (ticks - 1) * kappa + DELAY_PRICE * ticks * kappa * share
+    found = damping_for_ticks(stiffness, damping, share, ticks)
+    assert found <= charged * (1.0 + 1e-6)
+    if damping == 0.0:
+        assert found == pytest.approx(charged, rel=1e-3)  # exact for a spring
+        if ticks > 1:  # the charge for one tick is too small
+            assert found > 1.9 * (needed + DELAY_PRICE * kappa * share)
+
+
+def test_run_and_audit_charge_a_late_sample_for_each_of_its_ticks(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    clock = SlowClock({}, {})
+    device = ScriptedDevice(
+        stroke,
+        is_stale=lambda tick: tick % 4 != 0,
+        on_write=lambda _sent: clock.spend(0.3),
+    )
+    summary = recorded(path, "virtual_wall", device, STIFF, clock=clock, duration=0.5)
+    report = audit(path)
+    kept = report.timekeeping
+    assert report.resimulation == "bit for bit"
+    assert kept is not None
+    assert summary.timekeeping.delay_energy > 0.0
+    assert kept.delay_energy == pytest.approx(summary.timekeeping.delay_energy, rel=1e-6)

@@ -63,6 +63,7 @@ class AuditedBlock:
         motion: Motion of handle and tool.
         is_first: True for the first tick after a start or a pause without force, (n,).
         interval: Time in s since the device's last new sample, at least T between readings, (n,).
+        sample_ticks: Ticks since the device's last new sample, at least 1, (n,).
         share_before: r_{k−1}, the share of the device's motion that the handle made, (n,).
         rise_ticks: Ticks in which r rises from 0 to 1, (n,).
         scene_ticks: Ticks between two results of a slower scene; 0 for another.
@@ -74,6 +75,7 @@ class AuditedBlock:
     motion: Motion
     is_first: Flags
     interval: Array
+    sample_ticks: NDArray[np.int64]
     share_before: Array
     rise_ticks: Array
     scene_ticks: int
@@ -104,6 +106,7 @@ class AuditedBlock:
             motion=Motion.from_records(ticks, state, events, before),
             is_first=is_first,
             interval=_sample_intervals(ticks, state, parameters.period),
+            sample_ticks=_sample_ticks(ticks, state),
             share_before=before,
             rise_ticks=rise,
             scene_ticks=parameters.scene_ticks,
@@ -116,6 +119,7 @@ class AuditedBlock:
             self.state,
             row=row.copy(),
             since_sample=float(self.interval[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
+            stale_ticks=int(self.sample_ticks[-1] * has_flag(row, TickFlag.STALE_SAMPLE)[0]),
             rise_ticks=float(self.rise_ticks[-1]),
             sums=sums,
         )
@@ -136,6 +140,13 @@ def _shortened(vector: Array, limit: Array | float) -> Array:
     norm = np.linalg.norm(vector, axis=1)
     share = np.divide(limit, norm, out=np.ones_like(norm), where=norm > limit)
     return np.asarray(vector * share[:, None])
+
+
+def _sample_ticks(ticks: NDArray[np.void], state: AuditState) -> NDArray[np.int64]:
+    count = np.arange(len(ticks))
+    newest = _newest(~has_flag(ticks, TickFlag.STALE_SAMPLE))
+    before = np.concatenate([[-1], newest[:-1]])  # row of the last new sample
+    return np.asarray(np.where(before < 0, count + 1 + state.stale_ticks, count - before))
 
 
 def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float) -> Array:

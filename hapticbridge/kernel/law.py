@@ -348,17 +348,19 @@ def _held(s: State, v: Vector, first: int, length: float) -> Vector:
 
 
 @compiled
-def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float, float]:
+def lateness(s: State, kind: int, interval: float, ticks: int) -> tuple[float, float, float, float]:
     """Returns the terms of a sample's lateness for translation (0) or rotation (1).
 
     Args:
         s: The bound state, with the handle's new step d.
         kind: 0 or 1.
         interval: Time t since the last new sample in s.
+        ticks: m, ticks in this time.
 
     Returns:
-        K, K/2 + B'/T, K/2 + B'/T + c − b/t and ‖d‖². b is the device's damping seen at the handle,
-        at least what the condition needs; c is what a torque across the motion costs.
+        K, K/2 + B'/T, K/2 + B'/T + (m − 1) K²/(2 (K + 2B'/T)) + c − b/t and ‖d‖². b is the device's
+        damping seen at the handle, at least what the condition needs; c is what a torque across the
+        motion costs.
     """
     k, run, pose = s.coupling, s.run, s.pose
     stiffness, damping, across = k.stiffness, k.damping, 0.0
@@ -371,23 +373,25 @@ def lateness(s: State, kind: int, interval: float) -> tuple[float, float, float,
             across = twist_price(s, norm(vector_of(s.lossless.twist)))
     b = max(b, 0.5 * stiffness * run.period + damping)
     needed = 0.5 * stiffness + damping / run.period
-    return stiffness, needed, needed + across - b / interval, dot(d, d)
+    more = 0.25 * (ticks - 1) * stiffness * stiffness / needed if ticks > 1 else 0.0
+    return stiffness, needed, needed + more + across - b / interval, dot(d, d)
 
 
 @compiled
-def charge_lateness(s: State, interval: float) -> None:
+def charge_lateness(s: State, interval: float, ticks: int) -> None:
     """Charges the springs with the energy that a late sample may have put in.
 
-        D = (K/2 + B'/T + c − b/t) ‖d‖²,    b >= K T/2 + B' + c T
+        D = (K/2 + B'/T + (m − 1) K²/(2 (K + 2B'/T)) + c − b/t) ‖d‖²,    b >= K T/2 + B' + c T
 
-    d is the handle's step in m, t the time in s since the last sample, T the period. The hand has
-    felt a held force while the spring was stretched by d; the device burned b ‖d‖²/t. D is below
-    zero for a sample in time; a late one pays later, because the handle slips until the springs
-    hold less by D. b in N s/m is the device's damping seen at the handle, at least what the
-    condition needs.
+    m is the number of ticks since the last sample. In each of them the tool may have moved, and the
+    hand has felt the force of the first (``theory.bounds.late_minimum_damping``). d is the handle's
+    step in m, t the time in s since the last sample, T the period. The hand has felt a held force
+    while the spring was stretched by d; the device burned b ‖d‖²/t. D is below zero for a sample in
+    time; a late one pays later, because the handle slips until the springs hold less by D. b in
+    N s/m is the device's damping seen at the handle, at least what the condition needs.
     """
     for kind in range(2):
-        _, _, lacking, square = lateness(s, kind, interval)
+        _, _, lacking, square = lateness(s, kind, interval, ticks)
         s.coupling.owed[kind] = max(s.coupling.owed[kind] + lacking * square, 0.0)
 
 

@@ -201,6 +201,7 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
         return code
     # the device may have moved during all the time since its last new sample
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
+    ticks = s.guard.consecutive_stale + 1
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
     watch_device(s, moved, turned, interval)
@@ -217,8 +218,8 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
     max_stretch = max_twist = np.inf
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
-        charge_lateness(s, interval)
-        meter_delay(s, max(elapsed, s.run.period), interval)
+        charge_lateness(s, interval, ticks)
+        meter_delay(s, interval, ticks)
     else:
         skip_delay(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
