@@ -8,7 +8,9 @@ once. A run certifies its device only if it kept its time, which means two thing
 
        b >= N (1/s + j/T) + 3 κ t_d/T,    κ = (K T/2)²/N
 
-   s is the smaller of two shares: deadlines that were kept, and samples that were new. j is the
+   s is the smaller of two shares: deadlines that were kept, and samples that were new. In ticks
+   without a new sample the tool moves, so that these ask for m (m − 1) (K T)²/(4 N) more, with one
+   new sample in m ticks on average. j is the
    mean time by which a sample came later after its deadline than the one before; 0 if earlier.
 
 2. Single delays gave the hand at most ``INSTANT`` in energy beyond what b burned
@@ -23,6 +25,7 @@ springs cannot pay for it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -376,18 +379,18 @@ def _at_times(
     if not condition.is_felt:
         return condition
     coupling = parameters.effective or parameters.coupling
-    stiffness = parameters.scale * parameters.force_scale * coupling.stiffness
+    ratio, k, b = parameters.scale * parameters.force_scale, coupling.stiffness, coupling.damping
     if condition.axis == "rotation":
         ratio = parameters.force_scale / parameters.scale
-        stiffness = ratio * coupling.rotational_stiffness
-    needed = condition.needed * (1.0 / share + times.mean_jitter / parameters.period)
-    if stiffness > 0.0:
-        held = condition.ticks_per_sample * parameters.period
-        # of one force for n ticks the price of a spring alone, which is the larger one
-        price = DELAY_PRICE * 0.5 * stiffness * condition.ticks_per_sample
-        if condition.ticks_per_sample == 1:
-            price *= 0.5 * stiffness * held / condition.needed
-        needed += price * times.mean_delay
+        k, b = coupling.rotational_stiffness, coupling.rotational_damping
+    ticks, period = condition.ticks_per_sample, parameters.period
+    needed = condition.needed * (1.0 / share + times.mean_jitter / period)
+    if k > 0.0:
+        kappa = 0.5 * k / (1.0 + 2.0 * b / (k * period))  # κ/T
+        # samples that did not come: the tool moved in the ticks between them
+        count = ticks / times.fresh if times.fresh else math.inf
+        needed += ratio * kappa * period * count * (count - ticks)
+        needed += ratio * DELAY_PRICE * ticks * kappa * times.mean_delay
     at_times = replace(condition, needed=needed)
     if at_times.holds is False and condition.holds is not False:
         return replace(at_times, remedy=remedy)

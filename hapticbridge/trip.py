@@ -152,6 +152,9 @@ class Trip:
         """Tick and reason."""
         return f"tick {self.tick}: {self.words}"
 
+    def __str__(self) -> str:
+        return self.sentence
+
     @property
     def is_unsound(self) -> bool:
         """True if the simulation itself is in doubt; such a run is never passive.

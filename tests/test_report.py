@@ -21,6 +21,7 @@ from report_runs import Made
 
 import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit.replay import Agreement
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import run_conditions
 from hapticbridge.certification import Standing
@@ -307,7 +308,7 @@ def test_the_scene_is_the_cause_by_what_touched_and_what_was_moved(made: Made) -
     law = json.dumps([float(recording.meta[name]) for name in gains])
     hazardous = recording.meta | {"method": "implicitfast", "requested": law}
     assert cause_of(recording, report, meta=hazardous).kind == "contact setting"
-    foreign = replace(report, resimulation="not re-simulated: recorded with mujoco 3.0.0")
+    foreign = replace(report, agreement=Agreement.NOT_RUN, obstacle="recorded with mujoco 3.0.0")
     cause = cause_of(recording, foreign)
     assert (cause.kind, "touched" in cause.evidence) == ("contact setting", False)
     recording, report = made(report_runs.active_by_mocap)

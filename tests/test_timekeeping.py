@@ -452,7 +452,7 @@ def test_a_slow_device_that_bears_the_coupling_is_not_weakened_and_hears_nothing
     peaks = []
     for every in (1, 4):
         device = ScriptedDevice(pressed, is_stale=lambda tick, n=every: tick % n != 0)  # type: ignore[misc]
-        with fast("virtual_wall", device, coupling=Coupling(400.0, 0.5)) as bridge:
+        with fast("virtual_wall", device, coupling=Coupling(200.0, 0.3)) as bridge:
             summary = bridge.run(1.0)
         peaks.append(summary.peak_force)
         assert "the handle slips" not in str(summary)

@@ -7,9 +7,10 @@ device and N = K T/2 + B', the energy of each kind of axis is
     A_k = max(0, A_{k−1} + 3 m (K/2)²/(N/T) (t_d/τ_k) max(d_k², d_{k−1}²) − p_k)
 
 with k over samples and m ticks since the last one. p is what the device's damping burned beyond
-N + (m − 1) (K T)²/(4 N), less what it paid for late samples and for a torque across the motion
-(``kernel.law.twist_price``). To it comes what late samples cost and the springs could not pay, C_k = max(0, C_{k−1} + c_k − V_k), up to what the
-wrenches gave the hand beyond what b burned; V is the energy of the springs after the sample.
+N, less what it paid for late samples (``kernel.law.charge_lateness``) and for a torque across the
+motion (``kernel.law.twist_price``). To it comes what late samples cost and springs could not pay,
+C_k = max(0, C_{k−1} + c_k − V_k), up to what the wrenches gave the hand beyond what b burned; V is
+the energy of the springs after the sample.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array, torque_across, turn_between
-from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
+from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, newest, spring_energy
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag, has_flag
@@ -58,6 +59,7 @@ class TimingTally:
         last_square: Squared motions of the last sample, by kind of axis.
         owed: Energies C in J by kind of axis.
         burned: Energy in J that the device's damping has burned at least.
+        tool_then: Pose of the tool after the tick of the last new sample, (1, 7).
     """
 
     parameters: RunParameters
@@ -79,6 +81,7 @@ class TimingTally:
     last_square: Array = field(default_factory=_no_energy)
     owed: Array = field(default_factory=_no_energy)
     burned: float = 0.0
+    tool_then: Array = field(default_factory=lambda: np.zeros((1, 7)))
 
     def add(self, block: AuditedBlock, events: RunEvents) -> None:
         """Adds consecutive records, at least one."""
@@ -109,6 +112,7 @@ class TimingTally:
         ticks, parameters = block.ticks, self.parameters
         is_stale = has_flag(ticks, TickFlag.STALE_SAMPLE)
         is_new = np.concatenate([[True], ~is_stale | block.is_first])
+        waited, stretched = block.sample_ticks - 1, self._stretched(block)
         scale, force_scale = parameters.scale, parameters.force_scale
         linear, angular = parameters.device_damping, parameters.device_rotational_damping
         motion, total, owed = block.motion, np.zeros(len(ticks)), np.zeros(len(ticks))
@@ -124,13 +128,15 @@ class TimingTally:
             across = _price_across(block, events) if kind else 0.0
             half = 0.5 * gains[:, 0]
             price = np.divide(half**2, needed, out=np.zeros_like(half), where=needed > 0)
-            more = (block.sample_ticks - 1) * price
             burnt = np.maximum(b, needed * parameters.period) / block.interval
-            late = (needed + more + across - burnt) * square
+            late = (needed + across - burnt) * square
+            more = gains[:, 0] * np.sum(stretched[kind] * steps, axis=1)
+            more -= needed * np.sum(stretched[kind] ** 2, axis=1) / np.maximum(waited, 1)
+            late += np.where((waited > 0) & ~block.is_first, np.maximum(more, 0.0), 0.0)
             lent = np.concatenate([self.lent[kind : kind + 1], _drained(late, self.lent[kind])])
             squares = np.concatenate([self.last_square[kind : kind + 1], square])
-            newest = np.maximum.accumulate(np.where(is_new, np.arange(len(squares)), 0))
-            last = squares[newest[:-1]]
+            at = np.maximum.accumulate(np.where(is_new, np.arange(len(squares)), 0))
+            last = squares[at[:-1]]
             cost = _DELAY_PRICE * block.sample_ticks * price * delay[:-1] / block.interval
             cost = np.where(is_stale | block.is_first, 0.0, cost * np.maximum(square, last))
             energy = _drained(cost + np.minimum(lent[:-1] + late, 0.0), self.uncovered[kind])
@@ -140,10 +146,22 @@ class TimingTally:
             debt = _drained(np.where(gains[:, 0] > 0, late - paid, 0.0), self.owed[kind])
             owed += debt
             self.lent[kind], self.uncovered[kind] = lent[-1], energy[-1]
-            self.last_square[kind], self.owed[kind] = squares[newest[-1]], debt[-1]
+            self.last_square[kind], self.owed[kind] = squares[at[-1]], debt[-1]
         ratio = force_scale / scale
         held = np.minimum(ratio * owed, np.maximum(ticks["device_energy"] - self._burn(block), 0.0))
         self.max_uncovered = max(self.max_uncovered, float(np.max(ratio * total + held)))
+
+    def _stretched(self, block: AuditedBlock) -> tuple[Array, Array]:
+        """Returns how far the tool moved off since the last new sample, (n, 3) in m and rad."""
+        poses = np.concatenate([self.tool_then, block.motion.tool_before])
+        rows, begun = np.arange(len(block.ticks) + 1), np.append(newest(block.is_first), -1)
+        begun[-1] = begun[-2]
+        stale = has_flag(block.ticks[-1:], TickFlag.STALE_SAMPLE)[0]
+        count = np.append(block.sample_ticks, 1 + block.sample_ticks[-1] * stale)
+        then = poses[np.maximum(np.maximum(rows - count + 1, begun) + 1, 0)]
+        self.tool_then, then = then[-1:], then[:-1]
+        now = block.motion.tool_before
+        return then[:, :3] - now[:, :3], turn_between(now[:, 3:], then[:, 3:])
 
     def _burn(self, block: AuditedBlock) -> Array:
         """Returns the energy that the device's damping has burned at least by each tick, (n,)."""

@@ -96,7 +96,7 @@ class AuditedBlock:
         before[is_reset] = 0.0
         # a start rises slowly; after a reset, or once r has been 0, it rises within the fade
         is_short = is_reset | ((ticks["share"] == 0.0) & may_fade(ticks))
-        start, fade = _newest(is_first), _newest(is_short)
+        start, fade = newest(is_first), newest(is_short)
         rise = np.where(fade >= start, parameters.guarding.fade_ticks, parameters.ramp_ticks)
         rise = np.where((start < 0) & (fade < 0), state.rise_ticks, rise)
         return cls(
@@ -130,7 +130,7 @@ def first_share(parameters: RunParameters) -> float:
     return 0.0 if parameters.guarding.has_hand or parameters.ramp_ticks > 0 else 1.0
 
 
-def _newest(is_on: Flags) -> NDArray[np.int64]:
+def newest(is_on: Flags) -> NDArray[np.int64]:
     """Returns the newest row that is True up to each row; -1 before the first."""
     return np.maximum.accumulate(np.where(is_on, np.arange(len(is_on)), -1))
 
@@ -144,8 +144,8 @@ def _shortened(vector: Array, limit: Array | float) -> Array:
 
 def _sample_ticks(ticks: NDArray[np.void], state: AuditState) -> NDArray[np.int64]:
     count = np.arange(len(ticks))
-    newest = _newest(~has_flag(ticks, TickFlag.STALE_SAMPLE))
-    before = np.concatenate([[-1], newest[:-1]])  # row of the last new sample
+    last = newest(~has_flag(ticks, TickFlag.STALE_SAMPLE))
+    before = np.concatenate([[-1], last[:-1]])  # row of the last new sample
     return np.asarray(np.where(before < 0, count + 1 + state.stale_ticks, count - before))
 
 

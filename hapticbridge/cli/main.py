@@ -178,8 +178,8 @@ def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
     import tyro  # noqa: PLC0415
 
     description = _reflowed(inspect.getdoc(command) or "")
-    if {"-h", "--help", "--help-all"} & set(words):
-        is_whole = "--help-all" in words
+    if {"-h", "--help", "--help-all"} & (options := set(words)):
+        is_whole = "--help-all" in options
         command, hidden = _with_first_options(command, is_whole=is_whole)
         words = ["--help"]
         if hidden:

@@ -59,6 +59,7 @@ from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
     felt,
+    note_tool,
     retune,
     slip,
 )
@@ -221,6 +222,7 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
         charge_lateness(s, interval, ticks)
         meter_delay(s, interval, ticks)
     else:
+        note_tool(s)
         skip_delay(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)

@@ -31,7 +31,7 @@ term is not paid, so it is summed here, for translation and rotation each, as
 d is the handle's motion with the device, D the larger one of this sample and the last.
 
 A sample may come in one of m ticks only. The forces of two samples then differ by the deflections
-of m ticks, and the form holds with them all. It asks for m κ in place of κ, and for b >= m N_m with
+of m ticks, and the form holds with them all. It asks for m κ in place of κ, and for b >= m N_m,
 N_m = N + (m − 1) (K T)²/(4 N), as ``theory.bounds.late_minimum_damping`` has it; τ is the time
 between two samples. Both are exact for B' = 0. N has here
 what a torque across the motion costs (``law.twist_price``), but not in κ. Each joule
@@ -88,8 +88,7 @@ def meter_delay(s: State, interval: float, ticks: int) -> None:
     if s.guard.consecutive_stale > 0:
         return
     for kind in range(2):
-        stiffness, needed, lacking, square = lateness(s, kind, interval, ticks)
-        late = lacking * square
+        stiffness, needed, late, square = lateness(s, kind, interval, ticks)
         paying = min(t.lent[kind] + late, 0.0)
         t.lent[kind] = max(t.lent[kind] + late, 0.0)
         cost = 0.0

@@ -27,7 +27,7 @@ from hapticbridge.recording.reader import BLOCK
 from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.scene.checks import first_pump
-from hapticbridge.scene.contacts import check_contacts, geom_name
+from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.theory.bounds import NEEDED_SHARE
 from hapticbridge.units import format_energy
 
@@ -301,8 +301,8 @@ def cause_in_environment(evidence: Evidence, report: AuditReport, window: slice)
     if share < MOST:
         return _cause_without_contact(evidence, window, where)
     if concerns := _concerns(evidence, pairs):
-        concern, _, remedy = concerns[0].rpartition("; write ")
-        return Cause("contact setting", f"{where}; {concern}", f"write {remedy}")
+        first = concerns[0]
+        return Cause("contact setting", f"{where}; {first.words}", f"write {first.change}")
     if method.hazard:
         return _method_cause(method, "the contacts are set as recommended; ")
     hard = "a light tool on a stiff coupling is the hard case"
@@ -346,7 +346,7 @@ def _pair_words(evidence: Evidence, pairs: Pairs) -> str:
     return f", {share:.0%} while {touching}{more}"
 
 
-def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[str]:
+def _concerns(evidence: Evidence, pairs: Pairs | None) -> list[Concern]:
     """Returns concerns about the contacts that touched; about all contacts if unknown."""
     if evidence.model is None:
         return []
