@@ -388,7 +388,7 @@ def _at_times(
     if k > 0.0:
         kappa = 0.5 * k / (1.0 + 2.0 * b / (k * period))  # κ/T
         # samples that did not come: the tool moved in the ticks between them
-        count = ticks / times.fresh if times.fresh else math.inf
+        count = max(times.ticks / times.new_samples, ticks) if times.new_samples else math.inf
         needed += ratio * kappa * period * count * (count - ticks)
         needed += ratio * DELAY_PRICE * ticks * kappa * times.mean_delay
     at_times = replace(condition, needed=needed)

@@ -17,6 +17,7 @@ from hapticbridge import Coupling
 from hapticbridge.audit import audit
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.certification import Standing
+from hapticbridge.device import SimulatedDevice
 from hapticbridge.recording import read_recording
 from hapticbridge.theory.bounds import late_minimum_damping
 
@@ -91,10 +92,14 @@ def test_the_search_of_a_late_devices_coupling_takes_little_memory() -> None:
     assert needed[::100].tolist() == alone
 
 
-def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(call: Called) -> None:
-    command = "run point_mass --fast --duration 0.05 --device"
-    _, _, err = call(*command.split(), "simulated:rate=250")
-    told = " ".join(err.split())
+def test_a_run_on_a_slow_device_says_what_its_own_rate_would_allow(
+    call: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command, opened = "run point_mass --fast --duration 0.05", SimulatedDevice()
+    monkeypatch.setattr("hapticbridge.cli.run.device_for", lambda *_: opened)
+    assert "new samples per second" not in call(*command.split())[2]
+    opened = SimulatedDevice()
+    opened.info = replace(opened.info, rate=250.0)
+    told = " ".join(call(*command.split())[2].split())
     assert "the device gives 250 new samples per second, and each force is held:" in told
     assert "--rate 250 would allow " in told
-    assert "new samples per second" not in call(*command.split(), "simulated")[2]

@@ -106,7 +106,11 @@ def test_a_page_leads_with_its_verdict_and_shows_a_moment_only_of_a_fault(
     }
     found = passive.certification
     assert found is not None
-    standings = {each.verdict: each for each in Standing}
+    standings = {
+        True: Standing.CERTIFIED,
+        False: Standing.DAMPING,
+        None: Standing.DAMPING_UNKNOWN,
+    }
     for certified, words in sentences.items():
         judged = replace(passive, certification=replace(found, standing=standings[certified]))
         assert words in notes(judged)[-1]

@@ -158,7 +158,7 @@ class TimingTally:
         begun[-1] = begun[-2]
         stale = has_flag(block.ticks[-1:], TickFlag.STALE_SAMPLE)[0]
         count = np.append(block.sample_ticks, 1 + block.sample_ticks[-1] * stale)
-        then = poses[np.maximum(np.maximum(rows - count + 1, begun) + 1, 0)]
+        then = poses[np.clip(np.maximum(rows - count + 1, begun) + 1, 0, len(poses) - 1)]
         self.tool_then, then = then[-1:], then[:-1]
         now = block.motion.tool_before
         return then[:, :3] - now[:, :3], turn_between(now[:, 3:], then[:, 3:])
