@@ -63,6 +63,8 @@ UNKNOWN_DAMPING = (
 )
 """Reason why a device is not judged, with the next step."""
 
+_NO_HAND = "feels no force, as its motion is prescribed: there is nothing to certify"
+
 _OPEN = {
     Standing.DAMPING_UNKNOWN: UNKNOWN_DAMPING,
     Standing.DELAY_UNKNOWN: "its delay is unknown ('hapticbridge identify' measures it)",
@@ -113,7 +115,7 @@ class Certification:
     def words(self) -> str:
         """Verdict in a clause; ``reason`` has the cause in full."""
         if self.standing is Standing.NO_HAND:
-            return "the device feels no force: there is nothing to certify"
+            return f"the device {_NO_HAND}"
         if self.verdict:
             steps = [each.steps for each in self.conditions if each.steps is not None]
             unknown = any(each.holds is None for each in steps)
@@ -174,7 +176,7 @@ class Certification:
             limit = f"; but {self.energy.limit}" if self.energy.limit else ""
             return f"The device bears this coupling, in any hand{clause}{limit}."
         if self.standing is Standing.NO_HAND:
-            return "The device feels no force: there is nothing to certify."
+            return f"The device {_NO_HAND}."
         if self.verdict is None:
             slowness = self.kept.slowness
             return f"It is not known if the device bears this coupling in any hand{slowness}."

@@ -144,7 +144,7 @@ class Alarm(StrEnum):
 
     @property
     def sentence(self) -> str:
-        """What the watch did to the force, and the remedy."""
+        """Action of the watch on the force, and the remedy."""
         if self is Alarm.RUNS_AWAY:
             return (
                 "the force was taken away because the device did not move as it was pushed: an "

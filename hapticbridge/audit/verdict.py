@@ -477,7 +477,7 @@ def _hand_words(report: AuditReport) -> str:
 
 @dataclass(slots=True, kw_only=True)
 class JudgedDevice:
-    """What an audit finds on the device of a hand.
+    """Findings of an audit on the device of a hand.
 
     Attributes:
         grip: Name of the hand's grip.
