@@ -31,7 +31,7 @@ LOOSE = Hand(mass=0.01, damping=0.0, stiffness=60.0)
 
 
 BORNE = 700.0, 0.9
-"""K in N/m and B in N s/m that 2 N s/m bear two ticks late, for every scene (``zwidth --delay``)."""
+"""K in N/m and B in N s/m that 2 N s/m bear two ticks late, in every scene."""
 
 
 def held_to_an_anvil(

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.record import FORMAT, TICK_DTYPE, TickFlag
 from hapticbridge.recording import TAIL, Attachment, Recorder, Ring, read_recording
 from hapticbridge.recording import recorder as recorder_module
+from hapticbridge.recording.recorder import RecordStream
 from hapticbridge.recording.recorder_process import LiveLine, RunState
 
 META = {"method": "implicit", "device": "{}"}
@@ -37,6 +39,12 @@ def numbered(start: int, stop: int) -> NDArray[np.void]:
     # noise, so that the chunks do not shrink to nothing
     rows["tool_position"] = np.random.default_rng(start).normal(size=(stop - start, 3))
     return rows
+
+
+def started(*arguments: Any, **options: Any) -> Recorder:
+    recorder = Recorder(*arguments, **options)
+    recorder.start()
+    return recorder
 
 
 def produce(ring: Ring, recorder: Recorder, rows: NDArray[np.void]) -> None:
@@ -57,7 +65,7 @@ def ring() -> Iterator[Ring]:
 def test_recorder_writes_every_record_and_event_of_a_run(ring: Ring, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     rows = numbered(0, 3000)
-    recorder = Recorder(ring, path, META, FILES, epoch_ns=7)
+    recorder = started(ring, path, META, FILES, epoch_ns=7)
     recorder.event({"event": "start"}, 0)
     recorder.wait_until_ready()
     produce(ring, recorder, rows)
@@ -78,14 +86,14 @@ def test_recorder_writes_every_record_and_event_of_a_run(ring: Ring, tmp_path: P
 
 
 def test_records_that_wait_at_the_close_are_drained(ring: Ring, tmp_path: Path) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     ring.append(numbered(0, 512))
     recorder.close()
     assert read_recording(tmp_path / "run.mcap").ticks["tick"].tolist() == list(range(512))
 
 
 def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGSTOP)
     for number in range(3000):
@@ -97,7 +105,7 @@ def test_events_beyond_the_pipe_wait_and_all_arrive(ring: Ring, tmp_path: Path) 
 
 
 def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path: Path) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     assert os.getpgid(recorder.pid) != os.getpgid(0)
     for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -108,7 +116,7 @@ def test_interrupt_and_termination_leave_closing_to_bridge(ring: Ring, tmp_path:
 
 
 def test_recorder_loads_neither_mujoco_nor_the_compiler(ring: Ring, tmp_path: Path) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     loaded = Path(f"/proc/{recorder.pid}/maps").read_text()
     recorder.close()
@@ -123,7 +131,7 @@ def test_what_cannot_be_recorded_is_refused_before_the_run(ring: Ring, tmp_path:
         (tmp_path, "Is a directory"),
         (Path("/dev/full"), "No space left on device"),
     ):
-        recorder = Recorder(ring, path, META, FILES)
+        recorder = started(ring, path, META, FILES)
         with pytest.raises(RecordingError, match=reason):
             recorder.wait_until_ready()
         assert not recorder.is_alive()
@@ -137,7 +145,7 @@ def test_what_cannot_be_recorded_is_refused_before_the_run(ring: Ring, tmp_path:
 
 def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    recorder = Recorder(ring, path, META, ())
+    recorder = started(ring, path, META, ())
     recorder.wait_until_ready()
     # stands for a full disk: the process may not let a file grow beyond this
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
@@ -156,7 +164,7 @@ def test_full_disk_is_reported_at_close_and_file_reads_as_cut(ring: Ring, tmp_pa
 
 
 def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGKILL)
     limit = time.monotonic() + PATIENCE
@@ -170,7 +178,7 @@ def test_killed_recorder_is_noticed_and_named(ring: Ring, tmp_path: Path) -> Non
 
 
 def test_live_line_in_a_file_is_plain_text(ring: Ring, capfd: pytest.CaptureFixture[str]) -> None:
-    recorder = Recorder(ring, None, META, (), live=True)
+    recorder = started(ring, None, META, (), live=True)
     recorder.wait_until_ready()
     rows = numbered(0, 101)
     rows["wrench_on_tool"][-1] = (3.0, 0.0, -4.0, 9.0, 9.0, 9.0)
@@ -270,7 +278,7 @@ def test_a_recorder_that_stands_still_is_left_to_finish(
 ) -> None:
     monkeypatch.setattr(recorder_module, "STANDSTILL", 0.2)
     path = tmp_path / "run.mcap"
-    recorder = Recorder(ring, path, META, ())
+    recorder = started(ring, path, META, ())
     recorder.wait_until_ready()
     produce(ring, recorder, numbered(0, 600))
     os.kill(recorder.pid, signal.SIGSTOP)
@@ -304,7 +312,7 @@ print('{"closed": true}', flush=True)
 """
     monkeypatch.setattr(recorder_module, "STANDSTILL", 0.6)
     monkeypatch.setattr(recorder_module, "_BOOTSTRAP", slow)
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     for number in range(3000):
         recorder.event({"event": "mark", "text": "x" * 100}, number)
@@ -315,7 +323,7 @@ print('{"closed": true}', flush=True)
 def test_a_recorder_that_takes_records_for_ever_is_left_too(
     ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorder = Recorder(ring, tmp_path / "run.mcap", META, ())
+    recorder = started(ring, tmp_path / "run.mcap", META, ())
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGSTOP)
     monkeypatch.setattr(recorder_module, "LONGEST_CLOSE", 0.1)
@@ -335,7 +343,7 @@ def test_a_recorder_without_a_file_that_stands_still_is_ended(
     ring: Ring, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "STANDSTILL", 0.2)
-    recorder = Recorder(ring, None, META, (), live=True)
+    recorder = started(ring, None, META, (), live=True)
     recorder.wait_until_ready()
     os.kill(recorder.pid, signal.SIGSTOP)
     recorder.close()
@@ -349,7 +357,8 @@ def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
     script = (
         "import os, sys; from hapticbridge.recording import Recorder, Ring\n"
         "ring = Ring.shared(512); recorder = Recorder(ring, sys.argv[1], {}, ())\n"
-        "recorder.wait_until_ready(); print(recorder.pid, flush=True); os.kill(os.getpid(), 9)"
+        "recorder.start(); recorder.wait_until_ready()\n"
+        "print(recorder.pid, flush=True); os.kill(os.getpid(), 9)"
     )
     done = subprocess.run(
         [sys.executable, "-c", script, str(path)],
@@ -367,29 +376,38 @@ def test_a_recorder_of_a_run_without_a_tick_leaves_no_file_when_the_bridge_dies(
     assert not path.exists()
 
 
-@pytest.mark.parametrize("in_thread", [False, True], ids=["process", "thread"])
-def test_a_stop_while_the_process_starts_leaves_none(
-    in_thread: bool, ring: Ring, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("moment", ["process", "thread", "file"])
+def test_a_stop_while_the_process_starts_leaves_neither_process_nor_file(
+    moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The stop comes once the process runs, or as the first thread beside it starts."""
+    """The stop comes once the process runs, as the first thread starts, or once the file exists."""
+    path = tmp_path / "run.mcap"
     started: list[subprocess.Popen[bytes]] = []
     start = recorder_module.recorder_process
 
     def struck() -> subprocess.Popen[bytes]:
         started.append(start())
-        if not in_thread:
+        if moment == "process":
             signal.raise_signal(signal.SIGINT)
         return started[0]
+
+    threads: list[threading.Thread] = []
 
     class StruckThread(threading.Thread):
         def start(self) -> None:
             super().start()
-            if in_thread:
+            threads.append(self)
+            is_last = len(threads) == 2
+            while moment == "file" and is_last and not path.exists():
+                time.sleep(1e-3)
+            if moment == "thread" or (moment == "file" and is_last):
                 signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(threading, "Thread", StruckThread)
     monkeypatch.setattr(recorder_module, "recorder_process", struck)
+    stream = RecordStream(path, 1e-3, live=False, may_wait=True)
     with pytest.raises(KeyboardInterrupt):
-        Recorder(ring, tmp_path / "run.mcap", META, ())
+        stream.start(META, ())
+    stream.close(is_discarded=True)
     assert started[0].poll() is not None
-    assert not (tmp_path / "run.mcap").exists()
+    assert not path.exists()

@@ -622,7 +622,7 @@ def _place(service: object) -> tuple[str, int]:
     except ValueError:
         number = 0
     if not 0 < number < 65536:
-        raise DeviceError(f"service = '{service}': must be HOST:PORT, port 1 to 65535")
+        raise DeviceError(f"service is '{service}'; it must be HOST:PORT, port 1 to 65535")
     return str(host) or PLACE[0], number
 
 

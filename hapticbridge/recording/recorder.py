@@ -132,7 +132,7 @@ run()
 class Recorder:
     """Starts the recorder's process and sends events to it without blocking the loop.
 
-    The constructor returns at once; the process starts within about a quarter of a second
+    ``start`` returns at once; the process is there within about a quarter of a second
     (``wait_until_ready``). If the caller's process dies, the recorder drains the ring, writes the
     event ``bridge_died``, closes the file and removes the shared memory. Use it from one thread.
 
@@ -149,8 +149,7 @@ class Recorder:
         is_left: True if the process stood still at ``close`` and was left to finish by itself.
 
     Raises:
-        RecordingError: The ring is not shared, metadata or attachments cannot be written, or the
-            process cannot be started.
+        RecordingError: The ring is not shared, or metadata or attachments cannot be written.
     """
 
     def __init__(
@@ -178,27 +177,27 @@ class Recorder:
         }
         self._answers: SimpleQueue[dict[str, Any]] = SimpleQueue()
         self._outbox = bytearray()
-        self._is_configured = False
-        self._is_closed = False
+        self._is_started = self._is_configured = self._is_closed = False
         self.is_disk_full = False
         self.is_left = self._has_failed = False
-        pieces = [json.dumps(configuration).encode() + b"\n"]
-        pieces += [each.data for each in attachments]
-        is_started = False
-        try:
-            with deferring_stops():
-                self._process = recorder_process()
-                self._input = cast(IO[bytes], self._process.stdin)
-                self._listener = threading.Thread(target=self._listen, daemon=True)
-                # in a separate thread, because attachments exceed a pipe's buffer
-                self._sender = threading.Thread(target=self._configure, args=(pieces,), daemon=True)
-                self._listener.start()
-                self._sender.start()
-                is_started = True
-        except BaseException:  # a stop: the caller does not have the recorder to end it
-            if is_started:
-                self.abort()
-            raise
+        self._pieces = [json.dumps(configuration).encode() + b"\n"]
+        self._pieces += [each.data for each in attachments]
+
+    def start(self) -> None:
+        """Starts the process; ``abort`` or ``close`` ends it, also after a stop in the middle.
+
+        Raises:
+            RecordingError: The process cannot be started.
+        """
+        with deferring_stops():
+            self._process = recorder_process()
+            self._input = cast(IO[bytes], self._process.stdin)
+            self._listener = threading.Thread(target=self._listen, daemon=True)
+            # in a separate thread, because attachments exceed a pipe's buffer
+            self._sender = threading.Thread(target=self._configure, daemon=True)
+            self._listener.start()
+            self._sender.start()
+            self._is_started = True
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Waits until the file is open and has its metadata and attachments.
@@ -232,7 +231,7 @@ class Recorder:
     def is_alive(self) -> bool:
         """Returns True if the process runs; otherwise ``close`` raises the reason."""
         self._send()
-        return not self._is_closed and self._process.poll() is None
+        return self._is_started and not self._is_closed and self._process.poll() is None
 
     def close(self) -> None:
         """Waits until the process has written all records and finished the file.
@@ -244,7 +243,7 @@ class Recorder:
             RecordingError: The process died, could not write the file, or stands still and is left
                 to finish it.
         """
-        if self._is_closed or self._has_failed:
+        if self._is_closed or self._has_failed or not self._is_started:
             self._reap()
             return
         self._outbox += b'{"close":true}\n'
@@ -259,7 +258,8 @@ class Recorder:
     def abort(self) -> None:
         """Ends the process at once, for a run that never began; the file stays as it is."""
         self._has_failed = True
-        self._process.kill()
+        if self._is_started:
+            self._process.kill()
         self._reap()
 
     def _last_answer(self) -> dict[str, Any]:
@@ -314,7 +314,7 @@ class Recorder:
 
     def _reap(self) -> None:
         self._is_closed = True
-        if self.is_left:
+        if self.is_left or not self._is_started:
             return
         for _ in range(2):
             try:
@@ -329,9 +329,9 @@ class Recorder:
             self._input.close()
         self._listener.join(STANDSTILL)
 
-    def _configure(self, pieces: list[bytes]) -> None:
+    def _configure(self) -> None:
         try:
-            for piece in pieces:
+            for piece in self._pieces:
                 _write(self._input, piece)
             _set_blocking(self._input, False)
             self._is_configured = True
@@ -497,6 +497,7 @@ class RecordStream:
             self.recorder = Recorder(
                 self._ring, self._path, metadata, attachments, live=self._is_live
             )
+            self.recorder.start()
             self.recorder.wait_until_ready()
         if self._observer is not None:
             self._observer.start(str(self._ring.name), self._snapshot, metadata, attachments)

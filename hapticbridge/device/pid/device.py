@@ -266,7 +266,9 @@ def scale_of(
     )
     reverse = options.get("reverse", "")
     if reverse not in ("", "x", "y", "xy"):
-        raise DeviceError(f"reverse = {reverse!r}: must be 'x', 'y' or 'xy', the axes to reverse")
+        raise DeviceError(
+            f"reverse is {reverse!r}; it must be 'x', 'y' or 'xy', the axes to reverse"
+        )
     signs = np.array([-1.0 if axis in str(reverse) else 1.0 for axis in _AXES])
     return Scale(newtons, travel, signs), changes
 

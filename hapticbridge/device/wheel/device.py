@@ -301,7 +301,7 @@ def open_wheel(
     numbers = stated_numbers(options, MEASURED)
     axis = options.get("axis", "rz")
     if axis not in AXES[3:]:
-        raise DeviceError(f"axis = {axis!r}: must be one of {choices(AXES[3:])}")
+        raise DeviceError(f"axis is {axis!r}; it must be one of {choices(AXES[3:])}")
     is_reversed = "reverse" in options and stated_switch(options, "reverse")
     system = Linux() if kernel is None else kernel
     plugged = select_device(DRIVER, find(system), options.get("serial"))
@@ -314,7 +314,7 @@ def open_wheel(
         )
     turn = checked_number("range", degrees, "degrees", is_positive=True)
     if turn > WIDEST_RANGE:
-        raise DeviceError(f"range = {turn:g}: must be at most {WIDEST_RANGE:g} degrees")
+        raise DeviceError(f"range is {turn:g}; it must be at most {WIDEST_RANGE:g} degrees")
     interval = interval_of(plugged.path)
     rate = 1.0 / interval if interval else USUAL_RATE
     rate = checked_number("rate", options.get("rate", rate), "Hz", is_positive=True)
