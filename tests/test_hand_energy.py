@@ -16,6 +16,7 @@ from two_hands import BAR
 
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.demand.certification import Standing, worst_certification
+from hapticbridge.demand.guard import DEVICE_LIMITS
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
 from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
@@ -45,7 +46,7 @@ def ran(
     """Runs a scene with all defaults; returns what the run says and what its audit says."""
     scene, path = folder / "scene.xml", folder / "run.mcap"
     scene.write_text(text)
-    options = {"limits": None, "controller": None} | options
+    options = {"limits": DEVICE_LIMITS, "controller": None} | options
     summary = recorded(path, scene, device, duration=duration, **options)
     return summary, audit(path)
 
@@ -195,7 +196,7 @@ def test_energy_from_another_hand_is_paid(tmp_path: Path) -> None:
         Grasp("left", SimulatedDevice(path=random_motion(4, 1.5))),
         Grasp("right", SimulatedDevice(hand=None)),
     ]
-    summary = recorded(path, scene, hands, duration=1.5, limits=None, controller=None)
+    summary = recorded(path, scene, hands, duration=1.5, limits=DEVICE_LIMITS, controller=None)
     report = audit(path)
     got = [each.energies["device_energy"] for each in summary.hands]
     assert got[1] > 1e-3  # moved by the other hand
