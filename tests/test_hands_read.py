@@ -200,8 +200,8 @@ def test_the_trip_of_a_hand_is_repeated(tmp_path: Path) -> None:
     ):
         bridge.run(0.3)
     recorded, again, _ = what_if(path, {}, in_process=True).runs
-    assert "hand at 'right': the tool is farther" in recorded.trip
-    assert again.trip == recorded.trip
+    assert "hand at 'right': the tool is farther" in str(recorded.report.trip)
+    assert again.report.trip == recorded.report.trip
 
 
 def test_runs_of_several_hands_are_compared_hand_by_hand(bar: Path, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from hapticbridge.audit import audit
 from hapticbridge.recording import read_recording
 from hapticbridge.report import write_report
 from hapticbridge.scene import load_scene
+from hapticbridge.trip import Trip, TripCode
 from hapticbridge.whatif import what_if, write_what_if
 
 FILE = "<img src=x onerror=ran=1><svg onload=ran=2>"
@@ -112,7 +113,8 @@ def report_of_edited(path: Path, page: Path) -> None:
 
 def report_of_a_trip(path: Path, page: Path) -> None:
     recording = read_recording(path)
-    trip = {"event": "trip", "tick": 299, "time_ns": 0, "reason": EVIL}
+    trip = {"event": "trip", "tick": 299, "time_ns": 0}
+    trip |= Trip(TripCode.DEVICE, 299, detail=EVIL).details()
     edited = rewritten(recording, page.with_suffix(".mcap"), events=[*recording.events, trip])
     report_of(edited, page)
 

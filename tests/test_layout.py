@@ -40,7 +40,7 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export"),
+    ("certification", "guard", "summary", "timekeeping", "trip", "export"),
     ("testing",),
     ("commands", "check"),
     ("options",),
@@ -344,3 +344,100 @@ def test_a_write_to_a_part_of_the_state_is_found(line: str) -> None:
     assert not written_parts(
         "def f(s: State) -> None:\n    slack = s.energy.slack\n    slack = 1.0"
     )
+
+
+MESSAGES = re.compile(
+    "reason|sentence|words|message|remark|cause|clause|fault|concern|remed|problem|hint|finding"
+    "|agreement|resimulation|silence|alarm|slowness"
+)
+"""Names of texts for readers: a name or attribute that holds one has one of these in it."""
+
+READING = {"startswith", "endswith", "partition", "rpartition", "split", "rsplit", "find", "index"}
+READING |= {"removeprefix", "removesuffix", "count"}
+"""Methods by which a program reads a text."""
+
+READ_BACK: set[str] = set()
+"""Places that may read a text for readers; none does."""
+
+
+def name_of_text(node: ast.expr) -> str:
+    """Returns the name behind an expression: ``x.reason[0]``, ``str(reason)``, ``e["reason"]``."""
+    if isinstance(node, ast.Call):
+        inner = node.args or [node.func]
+        is_text = isinstance(node.func, ast.Name) and node.func.id == "str"
+        is_get = isinstance(node.func, ast.Attribute) and node.func.attr == "get"
+        return name_of_text(inner[0]) if is_text or is_get else ""
+    if isinstance(node, ast.Subscript):
+        return name_of_text(node.slice) if is_string(node.slice) else name_of_text(node.value)
+    if isinstance(node, ast.JoinedStr):
+        values = (each.value for each in node.values if isinstance(each, ast.FormattedValue))
+        return " ".join(map(name_of_text, values))
+    if is_string(node):
+        return str(node.value)  # type: ignore[attr-defined] # by the line above
+    name = getattr(node, "attr", getattr(node, "id", ""))
+    return "" if name.isupper() else name
+
+
+def is_string(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def read_messages(source: str) -> list[str]:
+    """Returns the expressions that take a text for readers apart, or compare it with another.
+
+    ``split()`` without an argument removes line breaks alone. A text that is all in capitals, and
+    one in a set of names, is a code.
+    """
+    found: list[ast.expr] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            owner = node.func.value
+            if node.func.attr in READING and node.args and not is_string(owner):
+                found += [node] if MESSAGES.search(name_of_text(owner)) else []
+        elif isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            for operator, left, right in zip(node.ops, sides, sides[1:], strict=False):
+                is_equal = isinstance(operator, ast.Eq | ast.NotEq)
+                is_within = isinstance(operator, ast.In | ast.NotIn)
+                texts = [left, right] if is_equal and (is_string(left) or is_string(right)) else []
+                texts += [right] if is_within and (is_string(left) or is_code(left)) else []
+                names = (name_of_text(each) for each in texts if not is_string(each))
+                found += [node] if any(map(MESSAGES.search, names)) else []
+    return [ast.unparse(node) for node in found]
+
+
+def is_code(node: ast.expr) -> bool:
+    return isinstance(node, ast.Name) and node.id.isupper()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'report.reason.partition("; ")',
+        'report.reason.partition("; ")[0]',
+        'str(stop.get("reason")).startswith("SafetyTrip")',
+        "reason.endswith(_REASONS[code])",
+        "UNKNOWN in self.watch_words",
+        '": K = " in f": {sentence}"',
+        'report.resimulation == "bit for bit"',
+        'event["reason"].split(": ")',
+        'concerns[0].rpartition("; write ")',
+    ],
+)
+def test_a_sentence_that_is_read_back_is_found(line: str) -> None:
+    assert read_messages(line)
+
+
+def test_a_code_is_no_sentence() -> None:
+    for line in ('" ".join(words.split())', "code in reasons", 'mode == "r"', "REASON in found"):
+        assert not read_messages(line), line
+
+
+def test_no_part_of_the_core_reads_a_sentence_back() -> None:
+    offences = [
+        f"{path.relative_to(PACKAGE)}: {text}"
+        for path in FILES
+        if concept(path) != "lab"
+        for text in read_messages(path.read_text(encoding="utf-8"))
+    ]
+    assert set(offences) == READ_BACK

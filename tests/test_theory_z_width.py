@@ -124,7 +124,7 @@ def test_with_delay_line_is_where_wall_meets_device(b: float, delay: int, tau: f
     assert z.limit[0] == pytest.approx(b / (T * (delay + 0.5)), rel=1e-6)
     assert z.limit[-1] == 0
     assert set(z.limited_by) == {WALL}
-    assert "of every scene" in z.notes[0]
+    assert "holds for every scene" in z.notes[0]
 
 
 OUT_OF_RANGE: list[tuple[Callable[[Any], Any], str]] = [

@@ -434,11 +434,11 @@ def test_a_trip_is_shown_beside_what_does_not_trip(tmp_path: Path) -> None:
             path, scene, device, duration=0.3, limits=Limits(force=10.0, torque=0.5, stretch=0.005)
         )
     same = what_if(path, {}).runs
-    assert same[1].trip == same[0].trip
+    assert same[1].report.trip == same[0].report.trip
     assert len(same[1].ticks) == len(same[0].ticks)
     found = what_if(path, {"stiffness": 100, "damping": 0.2})
-    assert "stretch limit" in found.runs[0].trip
-    assert "stretch limit" in found.runs[1].trip
+    assert "stretch limit" in str(found.runs[0].report.trip)
+    assert "stretch limit" in str(found.runs[1].report.trip)
     assert found.exit_code == 1
     tripped = len(found.runs[0].ticks)
     # a softer spring is as long sooner

@@ -29,6 +29,7 @@ from hapticbridge.run_description import (
     start_state,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.trip import BY_TRIP
 
 _TOLERANCE = 1e-9  # relative and absolute in SI units, for numbers of another processor
 
@@ -140,7 +141,7 @@ def event_statements(recording: RecordingFile, timing: TimingTally) -> Iterator[
         if type(tick) is not int or not 0 <= tick <= count:
             name = f"tick of the event '{event.get('event')}'"
             yield Statement(name, tick, f"0 to {count}", "the records")
-    has_tripped = str(stop.get("reason")).startswith(("SafetyTrip: ", "trip"))
+    has_tripped = stop.get("reason") == BY_TRIP
     if has_tripped:
         yield Statement("event 'trip'", names["trip"] > 0, True, "reason of the event 'stop'")
     for name, counted in (

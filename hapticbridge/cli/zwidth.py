@@ -224,15 +224,15 @@ def _print_z_width(z: ZWidth, command: str | None) -> None:
         reason = line.reason if line.is_required else f"not kept: {line.reason}"
         table.add_row(line.name, stiffness, f"{line.largest_damping:.4g} N s/m", reason)
     out.print(table)
-    reason = next(line.reason for line in z.lines if line.name == z.corner_limited_by)
+    reasons = {line.name: line.reason for line in z.lines}
+    reason = reasons.get(z.corner_limited_by, f"in every scene, {NEEDED_SHARE:.0%} of b needed")
     out.print(f"limited by: {z.corner_limited_by} ({reason})")
     for note in z.notes:
         out.print(f"note: {note}")
     (sentence,) = recommended_coupling(z).sentences()
     at, safe = z.corner.damping, z.corner.stiffness / STIFFNESS_MARGIN
-    where = "at a wall with" if z.delay else "at"
-    of = f"{safe:.4g} N/m that are safe {where} B_law = {at:.3g} N s/m"
-    out.print(f"use {sentence}: 80 % of the {of}")
+    of = f": 80 % of the {safe:.4g} N/m that are safe at B_law = {at:.3g} N s/m"
+    out.print(f"use {sentence}{'' if z.delay else of}")
     if command is None:
         out.print(
             "'hapticbridge run' has no low-pass: leave --filter-time out for a run's coupling"

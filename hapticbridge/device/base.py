@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from typing import Protocol
 
@@ -22,7 +22,7 @@ from hapticbridge.arguments import (
     shown,
 )
 from hapticbridge.dataclass_json import from_json, to_json
-from hapticbridge.errors import DeviceError
+from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import Quaternion, canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -35,6 +35,28 @@ def calling_on_error(close: Callable[[], None]) -> Iterator[None]:
     except BaseException:
         close()
         raise
+
+
+class Closable(Protocol):
+    """Link or guardian of a device."""
+
+    def close(self) -> None:
+        """Releases it."""
+
+
+@contextmanager
+def released(*parts: Closable | None) -> Iterator[None]:
+    """Closes the parts of a device after its last command, which a lost device does not take.
+
+    A lost device has no force, or its own watchdog ends it.
+    """
+    try:
+        with suppress(DeviceLost):
+            yield
+    finally:
+        for part in parts:
+            if part is not None:
+                part.close()
 
 
 # Data sheet of a haptic device

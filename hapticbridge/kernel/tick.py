@@ -71,6 +71,7 @@ from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
     felt,
+    note_tool,
     retune,
     slack_of_step,
     slip,
@@ -216,6 +217,7 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
         return code
     # the device may have moved during all the time since its last new sample
     interval = max(elapsed, s.run.period) + s.guard.time_since_sample
+    ticks = s.guard.consecutive_stale + 1
     observe_energy(s, moved, turned, interval)
     meter_device(s, moved, turned, interval)
     watch_device(s, moved, turned, interval)
@@ -232,9 +234,10 @@ def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     max_stretch = max_twist = np.inf
     is_timed = s.run.has_law and s.guard.has_hand and s.loop.tick > s.guard.start_tick
     if is_timed:
-        charge_lateness(s, interval)
-        meter_delay(s, max(elapsed, s.run.period), interval)
+        charge_lateness(s, interval, ticks)
+        meter_delay(s, interval, ticks)
     else:
+        note_tool(s)
         skip_delay(s)
     if s.mj.metered_mocaps > 0 and s.run.scheme != Scheme.SHOWN:
         note_moved_mocap_bodies(s)

@@ -283,14 +283,14 @@ class _Session:
         """Writes the events that arrived; returns how the run ended, or None."""
         while True:
             try:
-                message = inbox.get_nowait()
+                event = inbox.get_nowait()
             except Empty:
                 return None
-            if message is None:
+            if event is None:
                 return "died"
-            if "close" in message:
+            if "close" in event:
                 return "closed"
-            self._write_event(message, message["time_ns"])
+            self._write_event(event, event["time_ns"])
 
     def _write_event(self, event: dict[str, Any], time_ns: int) -> None:
         if self._writer is not None:

@@ -151,8 +151,10 @@ def _draw_hand(
     for axes in panels:
         finish(axes)
     if has_several_hands:
-        head = f"{printable(parameters.grip)}: {_coupling_sentence(recording)}"
-        head = head.partition(" effective")[0]
+        found = recorded_coupling(recording)
+        shown = found.effective or found.law
+        gains = f"K = {shown.stiffness:.4g} N/m, B = {shown.damping:.3g} N s/m" if shown else ""
+        head = f"{printable(parameters.grip)}: {gains}"
         force_axes.set_title(head, fontsize="small", loc="left", pad=46, parse_math=False)
 
 

@@ -22,6 +22,7 @@ from hapticbridge.recorded_scene import unpack_scene
 from hapticbridge.recording import Recording
 from hapticbridge.request import RunRequest, request_of, setups_of
 from hapticbridge.run_description import parameters_of
+from hapticbridge.trip import Trip
 from hapticbridge.whatif.settings import Settings
 
 
@@ -96,10 +97,9 @@ class RecordedRun:
         return (*first["device_position"].tolist(), *first["device_quaternion"].tolist())
 
     @property
-    def trip(self) -> str:
-        """Reason of the guard's stop, or empty."""
-        trips = [e for e in self.recording.events if e.get("event") == "trip"]
-        return str(trips[0].get("reason", "unknown")) if trips else ""
+    def trip(self) -> Trip | None:
+        """The guard's stop, or None."""
+        return Trip.among(self.recording.events)
 
 
 def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> RunRequest:

@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,6 +35,7 @@ from hapticbridge.device.base import (
     calling_on_error,
     checked_number,
     checked_period,
+    released,
     stated_numbers,
     stated_switch,
 )
@@ -232,15 +232,10 @@ class WheelDevice:
         if not self._is_open:
             return
         self._is_open = self._is_started = False
-        try:
-            with suppress(DeviceLost):  # the kernel has removed the effects of a lost device
-                self._push(0)
-                self._node.set(self._effect, 0)
-                self._node.erase(self._effect)
-        finally:
-            self._node.close()
-            if self.last_word is not None:
-                self.last_word.close()
+        with released(self._node, self.last_word):
+            self._push(0)
+            self._node.set(self._effect, 0)
+            self._node.erase(self._effect)
 
     def leave_last_word(self) -> None:
         """Starts a guardian process that ends the torque if the program hangs."""
