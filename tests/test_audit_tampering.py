@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.recording import Recording, read_recording, repair
-from hapticbridge.run_description import (
+from hapticbridge.run.description import (
     SOURCE_PREFIX,
     STATE_ATTACHMENT,
     processor,

@@ -13,13 +13,13 @@ from audit_cases import ScriptedDevice, recorded, rewritten, without_model
 from report_runs import ANVIL, LOOSE
 
 from hapticbridge.audit import audit
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
-from hapticbridge.commands import Command, Couple, Mark, Reset, Switch, tuning_ticks
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.errors import CommandError, DeviceError, RecordingError
-from hapticbridge.guard import Limits
 from hapticbridge.recording import read_recording
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Command, Couple, Mark, Reset, Switch, tuning_ticks
 
 T = 1e-3
 STEPS = tuning_ticks(T)

@@ -16,7 +16,7 @@ from cli_cases import Called
 from hapticbridge import Coupling
 from hapticbridge.audit import audit
 from hapticbridge.audit.events import AuditedRun
-from hapticbridge.certification import Standing
+from hapticbridge.demand.certification import Standing
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.recording import read_recording
 from hapticbridge.theory.bounds import late_minimum_damping

@@ -16,9 +16,9 @@ from hapticbridge.cli.flags import Flag, built, flags_of, texts_of, values_of
 from hapticbridge.cli.main import COMMANDS, command_class
 from hapticbridge.cli.run import Run
 from hapticbridge.coupling import Coupling
-from hapticbridge.guard import Limits
-from hapticbridge.hands import Grasp, GripAxis
-from hapticbridge.options import BridgeOptions, Workspace
+from hapticbridge.demand.guard import Limits
+from hapticbridge.run.hands import Grasp, GripAxis
+from hapticbridge.run.options import BridgeOptions, Workspace
 
 OPTION_CLASSES: tuple[Any, ...] = BridgeOptions, Workspace, Limits, Coupling, Grasp, GripAxis
 

@@ -11,7 +11,12 @@ from audit_cases import COUPLING, ScriptedDevice
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticbridge.commands import (
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import LoopSetting
+from hapticbridge.demand.methods import method_named
+from hapticbridge.device import AXES
+from hapticbridge.errors import CommandError
+from hapticbridge.run.commands import (
     INTERVAL,
     LONGEST_LINE,
     MAX_WAITING,
@@ -27,11 +32,6 @@ from hapticbridge.commands import (
     command_of,
     line_of,
 )
-from hapticbridge.device import AXES
-from hapticbridge.errors import CommandError
-from hapticbridge.guard import Limits
-from hapticbridge.loop_setting import LoopSetting
-from hapticbridge.rendering import method_named
 
 T = 1e-3
 INFO = ScriptedDevice(lambda _: (0, 0, 0, 1, 0, 0, 0)).info

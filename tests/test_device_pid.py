@@ -18,7 +18,7 @@ from hapticbridge.device.pid.device import LIFE, RESTART, PidDevice, open_pid
 from hapticbridge.device.profile import Profile, Quantity
 from hapticbridge.device.transport.hid import HidLink, find
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 

@@ -22,7 +22,7 @@ from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.rawhid.device import RawHidDevice, open_rawhid
 from hapticbridge.device.watchdog import SILENCE
 from hapticbridge.errors import DeviceError, DeviceLost
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
 
 STALE = int(TickFlag.STALE_SAMPLE)
 PUSH = np.array([1.0, 2.0, 3.0, 0.01, 0.02, 0.03])

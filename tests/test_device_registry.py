@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 from cli_cases import Called
 
-from hapticbridge import options as arrangement
-from hapticbridge.bridge import Bridge
 from hapticbridge.cli import run
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.device import registry as library
 from hapticbridge.device.falcon.device import DRIVER
 from hapticbridge.errors import DeviceError
-from hapticbridge.guard import Limits
+from hapticbridge.run import options as arrangement
+from hapticbridge.run.bridge import Bridge
 
 
 class Counted(SimulatedDevice):

@@ -19,7 +19,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Hand, Motion, SimulatedDevice
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.theory.sampled_loop import SampledLoop, WorstHand
 
 Array = NDArray[np.float64]

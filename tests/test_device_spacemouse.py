@@ -21,7 +21,7 @@ from hapticbridge.device import spacemouse as driver
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import SpaceMouseDevice, decoded, open_spacemouse
 from hapticbridge.errors import DeviceError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 
 PERIOD = 1e-3
 counts = st.integers(-32768, 32767)

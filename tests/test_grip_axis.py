@@ -16,7 +16,7 @@ import hapticbridge as hb
 from hapticbridge.cli.main import main
 from hapticbridge.device import GrippingDevice, SimulatedDevice
 from hapticbridge.errors import DeviceError, HapticBridgeError
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.testing.device_contract import CONTRACT
 
 JOINT = "joint:hinge"

@@ -15,14 +15,14 @@ from random_hands import random_motion
 from two_hands import BAR
 
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certification import Standing, worst_certification
+from hapticbridge.demand.certification import Standing, worst_certification
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.hand_energy import INSTANT, HandEnergy
-from hapticbridge.hands import Grasp
-from hapticbridge.options import Workspace
-from hapticbridge.summary import Summary
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.hands import Grasp
+from hapticbridge.run.options import Workspace
+from hapticbridge.run.summary import Summary
 from hapticbridge.units import format_energy
 
 SPHERE = """<mujoco><option timestep="0.001" gravity="0 0 {gravity}"/><worldbody>

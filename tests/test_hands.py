@@ -18,14 +18,14 @@ from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
-from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.device import device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceLost, HapticBridgeError
-from hapticbridge.hands import DeviceGroup
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.run.commands import Command, Couple, Reset, Switch
+from hapticbridge.run.hands import DeviceGroup
 from hapticbridge.whatif import what_if
 
 SHARED = ("tick", "deadline_ns", "read_ns", "kinetic", "potential")

@@ -11,14 +11,14 @@ from two_hands import BAR, TONGS, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
-from hapticbridge.compare import compare
 from hapticbridge.confinement import ForeignSceneError
-from hapticbridge.film import Shot, still
 from hapticbridge.recording.reader import open_hands, read_hands
 from hapticbridge.recording.recorder import salvage
+from hapticbridge.replay.film import Shot, still
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.report.plots import draw_recording
-from hapticbridge.run_description import requested_of
+from hapticbridge.run.description import requested_of
+from hapticbridge.tools.compare import compare
 from hapticbridge.whatif import what_if
 
 

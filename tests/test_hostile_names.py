@@ -14,10 +14,10 @@ from report_runs import LOOSE
 from view_cases import AT_ONCE, pressed
 
 from hapticbridge.audit import audit
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.recording import read_recording
 from hapticbridge.report import write_report
 from hapticbridge.scene import load_scene
-from hapticbridge.trip import Trip, TripCode
 from hapticbridge.whatif import what_if, write_what_if
 
 FILE = "<img src=x onerror=ran=1><svg onload=ran=2>"

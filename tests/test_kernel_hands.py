@@ -17,9 +17,9 @@ from two_hands import (
 )
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import method_named
 from hapticbridge.errors import HapticBridgeError, SceneError
 from hapticbridge.kernel.tick import whole_tick
-from hapticbridge.rendering import method_named
 from hapticbridge.scene import load_scene
 
 PERIOD = 1e-3

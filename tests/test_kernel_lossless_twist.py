@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit import audit
 from hapticbridge.coupling import Coupling
-from hapticbridge.guard import Limits, guard_parameters_for
-from hapticbridge.jit import compiled
+from hapticbridge.demand.guard import Limits, guard_parameters_for
+from hapticbridge.demand.methods import LOSSLESS_COUPLING as LOSSLESS
+from hapticbridge.demand.methods import prepare
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
-from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.kernel.tick import whole_tick
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     dot,
     norm,
     product,
@@ -33,10 +33,10 @@ from hapticbridge.pose import (
     store_vector,
     vector_of,
 )
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TickFlag
+from hapticbridge.kernel.state import BoundKernel
+from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import LOSSLESS_COUPLING as LOSSLESS
-from hapticbridge.rendering import prepare
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.theory.bounds import midpoint_damping
 

@@ -19,6 +19,8 @@ from swing_cases import ALARM, GRIPS, VERY_FIRM, OnItsStop, alarms, bunched, sha
 
 import hapticbridge as hb
 from hapticbridge.audit import audit
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.timekeeping import Alarm
 from hapticbridge.device import (
     AXES,
     DEFAULT_HAND,
@@ -28,10 +30,8 @@ from hapticbridge.device import (
     SimulatedDevice,
     TrajectoryDevice,
 )
-from hapticbridge.guard import Limits
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording.recorder_process import RunState
-from hapticbridge.timekeeping import Alarm
 
 
 @pytest.mark.parametrize("name", LOOP_SCENES)

@@ -117,7 +117,7 @@ def test_the_audit_never_imports_the_bridge() -> None:
     ):  # a second opinion has an arithmetic of its own
         modules = imported_modules(PACKAGE / "audit" / f"{name}.py")
         others = {module for module in modules if not module.startswith("hapticbridge.audit")}
-        assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.record"}, name
+        assert others <= {"hapticbridge.kernel.parameters", "hapticbridge.kernel.record"}, name
 
 
 def test_the_core_never_imports_the_lab() -> None:
@@ -174,7 +174,7 @@ WITH_PRIVATE_NAMES = {
 
 
 def test_no_test_reads_a_private_name() -> None:
-    examples = "device._link.close()\nfrom hapticbridge.jit import _cache"
+    examples = "device._link.close()\nfrom hapticbridge.kernel.jit import _cache"
     assert set(private_names(examples)) == {"device._link", "_cache"}
     offences = [
         f"{path.name}: {name}"

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticbridge import jit, machine_code
-from hapticbridge.jit import compiled, direct
+from hapticbridge.kernel import jit, machine_code
+from hapticbridge.kernel.jit import compiled, direct
 
 PAIR = np.dtype([("first", "<f8"), ("second", "<i8")])
 
@@ -225,7 +225,7 @@ SOURCES = {
     "limits": "RAMP = 0.25\nTABLE = (1.0, 2.0)\n",
     "flags": "import enum\nclass Flag(enum.IntEnum):\n    OPEN = 3\n",
     "inner": """
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 import numpy as np
 TURN = np.array([5.0, 6.0])
 @compiled
@@ -233,7 +233,7 @@ def risen(time):
     return 2.0 * time + TURN[1]
 """,
     "outer": """
-from hapticbridge.jit import compiled
+from hapticbridge.kernel.jit import compiled
 from limits import RAMP, TABLE
 from flags import Flag
 from inner import risen
@@ -323,7 +323,7 @@ def test_types_of_one_size_have_code_of_their_own(folder: Path) -> None:
 RUN = """
 import itertools, sys
 import hapticbridge as hb
-from hapticbridge.commands import Couple, Reset, Switch
+from hapticbridge.run.commands import Couple, Reset, Switch
 with hb.Bridge("point_mass", "simulated", clock=hb.SimulatedClock()) as bridge:
     bridge.session.commands.now = itertools.count(1.0).__next__
     bridge.run(0.02)

@@ -15,12 +15,12 @@ from random_hands import T, random_motion, shaken, smooth
 
 import hapticbridge as hb
 from hapticbridge import scene as scenes
-from hapticbridge.certificate import default_coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import DEFAULT_HAND, Hand, Motion, SimulatedDevice, device_for, scene_hand
 from hapticbridge.errors import SceneError
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.lab.closed_loop import ClosedLoop, LoopOutcome
-from hapticbridge.record import TickFlag
-from hapticbridge.rendering import default_method
 from hapticbridge.scene import scene_names, scene_path
 
 FORCE_LIMIT, TORQUE_LIMIT = 10.0, 0.5  # N and N m, of the default simulated device

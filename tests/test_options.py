@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticbridge import options
 from hapticbridge.arguments import label, members, rule_of, types_of
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
-from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters, RunParameters
-from hapticbridge.options import BridgeOptions, RunSetup, Workspace
+from hapticbridge.run import options
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.whatif.settings import CHANGEABLE, KEPT
 

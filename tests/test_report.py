@@ -22,15 +22,15 @@ from report_runs import Made
 import hapticbridge as hb
 from hapticbridge.audit import AuditReport, audit
 from hapticbridge.audit.replay import Agreement
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import run_conditions
-from hapticbridge.certification import Standing
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import run_conditions
+from hapticbridge.demand.certification import Standing
+from hapticbridge.demand.methods import method_named
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.kernel.parameters import DAMPER
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording, read_recording
-from hapticbridge.rendering import method_named
 from hapticbridge.report import write_report
 from hapticbridge.report.cause import Cause, likely_cause
 from hapticbridge.report.evidence import Evidence
@@ -50,7 +50,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
-from hapticbridge.trip import Trip, TripCode
+from hapticbridge.run.bridge import Bridge
 from hapticbridge.units import format_si
 
 pytestmark = pytest.mark.filterwarnings("ignore:scene '.*(floor|fan).xml'")

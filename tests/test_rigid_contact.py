@@ -13,16 +13,16 @@ import pytest
 from kernel_runs import Array, Run, T, go_on, load, run_of, samples_of, unlimited
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import METHODS, prepare
 from hapticbridge.errors import HapticBridgeError
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate
-from hapticbridge.options import BridgeOptions
-from hapticbridge.record import TICK_DTYPE
-from hapticbridge.rendering import METHODS, prepare
-from hapticbridge.run_description import method_of
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.description import method_of
+from hapticbridge.run.options import BridgeOptions
 from hapticbridge.scene import Scene, load_scene
 
 BETA, SPENDABLE = 0.2, 0.9  # of the law, written down anew

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import prepare
 from hapticbridge.errors import SceneError
 from hapticbridge.lab.methods import METHODS
-from hapticbridge.rendering import prepare
 from hapticbridge.scene import contacts, load_scene, scene_names
 from hapticbridge.scene.contacts import check_contacts, contact_concerns, contact_numbers
 

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hapticbridge.certificate import default_coupling
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import default_coupling
+from hapticbridge.demand.methods import default_method
 from hapticbridge.device import open_device
 from hapticbridge.errors import CouplingError
-from hapticbridge.rendering import default_method
 from hapticbridge.theory.bounds import minimum_damping, worst_frequency
 from hapticbridge.theory.transfer import CouplingGrid
 from hapticbridge.theory.z_width import (

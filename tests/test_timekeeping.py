@@ -14,22 +14,22 @@ from bridge_runs import fast, sway
 from cli_cases import Called
 from numpy.typing import NDArray
 
-from hapticbridge import timekeeping
 from hapticbridge.audit import AuditReport, audit
-from hapticbridge.bridge import Bridge
-from hapticbridge.certificate import default_coupling, is_certified
-from hapticbridge.certification import Standing, certification_of
 from hapticbridge.check.cost import Cost, Growth, TimingStats
 from hapticbridge.clock import SimulatedClock
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand import timekeeping
+from hapticbridge.demand.certificate import default_coupling, is_certified
+from hapticbridge.demand.certification import Standing, certification_of
+from hapticbridge.demand.loop_setting import fresh_share
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.timing import DELAY_PRICE
-from hapticbridge.loop_setting import fresh_share
-from hapticbridge.record import TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.summary import Summary
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.summary import Summary
 
 T = 1e-3
 B = 2.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.errors import RecordingError
 from hapticbridge.kernel import codes
-from hapticbridge.trip import Trip, TripCode
 
 TRIPS = (
     Trip(TripCode.JUMPED, 5),

@@ -20,16 +20,16 @@ from cli_cases import Called
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
-from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.guard import Limits
 from hapticbridge.device import DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import RecordingError, SafetyTrip
-from hapticbridge.guard import Limits
-from hapticbridge.options import Workspace
-from hapticbridge.record import TICK_DTYPE, TickFlag
+from hapticbridge.kernel.record import TICK_DTYPE, TickFlag
 from hapticbridge.recording import read_recording
-from hapticbridge.run_description import SOURCE_PREFIX
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import Command, Couple, Reset, Switch
+from hapticbridge.run.description import SOURCE_PREFIX
+from hapticbridge.run.options import Workspace
 from hapticbridge.scene import load_scene
 from hapticbridge.units import format_si
 from hapticbridge.whatif import WhatIf, WhatIfRun, what_if, write_what_if
@@ -121,7 +121,7 @@ def commanded(bridge: Bridge, tick: int) -> None:
 
 def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("INTERVAL", "RESET_INTERVAL"):  # no time passes between them
-        monkeypatch.setattr(f"hapticbridge.commands.{name}", 0.0)
+        monkeypatch.setattr(f"hapticbridge.run.commands.{name}", 0.0)
     path, motion = tmp_path / "run.mcap", tmp_path / "tap.csv"
     motion.write_text(TAP)
     device = f"simulated:path={motion}"

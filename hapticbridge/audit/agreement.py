@@ -16,11 +16,11 @@ import numpy as np
 
 from hapticbridge.audit.structure import Fault
 from hapticbridge.audit.timing import TimingTally
+from hapticbridge.demand.trip import BY_TRIP
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import GuardParameters
 from hapticbridge.recording import RecordingFile
-from hapticbridge.request import refused_request, request_of, setups_of
-from hapticbridge.run_description import (
+from hapticbridge.run.description import (
     SOURCE_PREFIX,
     STATE_ATTACHMENT,
     metas_of,
@@ -28,8 +28,8 @@ from hapticbridge.run_description import (
     sample_at,
     start_state,
 )
+from hapticbridge.run.request import refused_request, request_of, setups_of
 from hapticbridge.scene import Scene
-from hapticbridge.trip import BY_TRIP
 
 _TOLERANCE = 1e-9  # relative and absolute in SI units, for numbers of another processor
 

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import conditions_of
-from hapticbridge.commands import bits_in, concerns, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import conditions_of
+from hapticbridge.demand.loop_setting import LoopSetting, delay_ticks
+from hapticbridge.demand.methods import Method, RunCoupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import LoopSetting, delay_ticks
-from hapticbridge.record import TICK_DTYPE
+from hapticbridge.kernel.record import TICK_DTYPE
 from hapticbridge.recording import RecordingFile
-from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import STARTS, meta_start, method_of, parameters_of
+from hapticbridge.run.commands import bits_in, concerns, coupling_in, tuning_ticks
+from hapticbridge.run.description import STARTS, meta_start, method_of, parameters_of
 
 Array = NDArray[np.float64]
 

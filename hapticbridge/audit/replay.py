@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.agreement import first_contradiction, scene_statements
 from hapticbridge.audit.events import AuditedRun
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.audit.structure import first_row
-from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands import EventApplier
 from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import WARNINGS
 from hapticbridge.kernel.mujoco_c import quiet, warning_of, without_timers
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
-from hapticbridge.record import CLOCK_FIELDS, SAMPLE_DTYPE, TICK_DTYPE, TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import RecordingFile
-from hapticbridge.run_description import (
+from hapticbridge.run.commands import CHANGES as COMMANDED
+from hapticbridge.run.commands import EventApplier
+from hapticbridge.run.description import (
     SOURCE_PREFIX,
     STARTS,
     STATE_ATTACHMENT,
@@ -41,9 +41,9 @@ from hapticbridge.run_description import (
     start_of,
     versions,
 )
+from hapticbridge.run.slow_scene import SlowScene
 from hapticbridge.scene import Scene
 from hapticbridge.scene.compile import clause
-from hapticbridge.slow_scene import SlowScene
 
 # Attached scene
 

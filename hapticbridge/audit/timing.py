@@ -26,7 +26,7 @@ from hapticbridge.audit.spring import springs
 from hapticbridge.audit.wrench_limits import AuditedBlock, newest
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import TickFlag, has_flag
+from hapticbridge.kernel.record import TickFlag, has_flag
 
 _DELAY_PRICE = 3.0  # damping in (K T/2)²/N that a delay of a period needs
 

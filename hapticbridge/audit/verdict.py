@@ -30,25 +30,25 @@ from hapticbridge.audit.structure import (
 )
 from hapticbridge.audit.timing import TimingTally
 from hapticbridge.audit.wrench_limits import AuditedBlock, wrench_deviations
-from hapticbridge.certificate import (
+from hapticbridge.demand.certificate import (
     condition_sentences,
     damping_margin,
     is_run_certified,
     run_conditions,
 )
-from hapticbridge.certification import Certification, certification_of, worst_certification
+from hapticbridge.demand.certification import Certification, certification_of, worst_certification
+from hapticbridge.demand.loop_setting import fresh_share
+from hapticbridge.demand.methods import Method, RunCoupling
+from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
+from hapticbridge.demand.trip import BY_TRIP, Trip
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.hand_energy import INSTANT, HandEnergy
-from hapticbridge.loop_setting import fresh_share
-from hapticbridge.record import CLOCK_FIELDS
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
+from hapticbridge.kernel.record import CLOCK_FIELDS
 from hapticbridge.recording import RecordingFile
 from hapticbridge.recording.reader import open_hands
-from hapticbridge.rendering import Method, RunCoupling
-from hapticbridge.run_description import meta_start, requested_of
-from hapticbridge.summary import Environment, was_never_lossless
-from hapticbridge.timekeeping import RunTimes, Timekeeping
-from hapticbridge.trip import BY_TRIP, Trip
+from hapticbridge.run.description import meta_start, requested_of
+from hapticbridge.run.summary import Environment, was_never_lossless
 from hapticbridge.units import format_energy
 
 Verdict = Literal["passive", "unverified", "active", "invalid"]

@@ -31,7 +31,7 @@ from hapticbridge.audit.motion import (
 from hapticbridge.audit.spring import limits_on_tool, shortened, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.record import UNITS, TickFlag, has_flag
+from hapticbridge.kernel.record import UNITS, TickFlag, has_flag
 
 Flags = NDArray[np.bool_]
 

@@ -24,16 +24,16 @@ from hapticbridge.audit.batch import (
     write_audits,
 )
 from hapticbridge.cli.terminal import err, out, plain, print_error, print_written, progress, working
+from hapticbridge.demand.trip import Trip
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.film import Shot, still
 from hapticbridge.plotting import check_ending
 from hapticbridge.recording import Recording, read_recording, repair
 from hapticbridge.recording.reader import read_hands
+from hapticbridge.replay.film import Shot, still
 from hapticbridge.report import check_page_name, plot_recording, telling_time, write_report
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
 from hapticbridge.sweep import Interrupted, Table
-from hapticbridge.trip import Trip
 from hapticbridge.units import energy_rows, format_energy
 from hapticbridge.whatif import WhatIf, changes_from, draw_what_if, what_ifs, write_what_if
 from hapticbridge.whatif.page import changes, rows, sentences

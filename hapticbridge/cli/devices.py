@@ -15,8 +15,8 @@ from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
 from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.options import BridgeOptions
 from hapticbridge.realtime.doctor import LONGEST, SHORTEST, Diagnosis, diagnose
+from hapticbridge.run.options import BridgeOptions
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,13 @@ from typing import Literal
 
 from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
-from hapticbridge.compare import Comparison, Difference, compare
-from hapticbridge.dataset import DATASETS, write_dataset
 from hapticbridge.errors import RecordingError
-from hapticbridge.export import EVERYTHING, export, time_of
 from hapticbridge.files import atomic_write
-from hapticbridge.film import USUAL_SHOT, Shot, draw
 from hapticbridge.recording import read_recording
+from hapticbridge.replay.film import USUAL_SHOT, Shot, draw
+from hapticbridge.tools.compare import Comparison, Difference, compare
+from hapticbridge.tools.dataset import DATASETS, write_dataset
+from hapticbridge.tools.export import EVERYTHING, export, time_of
 from hapticbridge.units import format_si
 from hapticbridge.view import Address
 from hapticbridge.view.window import check_view

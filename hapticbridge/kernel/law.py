@@ -29,17 +29,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, Scheme, State
 from hapticbridge.kernel.handle import (
     device_from_scene,
     scene_from_device,
     slip_handle,
 )
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.ledger import SLACK_SHARE, moment_dot
 from hapticbridge.kernel.mujoco_c import floats
 from hapticbridge.kernel.parameters import ALL_MOTORS, RunParameters
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,

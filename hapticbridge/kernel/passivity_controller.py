@@ -10,12 +10,12 @@ import math
 
 import numpy as np
 
-from hapticbridge.hand_energy import INSTANT
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
+from hapticbridge.kernel.hand_energy import INSTANT
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import held_energy, pulled
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
-from hapticbridge.pose import Vector, norm, scaled
+from hapticbridge.kernel.pose import Vector, norm, scaled
 
 THRESHOLD = 1e-5
 """Energy debt in J above which the controller acts. Rounding and the first-order error of turning

@@ -29,7 +29,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.codes import (
     BAD_RESULT,
     BAD_SAMPLE,
@@ -67,6 +66,7 @@ from hapticbridge.kernel.handle import (
     take_handle_frames,
     turns_actuators_alone,
 )
+from hapticbridge.kernel.jit import compiled, compiled_for_threads
 from hapticbridge.kernel.law import (
     charge_lateness,
     command_handle_velocity,
@@ -115,19 +115,7 @@ from hapticbridge.kernel.passivity_controller import (
     observe_energy,
     within_energy_limit,
 )
-from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
-from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
-from hapticbridge.kernel.springs import restore_springs
-from hapticbridge.kernel.swing_watch import watch_device
-from hapticbridge.kernel.tick_guard import (
-    DEVICE_BUTTONS,
-    advance_share,
-    note_anchored,
-    refusal,
-    send_within,
-)
-from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
-from hapticbridge.pose import (
+from hapticbridge.kernel.pose import (
     Quaternion,
     Vector,
     add,
@@ -142,6 +130,18 @@ from hapticbridge.pose import (
     subtract,
     vector_of,
 )
+from hapticbridge.kernel.rigid_contact import aim_contacts, fill_tank, finish_contacts, follow_speed
+from hapticbridge.kernel.shown_tool import hand_over, note_contacts, shown_wrench, take_over
+from hapticbridge.kernel.springs import restore_springs
+from hapticbridge.kernel.swing_watch import watch_device
+from hapticbridge.kernel.tick_guard import (
+    DEVICE_BUTTONS,
+    advance_share,
+    note_anchored,
+    refusal,
+    send_within,
+)
+from hapticbridge.kernel.timing import meter_debt, meter_delay, note_delay, skip_delay
 
 LOOP_DTYPE = np.dtype(
     [

@@ -43,8 +43,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import State
+from hapticbridge.kernel.jit import compiled
 from hapticbridge.kernel.law import lateness
 
 TIMING_DTYPE = np.dtype(

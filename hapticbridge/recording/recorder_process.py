@@ -29,7 +29,7 @@ from rich.text import Text
 
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import remove_file
-from hapticbridge.record import TickFlag
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording.format import Attachment, further_hands
 from hapticbridge.recording.ring import Ring
 from hapticbridge.recording.writer import RecordingWriter

@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from hapticbridge.audit import AuditReport
 from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded
 from hapticbridge.audit.replay import Agreement, Resimulator
-from hapticbridge.certificate import DampingCondition, run_conditions
-from hapticbridge.commands import UNITS
 from hapticbridge.confinement import Worker, in_bounds
+from hapticbridge.demand.certificate import DampingCondition, run_conditions
+from hapticbridge.demand.loop_setting import Lag, delay_ticks, required_damping
+from hapticbridge.demand.methods import Method
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.loop_setting import Lag, delay_ticks, required_damping
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import BLOCK
-from hapticbridge.rendering import Method
 from hapticbridge.report.evidence import Evidence
+from hapticbridge.run.commands import UNITS
 from hapticbridge.scene.checks import first_pump
 from hapticbridge.scene.contacts import Concern, check_contacts, geom_name
 from hapticbridge.theory.bounds import NEEDED_SHARE

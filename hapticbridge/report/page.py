@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport
+from hapticbridge.demand.guard import CONTROLLERS
 from hapticbridge.device import DATA_SHEET_UNITS
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import atomic_write, read_json
-from hapticbridge.guard import CONTROLLERS
+from hapticbridge.kernel.record import TickFlag, due_times
 from hapticbridge.plotting import inline_svg
-from hapticbridge.record import TickFlag, due_times
 from hapticbridge.recording import Recording
 from hapticbridge.report.cause import excess_of, pump_behind_trip
 from hapticbridge.report.evidence import Evidence
@@ -30,7 +30,7 @@ from hapticbridge.report.plots import (
     draw_recording,
     draw_timing,
 )
-from hapticbridge.run_description import meta_float
+from hapticbridge.run.description import meta_float
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Facts of the run

@@ -12,11 +12,11 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.kernel.record import TickFlag, due_times, force_on_hand, has_flag
 from hapticbridge.plotting import new_figure, write_picture
-from hapticbridge.record import TickFlag, due_times, force_on_hand, has_flag
 from hapticbridge.recording import Recording
 from hapticbridge.report.evidence import DRAWABLE, Evidence, is_motion_prescribed, recorded_coupling
-from hapticbridge.run_description import method_of, parameters_of
+from hapticbridge.run.description import method_of, parameters_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,15 +22,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.audit.recorded_scene import compile_recorded
+from hapticbridge.demand.timekeeping import Alarm
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.film_process import MIN_REFERENCE, is_held, tell_apart
-from hapticbridge.record import force_on_hand
-from hapticbridge.recorded_scene import compile_recorded
+from hapticbridge.kernel.record import force_on_hand
 from hapticbridge.recording import RecordingFile, Ring
 from hapticbridge.recording.format import further_hands
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.run_description import parameters_of
-from hapticbridge.timekeeping import Alarm
+from hapticbridge.replay.stage import MIN_REFERENCE, is_held, tell_apart
+from hapticbridge.run.description import parameters_of
 from hapticbridge.view.controls import Controls, Outlet, add_hand, allowance_of
 from hapticbridge.view.geometry import Scenery, Tendons
 from hapticbridge.view.page import Held, Page, Sight, Trace, quoted

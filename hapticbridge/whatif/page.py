@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import unit_of
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.methods import RunCoupling
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
-from hapticbridge.guard import Limits
-from hapticbridge.hand_energy import INSTANT
 from hapticbridge.kernel.codes import Grip
+from hapticbridge.kernel.hand_energy import INSTANT
+from hapticbridge.kernel.record import due_times
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
-from hapticbridge.record import due_times
-from hapticbridge.rendering import RunCoupling
 from hapticbridge.report.evidence import (
     DRAWABLE,
     Evidence,

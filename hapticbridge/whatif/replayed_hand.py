@@ -17,21 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticbridge.bridge import Bridge
+from hapticbridge.audit.recorded_scene import load_unpacked
 from hapticbridge.clock import Clock, SimulatedClock
-from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands import concerns, coupling_in, tuning_ticks
+from hapticbridge.demand.loop_setting import delay_ticks
+from hapticbridge.demand.trip import TripCode
 from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
 from hapticbridge.errors import SafetyTrip
-from hapticbridge.hands import Grasp
-from hapticbridge.loop_setting import delay_ticks
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import load_unpacked
-from hapticbridge.run_description import CARRIED, sample_at
+from hapticbridge.kernel.record import TickFlag
+from hapticbridge.run.bridge import Bridge
+from hapticbridge.run.commands import CHANGES as COMMANDED
+from hapticbridge.run.commands import concerns, coupling_in, tuning_ticks
+from hapticbridge.run.description import CARRIED, sample_at
+from hapticbridge.run.hands import Grasp
 from hapticbridge.scene import Scene
-from hapticbridge.trip import TripCode
 from hapticbridge.whatif.recorded import RecordedRun, changed_request
 from hapticbridge.whatif.settings import GAINS, Settings
 

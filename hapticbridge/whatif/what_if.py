@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.audit import AuditReport, audit
+from hapticbridge.audit.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.clock import Clock, SimulatedClock
-from hapticbridge.compare import compare
 from hapticbridge.confinement import Work, Worker, in_bounds
 from hapticbridge.device import Device
 from hapticbridge.device.registry import FINGERS_HAND
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.record import TickFlag
-from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.recording import Recording
 from hapticbridge.recording.reader import read_hands
 from hapticbridge.scene import Scene
+from hapticbridge.tools.compare import compare
 from hapticbridge.units import format_si
 from hapticbridge.whatif.recorded import RecordedRun
 from hapticbridge.whatif.replayed_hand import (

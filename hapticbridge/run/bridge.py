@@ -19,10 +19,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.certificate import condition_sentences
 from hapticbridge.clock import Clock, RealClock
-from hapticbridge.commands import Command, Repeat, Stop
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import condition_sentences
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.trip import Trip, TripCode
 from hapticbridge.device import Device
 from hapticbridge.device.base import checked_read, checked_write
 from hapticbridge.errors import (
@@ -32,32 +33,31 @@ from hapticbridge.errors import (
     SceneError,
     choices,
 )
-from hapticbridge.guard import Limits
-from hapticbridge.hands import (
+from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
+from hapticbridge.kernel.mujoco_c import quiet, without_timers
+from hapticbridge.realtime import real_time
+from hapticbridge.recording.recorder import RingObserver
+from hapticbridge.run.commands import Command, Repeat, Stop
+from hapticbridge.run.hands import (
     DeviceGroup,
     Grasp,
     devices_for_run,
     scene_of_grasps,
 )
-from hapticbridge.inputs import Write, input_writes
-from hapticbridge.kernel.codes import BAD_RESULT, HALF_DONE, HAND_CODES, OK, RING_FULL
-from hapticbridge.kernel.mujoco_c import quiet, without_timers
-from hapticbridge.options import (
+from hapticbridge.run.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
     RunSetup,
     Workspace,
     device_for_run,
 )
-from hapticbridge.realtime import real_time
-from hapticbridge.recording.recorder import RingObserver
-from hapticbridge.request import RunRequest
+from hapticbridge.run.request import RunRequest
+from hapticbridge.run.session import RecordOutput, Session, StopRequest
+from hapticbridge.run.summary import Ledger, Summary
 from hapticbridge.scene import Scene, load_scene
 from hapticbridge.scene.compile import clause
-from hapticbridge.session import RecordOutput, Session, StopRequest
+from hapticbridge.scene.inputs import Write, input_writes
 from hapticbridge.signals import stopping_on_signals
-from hapticbridge.summary import Ledger, Summary
-from hapticbridge.trip import Trip, TripCode
 
 OnTick = Callable[[int], None]
 """Function called with a tick's number before the tick, for scripted inputs."""

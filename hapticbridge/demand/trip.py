@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from hapticbridge.demand.guard import USUAL_ENERGY
 from hapticbridge.errors import RecordingError
-from hapticbridge.guard import USUAL_ENERGY
 from hapticbridge.kernel import codes
 from hapticbridge.units import format_energy
 

@@ -9,11 +9,7 @@ from functools import partial
 from typing import Literal
 
 from hapticbridge.coupling import Coupling
-from hapticbridge.device.base import DeviceInfo
-from hapticbridge.errors import CouplingError
-from hapticbridge.kernel.codes import Scheme
-from hapticbridge.kernel.parameters import RunParameters, checked_substeps
-from hapticbridge.loop_setting import (
+from hapticbridge.demand.loop_setting import (
     IN_TIME,
     Axis,
     Lag,
@@ -22,7 +18,11 @@ from hapticbridge.loop_setting import (
     device_period,
     required_damping,
 )
-from hapticbridge.rendering import Method, default_method
+from hapticbridge.demand.methods import Method, default_method
+from hapticbridge.device.base import DeviceInfo
+from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.codes import Scheme
+from hapticbridge.kernel.parameters import RunParameters, checked_substeps
 from hapticbridge.theory.bounds import (
     NEEDED_SHARE,
     midpoint_damping,
@@ -80,7 +80,7 @@ def default_coupling(
         scale: Handle motion per device motion.
         force_scale: Force on the device per force on the tool.
         law_evaluations: Evaluations of the wrench per tick (substeps).
-        method: Rendering method; None takes ``rendering.default_method``.
+        method: Rendering method; None takes ``methods.default_method``.
 
     Raises:
         CouplingError: The number of evaluations, a scale or the period is out of range.

@@ -21,8 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import LARGEST, SMALLEST, check_fields, rule_of, shared, shown
-from hapticbridge.certificate import StepCondition, assumed_damping
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import StepCondition, assumed_damping
+from hapticbridge.demand.guard import Limits
+from hapticbridge.demand.loop_setting import IN_TIME, LoopSetting
+from hapticbridge.demand.methods import Method
 from hapticbridge.errors import (
     CommandError,
     CouplingError,
@@ -31,15 +34,12 @@ from hapticbridge.errors import (
     choices,
 )
 from hapticbridge.files import read_json
-from hapticbridge.guard import Limits
-from hapticbridge.inputs import applied_writes
 from hapticbridge.kernel.codes import CLUTCHED, FORCE_OFF
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundKernel
-from hapticbridge.loop_setting import IN_TIME, LoopSetting
-from hapticbridge.rendering import Method
-from hapticbridge.run_description import restore_state
-from hapticbridge.slow_scene import SlowScene
+from hapticbridge.run.description import restore_state
+from hapticbridge.run.slow_scene import SlowScene
+from hapticbridge.scene.inputs import applied_writes
 from hapticbridge.units import format_si
 
 # Commands and their wire format
@@ -515,7 +515,7 @@ class EventApplier:
 
     The loop applies the event that it records, so live run and re-simulation share one path.
     ``hands`` holds kernel and parameters of each hand. ``start`` is the scene's state at the start
-    (``run_description.start_state``), as bytes. A scene slower than the loop takes part in a change
+    (``description.start_state``), as bytes. A scene slower than the loop takes part in a change
     before its next step.
     """
 

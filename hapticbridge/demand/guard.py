@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.arguments import check_fields, option, unit_of
-from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
+from hapticbridge.demand.certificate import assumed_damping
+from hapticbridge.demand.loop_setting import IN_TIME, Lag
 from hapticbridge.device import AXES, Device, DeviceInfo
 from hapticbridge.device.base import JUMP_MARGIN
 from hapticbridge.device.registry import is_driver
 from hapticbridge.errors import DeviceError
-from hapticbridge.jit import direct
 from hapticbridge.kernel.handle import stretch_at
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
-from hapticbridge.loop_setting import IN_TIME, Lag
 
 # Limits of the wrench and of the run
 

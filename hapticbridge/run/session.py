@@ -20,22 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.clock import Clock, RealClock, slept_ns
-from hapticbridge.commands import CommandExecutor, CommandQueue, EventApplier
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import to_json
-from hapticbridge.device import Device
-from hapticbridge.device.base import checked_close, checked_start, checked_write
-from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
-from hapticbridge.guard import (
+from hapticbridge.demand.guard import (
     refuse_implausible_pose,
     refuse_stretched_start,
     wait_until_still,
 )
-from hapticbridge.hands import DeviceGroup
-from hapticbridge.inputs import Write
-from hapticbridge.jit import direct
+from hapticbridge.demand.methods import prepare, prepare_hands
+from hapticbridge.demand.trip import BY_TRIP, Trip, TripCode
+from hapticbridge.device import Device
+from hapticbridge.device.base import checked_close, checked_start, checked_write
+from hapticbridge.errors import DeviceError, HapticBridgeError, SafetyTrip
 from hapticbridge.kernel.codes import OK, RING_FULL
+from hapticbridge.kernel.jit import direct
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
     answer_step,
@@ -45,7 +45,6 @@ from hapticbridge.kernel.tick import (
     publish,
     publish_positions,
 )
-from hapticbridge.options import RunSetup
 from hapticbridge.realtime import (
     Grant,
     check_pace,
@@ -53,12 +52,10 @@ from hapticbridge.realtime import (
     warn_of_refusals,
     warn_of_slow_motion,
 )
-from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE, TickFlag
 from hapticbridge.recording.recorder import RecordStream, RingObserver
 from hapticbridge.recording.ring import Snapshot
-from hapticbridge.rendering import prepare, prepare_hands
-from hapticbridge.request import RunRequest
-from hapticbridge.run_description import (
+from hapticbridge.run.commands import CommandExecutor, CommandQueue, EventApplier
+from hapticbridge.run.description import (
     attachments,
     describe_hands,
     describe_machine,
@@ -66,11 +63,14 @@ from hapticbridge.run_description import (
     describe_start,
     start_state,
 )
+from hapticbridge.run.hands import DeviceGroup
+from hapticbridge.run.options import RunSetup
+from hapticbridge.run.request import RunRequest
+from hapticbridge.run.slow_scene import LONGEST_WAIT, SlowScene
+from hapticbridge.run.summary import RunOutcome, Summary
 from hapticbridge.scene.checks import first_pump, strongest_actuator
+from hapticbridge.scene.inputs import Write
 from hapticbridge.signals import deferring_stops
-from hapticbridge.slow_scene import LONGEST_WAIT, SlowScene
-from hapticbridge.summary import RunOutcome, Summary
-from hapticbridge.trip import BY_TRIP, Trip, TripCode
 
 SUSPENDED_NS = 50_000_000
 """Longest sleep of the machine in ns that a run survives. After a longer one the state of hand and

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 import platformdirs
 
-from hapticbridge import machine_code
+from hapticbridge.kernel import machine_code
 
 _Function = TypeVar("_Function", bound=Callable[..., object])
 

@@ -13,24 +13,24 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.certificate import condition_sentences
-from hapticbridge.certification import (
+from hapticbridge.coupling import Coupling
+from hapticbridge.demand.certificate import condition_sentences
+from hapticbridge.demand.certification import (
     Certification,
     Standing,
     certification_of,
     worst_certification,
 )
-from hapticbridge.coupling import Coupling
+from hapticbridge.demand.loop_setting import fresh_share
+from hapticbridge.demand.methods import Method, RunCoupling, default_method, method_named
+from hapticbridge.demand.timekeeping import RunTimes, Timekeeping
+from hapticbridge.demand.trip import Trip
 from hapticbridge.device import DeviceInfo
-from hapticbridge.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
+from hapticbridge.kernel.hand_energy import INSTANT, HandEnergy
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.loop_setting import fresh_share
-from hapticbridge.record import TickFlag
-from hapticbridge.rendering import Method, RunCoupling, default_method, method_named
-from hapticbridge.timekeeping import RunTimes, Timekeeping
-from hapticbridge.trip import Trip
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.units import energy_rows, format_share, format_si, format_wrenches
 
 # Sentences on the effective coupling and its law

@@ -30,12 +30,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from hapticbridge.certificate import DampingCondition
-from hapticbridge.hand_energy import INSTANT
+from hapticbridge.demand.certificate import DampingCondition
+from hapticbridge.kernel.hand_energy import INSTANT
 from hapticbridge.kernel.parameters import RunParameters
+from hapticbridge.kernel.record import TickFlag
 from hapticbridge.kernel.swing_watch import PUSH, STAND
 from hapticbridge.kernel.timing import DELAY_PRICE
-from hapticbridge.record import TickFlag
 from hapticbridge.units import format_si
 
 NOT_KEPT = "the run did not keep its time"

@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from hapticbridge.certificate import DampingCondition, is_run_certified, run_conditions
+from hapticbridge.demand.certificate import DampingCondition, is_run_certified, run_conditions
+from hapticbridge.demand.methods import Method
+from hapticbridge.demand.timekeeping import NOT_KEPT, RunTimes, Timekeeping
 from hapticbridge.device import DeviceInfo
-from hapticbridge.hand_energy import HandEnergy
+from hapticbridge.kernel.hand_energy import HandEnergy
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.rendering import Method
-from hapticbridge.timekeeping import NOT_KEPT, RunTimes, Timekeeping
 
 
 class Standing(StrEnum):

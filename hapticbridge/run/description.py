@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from hapticbridge.arguments import types_of
 from hapticbridge.coupling import Coupling
+from hapticbridge.demand.methods import RIGID, SCENE, Method, method_named
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import CouplingError, HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
-from hapticbridge.record import SAMPLE_DTYPE
+from hapticbridge.kernel.record import SAMPLE_DTYPE
 from hapticbridge.recording import Attachment
 from hapticbridge.recording.format import HANDS_KEY, further_hands
-from hapticbridge.rendering import RIGID, SCENE, Method, method_named
 from hapticbridge.scene import Scene
 
 # Start of a run: MuJoCo's state, compiled model, and energies
