@@ -78,7 +78,7 @@ def test_a_device_is_closed_whatever_was_refused(
     code, _, err = call("zwidth", "--measure", "mouse")
     assert code == 2
     assert "no force moves this device along x, y or z, so it has no walls to try" in err
-    for wrong in ("--axis q", "--damping nan"):
+    for wrong in ("--axis q", "--damping 1e31"):
         assert call(*f"zwidth --measure {FREE} {wrong}".split())[0] == 2
     assert len(closed) == 2
 

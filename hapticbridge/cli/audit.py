@@ -171,10 +171,10 @@ class Audit:
 
     what_if: tuple[str, ...] = option((), metavar="NAME=VALUE", is_repeated=True)
     """Simulate the recorded hand again with this changed; several of them add up to one change.
-    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is
-    stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
-    scene_rate, scale, force_scale, contact_stiffness, controller, or a parameter of the scene;
-    GRIP:stiffness and the like are of one of several hands. The change is simulated with the
+    Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is an
+    option of 'run', as stiffness, rate, method, substeps, scale, controller or force_limit, or a
+    parameter of the scene; an unknown name lists them. GRIP:stiffness and the like are of one of
+    several hands. The change is simulated with the
     recorded motion and, where the device is known, with a model hand that yields. --plot and
     --report show all runs of one change side by side (one file only)."""
 

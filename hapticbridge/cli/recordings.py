@@ -141,9 +141,9 @@ class Export:
     )
     """The format. 'parquet' and 'lerobot' need the extra 'tables', 'hdf5' and 'robomimic' the extra
     'hdf5', 'rerun' the extra 'rerun'."""
-    start: float = option(-math.inf, flag="from", metavar="S")
+    start: float = option(-math.inf, flag="from", metavar="S", is_finite=False)
     """First time to write, in s of the run; by default its start."""
-    end: float = option(math.inf, flag="to", metavar="S")
+    end: float = option(math.inf, flag="to", metavar="S", is_finite=False)
     """Time in s of the run before which the last tick lies; by default its end."""
     out: Path | None = None
     """File to write; by default the recording's name with the format's ending. A folder that does

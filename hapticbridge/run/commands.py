@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import check_fields, rule_of, shared, shown
+from hapticbridge.arguments import LARGEST, SMALLEST, check_fields, rule_of, shared, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.demand.certificate import StepCondition, assumed_damping
 from hapticbridge.demand.guard import Limits
@@ -64,10 +64,12 @@ class Couple:
         CommandError: A value is out of range.
     """
 
-    stiffness: float = shared(Coupling, "stiffness")
-    damping: float = shared(Coupling, "damping")
-    rotational_stiffness: float | None = shared(Coupling, "rotational_stiffness", None)
-    rotational_damping: float | None = shared(Coupling, "rotational_damping", None)
+    stiffness: float = shared(Coupling, "stiffness", least=SMALLEST, most=LARGEST)
+    damping: float = shared(Coupling, "damping", most=LARGEST)
+    rotational_stiffness: float | None = shared(
+        Coupling, "rotational_stiffness", None, most=LARGEST
+    )
+    rotational_damping: float | None = shared(Coupling, "rotational_damping", None, most=LARGEST)
     grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
