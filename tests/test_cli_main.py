@@ -56,7 +56,7 @@ NOT_FOR_A_RUN = frozenset(
         "hapticbridge.device.wheel",
         "hapticbridge.audit.verdict",
         "hapticbridge.check.lean",
-        "hapticbridge.check.run_faults",
+        "hapticbridge.check.cost",
         "hapticbridge.realtime.doctor",
         "hapticbridge.replay.film",
         "glfw",

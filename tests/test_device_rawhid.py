@@ -58,7 +58,7 @@ def test_the_data_sheet_is_what_the_user_and_the_device_say() -> None:
         (Claims(torque_limit=NAN), "does not report its torque_limit"),
         (Claims(speed_limit=NAN), "does not report its speed_limit"),
         (Claims(rate=NAN), "does not report its rate"),
-        (Claims(mass=-1.0), "reports an impossible data sheet: mass = -1.0"),
+        (Claims(mass=-1.0), "reports an impossible data sheet: mass is -1.0 kg"),
         (Claims(axes=0), "reports an impossible data sheet: axes"),
         (Claims(axes=128), "reports an impossible data sheet: axes"),
     ],

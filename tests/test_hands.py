@@ -259,7 +259,7 @@ TWO = (hb.Grasp("left"), hb.Grasp("right"))
         (lambda: bridge_of(("left", "right")), "several hands are named by a Grasp each"),
         (lambda: bridge_of(TWO, {"damping": 1.0}), "has a coupling of its own"),
         (lambda: bridge_of("simulated"), "was loaded with 2 grips, and one device holds one"),
-        (lambda: hb.Grasp(""), "grip is ''; it must name a site or a body"),
+        (lambda: hb.Grasp(""), "grip is ''; it must be a text that is not empty"),
         (lambda: bridge_of(twice(Scripted("one", 0.0))), "two hands have one device"),
     ],
 )

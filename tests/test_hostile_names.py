@@ -103,7 +103,7 @@ def report_of(path: Path, page: Path) -> None:
 def report_of_edited(path: Path, page: Path) -> None:
     """Writes the report on a file whose metadata and events are script, too."""
     recording = read_recording(path)
-    meta = {key: EVIL for key in recording.meta if key not in ("epoch_ns", "period_s")}
+    meta = {key: EVIL for key in recording.meta if key not in ("format", "epoch_ns", "period_s")}
     trip = {"event": "trip", "tick": 9, "time_ns": 0, "reason": EVIL, EVIL: EVIL, "by": EVIL}
     edited = rewritten(
         recording, page.with_suffix(".mcap"), meta=meta, events=[*recording.events, trip]

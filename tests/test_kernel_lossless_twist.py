@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -350,17 +349,3 @@ def test_another_damping_that_pays_does_not_pass_the_audit(tmp_path: Path) -> No
         changed = {"guard": replace(guard, twist_damping=pays).to_json()}
         report = audit(rewritten(recording, tmp_path / "other.mcap", meta=changed))
         assert report.verdict == "invalid"
-
-
-@pytest.mark.parametrize(("twist", "certified"), [(2.3, False), (3.0, True)])
-def test_a_recording_without_that_damping_counts_the_whole_torque_up_to_the_angle_limit(
-    tmp_path: Path, twist: float, certified: bool
-) -> None:
-    b_r = midpoint_damping(0.2, 1e-5, T, twist)
-    _, recording = recorded_about_a_twist(tmp_path, b_r)
-    guard = json.loads(recording.meta["guard"])
-    del guard["twist_damping"]
-    earlier = {"guard": json.dumps(guard)}
-    report = audit(rewritten(recording, tmp_path / "earlier.mcap", meta=earlier))
-    found = report.verdict, report.certified, report.resimulation
-    assert found == ("passive", certified, "bit for bit")
