@@ -206,10 +206,7 @@ def test_device_that_no_force_moves_is_not_certified_whatever_damping_it_claims(
     report = verdict_of(tap, folder, meta=other_sheet(tap, **claimed))
     assert (report.verdict, report.certified, report.conditions) == ("passive", None, ())
     free = other_sheet(tap, **claimed, is_prescribed=False)
-    asked = json.loads(free["request"])
-    asked["options"]["limits"]["ramp"] = 0.0  # as recorded: a prescribed motion has none
-    free["request"] = json.dumps(asked)
-    assert verdict_of(tap, folder, meta=free).certified is True
+    assert verdict_of(tap, folder, meta=free).verdict == "invalid"  # its guard is another
 
 
 @settings(
