@@ -26,7 +26,7 @@ class Counted(SimulatedDevice):
 
 
 @pytest.mark.parametrize(
-    "option", [("--force-limit", "1e6"), ("--stiffness", "1e9"), ("--clutch", "9")]
+    "option", [("--force-limit", "1e6"), ("--stiffness", "-1"), ("--clutch", "9")]
 )
 def test_a_run_refused_late_lets_its_device_go(
     call: Called, monkeypatch: pytest.MonkeyPatch, option: tuple[str, str]
