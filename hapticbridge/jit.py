@@ -232,15 +232,28 @@ class Compiled(Deferred):
             code = machine_code.read(path)
         if code is None:
             signature = _signature(arguments)
-            dispatcher = self._decorated(is_cached=False)  # a cached one prints no code
-            dispatcher.compile(signature)
-            found, ir = dispatcher.overloads[signature], dispatcher.inspect_llvm(signature)
-            result = str(found.signature.return_type)
-            symbol = found.fndesc.llvm_func_name
-            code = machine_code.object_code(ir, symbol, kinds, result, c_types)
+            with import_module("hapticbridge.whole_program").whole_program():
+                self._part.compile(signature)
+            found = self._part.overloads[signature]
+            result, symbol = str(found.signature.return_type), found.fndesc.llvm_func_name
+            parts = found.library.modules()
+            code = machine_code.object_code(parts, symbol, kinds, result, c_types)
             if folder is not None:
                 machine_code.write(path, code)
         return code
+
+    @cached_property
+    def _part(self) -> Any:
+        """The function as a part of a program that is compiled as a whole."""
+        return import_module("numba").njit(
+            error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+        )(self._function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Type that numba sees in a caller."""
+        is_part = import_module("hapticbridge.whole_program").is_open()
+        return (self._part if is_part else self.built)._numba_type_
 
     def _decorated(self, *, is_cached: bool) -> Any:
         numba = import_module("numba")

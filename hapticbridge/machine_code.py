@@ -114,12 +114,12 @@ def processor() -> tuple[str, str]:
 
 
 def object_code(
-    ir: str, symbol: str, kinds: Sequence[Kind], result: str, c_types: Sequence[str] = ()
+    parts: Sequence[Any], symbol: str, kinds: Sequence[Kind], result: str, c_types: Sequence[str] = ()
 ) -> bytes:
-    """Compiles a function's optimised code together with an entry.
+    """Compiles a function with all that it calls, together with an entry.
 
     Args:
-        ir: LLVM code of the function and all that it calls, as numba prints it.
+        parts: LLVM modules of the function and all that it calls, not optimised.
         symbol: Name of the function there.
         kinds: Types of the arguments.
         result: numba's name of the result's type.
@@ -133,20 +133,31 @@ def object_code(
         return b""
     target, _ = _machine()
     try:
-        module = llvm.parse_assembly(ir)
         entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result)
-        module.link_in(llvm.parse_assembly(entry))
+        module = llvm.parse_assembly(entry)
+        module.triple = llvm.get_process_triple()
+        module.data_layout = str(target.target_data)
+        for part in parts:
+            module.link_in(part, preserve=True)
         for value in (*module.functions, *module.global_variables):
             if not value.is_declaration and value.name != _ENTRY:
                 value.linkage = "internal"
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_global_dead_code_eliminate_pass()
-        passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
+        _optimise(module, target)
         code = bytes(target.emit_object(module))
         address_of(code, symbol)
     except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
         return b""
     return code
+
+
+def _optimise(module: Any, target: Any) -> None:
+    """Optimises a module at LLVM's level 3, as numba does."""
+    options = llvm.create_pipeline_tuning_options(3)
+    options.loop_vectorization, options.slp_vectorization = True, False
+    builder = llvm.create_pass_builder(target, options)
+    passes = builder.getModulePassManager()
+    passes.add_refprune_pass()
+    passes.run(module, builder)
 
 
 def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
