@@ -72,6 +72,8 @@ declare ptr @PyBool_FromLong(i64)
 declare ptr @PyLong_FromLongLong(i64)
 declare ptr @PyFloat_FromDouble(double)
 declare void @Py_IncRef(ptr)
+declare ptr @PyEval_SaveThread()
+declare void @PyEval_RestoreThread(ptr)
 @_Py_NoneStruct = external global i8
 """
 
@@ -109,14 +111,33 @@ def _machine() -> tuple[Any, Any]:
 
 @cache
 def processor() -> tuple[str, str]:
-    """Returns name and features of this processor, for which the code is made."""
-    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    """Returns name and features of the processor for which the code is made.
+
+    On x86-64 that is level 3 of the architecture where this processor has it, elsewhere on Linux
+    the 64-bit ARM architecture's baseline. Code made on another such machine then fits, and no
+    number changes: floating-point operations are never contracted or reordered.
+    """
+    name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features()
+    machine = llvm.get_process_triple().partition("-")[0]
+    if machine == "x86_64" and all(features.get(each) for each in _LEVEL_3):
+        return "x86-64-v3", ""
+    return ("generic", "") if machine == "aarch64" else (name, features.flatten())
 
 
-def object_code(
-    parts: Sequence[Any], symbol: str, kinds: Sequence[Kind], result: str, c_types: Sequence[str] = ()
+_LEVEL_3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "sse4.2", "popcnt")
+"""Features of the third level of x86-64, as LLVM names them."""
+
+
+def program(
+    parts: Sequence[Any],
+    symbol: str,
+    kinds: Sequence[Kind],
+    result: str,
+    *,
+    c_types: Sequence[str] = (),
+    releases_lock: bool = False,
 ) -> bytes:
-    """Compiles a function with all that it calls, together with an entry.
+    """Links a function with all that it calls and an entry.
 
     Args:
         parts: LLVM modules of the function and all that it calls, not optimised.
@@ -125,42 +146,64 @@ def object_code(
         result: numba's name of the result's type.
         c_types: If given, LLVM's types of the arguments of a C function that returns an ``int``;
             the entry is then that function. Otherwise it takes Python objects.
+        releases_lock: True to release the interpreter lock in calls from Python.
 
     Returns:
-        The object code, empty if it cannot be used without numba's runtime.
+        LLVM's bitcode, empty if there is no entry for such a result.
     """
     if result not in _RESULTS:
         return b""
     target, _ = _machine()
+    entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result, releases_lock)
+    module = llvm.parse_assembly(entry)
+    module.triple, module.data_layout = target.triple, str(target.target_data)
+    for part in parts:
+        module.link_in(part, preserve=True)
+    for value in (*module.functions, *module.global_variables):
+        if not value.is_declaration and value.name != _ENTRY:
+            value.linkage = "internal"
+    return bytes(module.as_bitcode())
+
+
+def object_code(bitcode: bytes) -> bytes:
+    """Optimises and compiles a program, at LLVM's level 3 as numba does.
+
+    Returns:
+        The object code, empty if it cannot be used without numba's runtime.
+    """
+    if not bitcode:
+        return b""
+    target, _ = _machine()
     try:
-        entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result)
-        module = llvm.parse_assembly(entry)
-        module.triple = llvm.get_process_triple()
-        module.data_layout = str(target.target_data)
-        for part in parts:
-            module.link_in(part, preserve=True)
-        for value in (*module.functions, *module.global_variables):
-            if not value.is_declaration and value.name != _ENTRY:
-                value.linkage = "internal"
-        _optimise(module, target)
-        code = bytes(target.emit_object(module))
-        address_of(code, symbol)
+        module = llvm.parse_bitcode(bitcode)
+        options = llvm.create_pipeline_tuning_options(3)
+        options.loop_vectorization, options.slp_vectorization = True, False
+        builder = llvm.create_pass_builder(target, options)
+        passes = builder.getModulePassManager()
+        passes.add_refprune_pass()
+        passes.run(module, builder)
+        return bytes(target.emit_object(module))
     except (RuntimeError, AttributeError):  # the latter with an llvmlite that lacks such a pass
+        return b""
+
+
+def usable(code: bytes, name: str) -> bytes:
+    """Returns the code, or none if the linker refuses it."""
+    try:
+        address_of(code, name)
+    except RuntimeError:
         return b""
     return code
 
 
-def _optimise(module: Any, target: Any) -> None:
-    """Optimises a module at LLVM's level 3, as numba does."""
-    options = llvm.create_pipeline_tuning_options(3)
-    options.loop_vectorization, options.slp_vectorization = True, False
-    builder = llvm.create_pass_builder(target, options)
-    passes = builder.getModulePassManager()
-    passes.add_refprune_pass()
-    passes.run(module, builder)
+def serve() -> None:
+    """Compiles the programs in the files named on standard input, each into a file beside it."""
+    for line in sys.stdin:
+        path = Path(line.rstrip("\n"))
+        path.with_suffix(".o").write_bytes(object_code(path.read_bytes()))
 
 
-def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
+def _entry(symbol: str, kinds: Sequence[Kind], result: str, releases_lock: bool) -> str:
     """Returns LLVM code that calls a function of numba with Python objects.
 
     The function takes places for its result and for an exception, and returns 0 without one. NULL
@@ -179,13 +222,17 @@ def _entry(symbol: str, kinds: Sequence[Kind], result: str) -> str:
     place, give = _RESULTS[result]
     types = ", ".join(value.split()[0] for value in passed)
     body = "\n".join(lines)
+    release = "%thread = call ptr @PyEval_SaveThread()" if releases_lock else ""
+    regain = "call void @PyEval_RestoreThread(ptr %thread)" if releases_lock else ""
     return f"""{_DECLARATIONS}
 declare i32 @"{symbol}"({types})
 define ptr @{_ENTRY}(ptr %self, ptr %arguments, i64 %count) {{
 %place = alloca {place}
 %exception = alloca ptr
 {body}
+{release}
 %status = call i32 @"{symbol}"({", ".join(passed)})
+{regain}
 %failed = icmp ne i32 %status, 0
 br i1 %failed, label %fail, label %done
 fail:

@@ -90,7 +90,7 @@ _SIGNATURE = "int32(intp, intp, intp, int32, int32, float64)"
 _mjc_box_box: Any = external("mjc_BoxBox", _SIGNATURE)
 _mjc_convex: Any = external("mjc_Convex", _SIGNATURE)
 
-_C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
+C_TYPES = ("i64", "i64", "i64", "i32", "i32", "double")
 """Arguments of ``mjfCollision``: model, data, points, two geoms, margin."""
 
 
@@ -349,7 +349,7 @@ def _install(first: int, second: int) -> None:
 
 @cache
 def _address(function: Any) -> int:
-    return callback(function, *_C_TYPES)
+    return callback(function, *C_TYPES)
 
 
 def install(model: mujoco.MjModel) -> None:

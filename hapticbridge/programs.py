@@ -1,0 +1,46 @@
+"""Large programs of a run with one hand and of its audit, compiled together ahead of the first run.
+
+Programs that are missing here are compiled when they are first needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hapticbridge.device.simulated.dynamics import STATE_DTYPE as HAND_DTYPE
+from hapticbridge.device.simulated.dynamics import next_sample
+from hapticbridge.jit import Program, examples, prepare
+from hapticbridge.kernel.colliders import C_TYPES, box_box, flat_flat, round_flat
+from hapticbridge.kernel.state import STATE_DTYPE
+from hapticbridge.kernel.tick import (
+    after_step,
+    answer_step,
+    before_step,
+    between_halves,
+    finish_tick,
+    simulate_recorded,
+)
+from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
+
+
+def programs() -> list[Program]:
+    """Returns the programs, first those with the most work for LLVM."""
+    state, sample, row = (np.zeros(1, each) for each in (STATE_DTYPE, SAMPLE_DTYPE, TICK_DTYPE))
+    counts, numbers = np.zeros(1, np.int64), np.zeros(1)
+    return [
+        Program(after_step, (state, row, 0)),
+        Program(answer_step, (state, row, 0)),
+        Program(finish_tick, (state, row, row, counts, 0, 0, 0, 0, 0, True)),
+        Program(before_step, (state, sample, row, 0, 0.0)),
+        Program(simulate_recorded, (state, sample, counts, numbers, row, row)),
+        Program(between_halves, (state,)),
+        Program(next_sample, (np.zeros(1, HAND_DTYPE), np.empty((0, 8)), sample)),
+        *(Program(each, examples(C_TYPES), C_TYPES) for each in (box_box, round_flat, flat_flat)),
+    ]
+
+
+def prepare_run(note: Callable[[int], None]) -> None:
+    """Compiles what a run and its audit need and is not on disk (``jit.prepare``)."""
+    prepare(programs(), note=note)
