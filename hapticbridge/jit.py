@@ -306,55 +306,43 @@ class Program(NamedTuple):
     c_types: tuple[str, ...] = ()
 
 
-def prepare(
-    programs: Sequence[Program], folder: Path | None = None, note: Callable[[int], None] = int
-) -> int:
+def prepare(programs: Sequence[Program], note: Callable[[int], None]) -> None:
     """Compiles the programs whose machine code is not on disk, on two processors.
 
     This process types and lowers one program while a child optimises another.
 
     Args:
         programs: What is to be on disk.
-        folder: Where it is put; without one, that of ``cache_folder``.
         note: Called with the number of programs that are left, before each.
-
-    Returns:
-        Count of the programs that were compiled.
     """
-    target = folder or cache_folder()
-    if target is None or sys.platform != "linux":
-        return 0
-    names = [each.function.file_name(each.arguments, each.c_types) for each in programs]
-    kept = (target,) if folder else (target, READY_MADE)
-    missing = {
-        name: each
-        for name, each in zip(names, programs, strict=True)
-        if all(machine_code.read(place / name) is None for place in kept)
-    }
+    folder = cache_folder()
+    if folder is None or sys.platform != "linux":
+        return
+    missing: dict[str, Program] = {}
+    for each in programs:
+        name = each.function.file_name(each.arguments, each.c_types)
+        if not any((place / name).exists() for place in (READY_MADE, folder)):
+            missing[name] = each
     if not missing:
-        return 0
-    code = "from hapticbridge.machine_code import serve; serve()"
-    command = [sys.executable, "-c", code]
-    with (
-        TemporaryDirectory(dir=target) as place,
-        subprocess.Popen(command, stdin=subprocess.PIPE, text=True) as child,
-    ):
+        return
+    command = [sys.executable, "-c", "from hapticbridge.machine_code import serve; serve()"]
+    with TemporaryDirectory(dir=folder) as place:
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
         assert child.stdin is not None
-        for count, (name, each) in enumerate(missing.items()):
-            note(len(missing) - count)
-            path = Path(place, name).with_suffix(".bc")
-            path.write_bytes(each.function.program(each.arguments, each.c_types))
-            with suppress(BrokenPipeError):
-                child.stdin.write(f"{path}\n")
-                child.stdin.flush()
-        with suppress(BrokenPipeError):
-            child.stdin.close()
-        child.wait()
+        try:
+            with suppress(BrokenPipeError), child, child.stdin:
+                for count, (name, each) in enumerate(missing.items()):
+                    note(len(missing) - count)
+                    path = Path(place, name).with_suffix(".bc")
+                    path.write_bytes(each.function.program(each.arguments, each.c_types))
+                    child.stdin.write(f"{path}\n")
+                    child.stdin.flush()
+        finally:
+            child.kill()  # of a compilation that was broken off
         for name in missing:
-            with suppress(FileNotFoundError):  # of a child that was ended; compiled when needed
-                found = Path(place, name).read_bytes()
-                machine_code.write(target / name, machine_code.usable(found, name))
-    return len(missing)
+            with suppress(FileNotFoundError):  # the child was ended; compiled when it is needed
+                code = machine_code.usable(Path(place, name).read_bytes(), name)
+                machine_code.write(folder / name, code)
 
 
 READY_MADE = Path(__file__).with_name("ready_made")

@@ -1,11 +1,16 @@
 """Large programs of a run with one hand and of its audit, compiled together ahead of the first run.
 
-Programs that are missing here are compiled when they are first needed.
+Programs that are missing here are compiled when they are first needed. ``python -m`` with this
+module makes all that the first run and its audit need, as ``scripts/setup`` and a wheel do.
 """
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -43,4 +48,24 @@ def programs() -> list[Program]:
 
 def prepare_run(note: Callable[[int], None]) -> None:
     """Compiles what a run and its audit need and is not on disk (``jit.prepare``)."""
-    prepare(programs(), note=note)
+    prepare(programs(), note)
+
+
+def main() -> None:
+    """Compiles, tells how far it is, and runs and audits a scene once."""
+    from hapticbridge import Bridge, SimulatedClock, audit  # noqa: PLC0415 - they import much
+
+    def note(left: int) -> None:
+        print(f"compiling for this machine, {left} programs left ...", file=sys.stderr, flush=True)
+
+    prepare_run(note)
+    with TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        path = Path(folder, "run.mcap")
+        with Bridge("peg_in_hole", clock=SimulatedClock(), recording=path) as bridge:
+            bridge.run(0.02)
+        audit(path, in_process=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -133,7 +133,7 @@ table = (ctypes.c_void_p * 81).in_dll(library, "mjCOLLISIONFUNC")
 box = int(mujoco.mjtGeom.mjGEOM_BOX)
 table[9 * box + box] = ctypes.cast(library.mjc_Convex, ctypes.c_void_p).value
 try:
-    install()
+    install(mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom type='box' size='1 1 1'/><geom type='box' size='1 1 1'/></worldbody></mujoco>"))
 except SceneError as error:
     print(error)
 """

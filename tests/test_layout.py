@@ -15,7 +15,7 @@ TESTS = Path(__file__).parent
 PACKAGE = TESTS.parent / "hapticbridge"
 
 ORDER = (
-    ("errors", "jit", "lazy", "machine_code", "record", "signals", "units"),
+    ("errors", "jit", "lazy", "machine_code", "record", "signals", "units", "whole_program"),
     (
         "arguments",
         "clock",
@@ -40,7 +40,7 @@ ORDER = (
         "slow_scene",
         "theory_plots",
     ),
-    ("guard", "summary", "timekeeping", "export"),
+    ("guard", "summary", "timekeeping", "export", "programs"),
     ("testing",),
     ("commands", "check"),
     ("options",),

@@ -52,6 +52,7 @@ from hapticbridge.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
+from hapticbridge.programs import prepare_run
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.rehearsal import static_load
 from hapticbridge.rendering import RunCoupling, default_method
@@ -219,6 +220,11 @@ def announce_measured(bridge: Bridge) -> None:
 
 MAX_FAULTS = 2
 """Number of a scene's faults that a run repeats."""
+
+
+def _note_compiling(left: int) -> None:
+    """Tells how far the compilation is that comes once on a machine."""
+    err.print(f"compiling for this machine, once, for about a minute: {left} programs left …")
 
 
 def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
@@ -432,6 +438,7 @@ class Run:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
                 source = read_scene(self.scene, **settings_from(self.settings))
+            prepare_run(_note_compiling)
             held = self._completed(held, own_grips(source))
             if len(held) > 1:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
@@ -633,7 +640,7 @@ class Run:
         if not self.as_json:
             for setup in bridge.setups:
                 announce(setup, self._gains(), is_method_chosen=self.method is not None)
-        with err.status("preparing (the first run on a machine compiles for about a minute) …"):
+        with err.status("preparing …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
         if window is not None:
