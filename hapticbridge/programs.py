@@ -18,6 +18,7 @@ from hapticbridge.device.simulated.dynamics import STATE_DTYPE as HAND_DTYPE
 from hapticbridge.device.simulated.dynamics import next_sample
 from hapticbridge.jit import Program, examples, prepare
 from hapticbridge.kernel.colliders import C_TYPES, box_box, flat_flat, round_flat
+from hapticbridge.kernel.handle import stretch_at
 from hapticbridge.kernel.state import STATE_DTYPE
 from hapticbridge.kernel.tick import (
     after_step,
@@ -41,6 +42,7 @@ def programs() -> list[Program]:
         Program(before_step, (state, sample, row, 0, 0.0)),
         Program(simulate_recorded, (state, sample, counts, numbers, row, row)),
         Program(between_halves, (state,)),
+        Program(stretch_at, (state[0], sample)),
         Program(next_sample, (np.zeros(1, HAND_DTYPE), np.empty((0, 8)), sample)),
         *(Program(each, examples(C_TYPES), C_TYPES) for each in (box_box, round_flat, flat_flat)),
     ]
@@ -56,7 +58,7 @@ def main() -> None:
     from hapticbridge import Bridge, SimulatedClock, audit  # noqa: PLC0415 - they import much
 
     def note(left: int) -> None:
-        print(f"compiling for this machine, {left} programs left ...", file=sys.stderr, flush=True)
+        print(f"compiling for this machine; programs left: {left} ...", file=sys.stderr, flush=True)
 
     prepare_run(note)
     with TemporaryDirectory() as folder, warnings.catch_warnings():

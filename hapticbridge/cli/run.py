@@ -224,7 +224,7 @@ MAX_FAULTS = 2
 
 def _note_compiling(left: int) -> None:
     """Tells how far the compilation is that comes once on a machine."""
-    err.print(f"compiling for this machine, once, for about a minute: {left} programs left …")
+    err.print(f"compiling for this machine, once, for about a minute; programs left: {left} …")
 
 
 def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
