@@ -30,7 +30,7 @@ def test_the_first_run_and_its_audit_load_what_was_compiled_ahead(
     assert (
         main(["run", "point_mass", "--fast", "--duration", "0.01", "--record", str(recording)]) == 0
     )
-    audit(recording, in_process=True)
+    audit(recording)
     names = {each.function.file_name(each.arguments, each.c_types) for each in programs()}
     # the point mass has no boxes; the code of the simulated device may be loaded already
     needless = "box_box", "flat_flat", "round_flat", "next_sample"
