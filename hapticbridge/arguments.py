@@ -1,11 +1,29 @@
-"""Validation of arguments, with one-sentence refusals."""
+"""Validation of arguments and of the fields of dataclasses, with one-sentence refusals.
+
+A field has its type, default, unit and valid values in one place (``option``). ``check_fields``
+holds an object to them, ``value_from`` reads a value from text. The command line, the recorded
+request and the what-if are made from the same fields.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import types
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from numbers import Real
-from typing import TypeGuard
+from pathlib import Path
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeGuard,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -121,8 +139,8 @@ class Arguments:
         is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         if not is_whole or not least <= value <= most:
             raise self.error(
-                f"{name} is {shown(value)}; it must be a whole number{_of(unit, 'of')} >= {least} "
-                f"and <= {most}"
+                f"{name} is {shown(value)}; it must be a whole number{_of(unit, 'of')}, "
+                f"{_range(least, most)}"
             )
         return int(value)
 
@@ -180,9 +198,223 @@ def _first(array: Array, is_wrong: NDArray[np.bool_], unit: str) -> str:
     return f"{float(array[is_wrong].flat[0]):g} {unit}".rstrip()
 
 
-def _range(least: float, most: float, is_open: bool) -> str:
+def _range(least: float, most: float, is_open: bool = False, is_finite: bool = True) -> str:
     if least == -np.inf and most == np.inf:
-        return "finite"
+        return "finite" if is_finite else "a number"
+    above = f"{'>' if is_open else '>='} {least:.10g}"
     if most == np.inf:
-        return f"finite and {'>' if is_open else '>='} {least:g}"
-    return f"in {'(' if is_open else '['}{least:g}, {most:g}]"
+        return f"finite and {above}" if is_finite else f"{above}, inf for none"
+    return f"{above} and <= {most:.10g}" if is_open else f"{least:.10g} to {most:.10g}"
+
+
+# Fields of dataclasses
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Unit and valid values of a field, and its flag on the command line.
+
+    Attributes:
+        unit: Unit of its number.
+        least: Smallest valid number.
+        most: Largest valid number.
+        is_open: True excludes the smallest number itself.
+        is_finite: False admits inf, for no limit.
+        is_filled: True refuses an empty text.
+        flag: Name of the flag, without dashes; empty for the field's name.
+        no_flag: Reason why the field has no flag; empty for one that has.
+        metavar: Word for the value in help; empty for that of its type.
+        is_positional: True for a word without a flag.
+        is_repeated: True for a tuple whose flag is repeated, once per value.
+        gains_of: Class of whose fields a mapping holds some by name.
+        source: Class and name of the field that documents it; None for itself.
+    """
+
+    unit: str = ""
+    least: float = -np.inf
+    most: float = np.inf
+    is_open: bool = False
+    is_finite: bool = True
+    is_filled: bool = False
+    flag: str = ""
+    no_flag: str = ""
+    metavar: str = ""
+    is_positional: bool = False
+    is_repeated: bool = False
+    gains_of: type[Any] | None = None
+    source: tuple[Any, str] | None = None
+
+    def valid(self) -> str:
+        """Returns the valid numbers in words."""
+        return _range(self.least, self.most, self.is_open, self.is_finite)
+
+    def admits(self, number: float) -> bool:
+        """Returns True for a valid number; NaN is none."""
+        is_above = number > self.least if self.is_open else number >= self.least
+        is_below = number <= self.most and (not self.is_finite or number < np.inf)
+        return is_above and is_below and (not self.is_finite or number > -np.inf)
+
+
+def rule(**values: Any) -> dict[str, Rule]:
+    """Returns the metadata of a field that has a ``Rule`` with these values."""
+    return {"rule": Rule(**values)}
+
+
+def option(default: Any = MISSING, **values: Any) -> Any:
+    """Returns a field of a dataclass with a default and a ``Rule`` with these values."""
+    return field(default=default, metadata=rule(**values))
+
+
+def shared(owner: type[Any], name: str, default: Any = MISSING, **values: Any) -> Any:
+    """Returns a field with the default, the rule and the text of another class's field.
+
+    Args:
+        owner: The other class.
+        name: The field there.
+        default: Default in place of the other one.
+        **values: Values of ``Rule`` in place of the other one's.
+    """
+    [other] = [each for each in fields(owner) if each.name == name]
+    own = replace(rule_of(other), source=(owner, name), **values)
+    return field(default=other.default if default is MISSING else default, metadata={"rule": own})
+
+
+_NO_RULE = Rule()
+
+
+def rule_of(each: Field[Any]) -> Rule:
+    """Returns the rule of a field; of one without, the rule that admits every finite number."""
+    own: Rule = each.metadata.get("rule", _NO_RULE)
+    return own
+
+
+@cache
+def types_of(kind: Any) -> dict[str, Any]:
+    """Returns the types of a dataclass's fields, by name."""
+    return get_type_hints(kind, include_extras=True)
+
+
+def members(kind: Any, *, is_stored: bool = True) -> tuple[Any, ...]:
+    """Returns the types of a union, or the one type.
+
+    A field ``Annotated[T, S]`` takes T and is stored as S, or written as S in a text.
+    """
+    if get_origin(kind) is Annotated:
+        return members(get_args(kind)[is_stored])
+    return get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+
+
+def label(each: Field[Any]) -> str:
+    """Returns the words for a field in messages, as its flag has them."""
+    return (rule_of(each).flag or each.name).replace("_", " ").replace("-", " ")
+
+
+def unit_of(kind: type[Any], name: str) -> str:
+    """Returns the unit of a field; empty for one without."""
+    return next((rule_of(each).unit for each in fields(kind) if each.name == name), "")
+
+
+def check_fields(
+    made: Any, error: type[HapticBridgeError] = HapticBridgeError, of: str = ""
+) -> None:
+    """Holds the fields of a frozen dataclass to their types and rules; numbers become plain ones.
+
+    Fields of other types than numbers, flags, texts, choices and dataclasses are left to the class.
+
+    Args:
+        made: The object, in its ``__post_init__``.
+        error: Class of the error.
+        of: Words before the field's name in messages.
+
+    Raises:
+        HapticBridgeError: ``error``: a value is of another type or out of range.
+    """
+    kind: Any = type(made)
+    for each, kinds, own in _checks(kind):
+        value = getattr(made, each.name)
+        plain = checked_value(f"{of}{label(each)}", value, kinds, own, error)
+        if plain is not value:
+            object.__setattr__(made, each.name, plain)
+
+
+def checked_value(
+    name: str,
+    value: Any,
+    kinds: tuple[Any, ...],
+    own: Rule,
+    error: type[HapticBridgeError] = HapticBridgeError,
+) -> Any:
+    """Returns a value that is of one of the types and that the rule admits, as a plain number.
+
+    Raises:
+        HapticBridgeError: ``error``: it is not; the message says what is valid.
+    """
+    kind = next((kind for kind in kinds if _fits(kind, value, own)), None)
+    if kind is None:
+        unit = f" {own.unit}" if own.unit and is_number(value) else ""
+        raise error(f"{name} is {shown(value)}{unit}; it must be {_valid(kinds, own)}")
+    return kind(value) if kind in (int, float) and type(value) is not kind else value
+
+
+@cache
+def _checks(kind: Any) -> tuple[tuple[Field[Any], tuple[Any, ...], Rule], ...]:
+    """Returns the fields that ``check_fields`` holds to something, with types and rule."""
+    found = []
+    for each in fields(kind):
+        kinds = members(types_of(kind)[each.name], is_stored=False)
+        if all(_is_checked(member) for member in kinds):
+            found.append((each, kinds, rule_of(each)))
+    return tuple(found)
+
+
+def _is_checked(kind: Any) -> bool:
+    is_simple = kind in (bool, int, float, str, type(None)) or is_dataclass(kind)
+    return is_simple or get_origin(kind) in (Literal, Mapping)
+
+
+def _fits(kind: Any, value: Any, own: Rule) -> bool:
+    """Returns True for a value of a type that its rule admits."""
+    if kind is int:
+        is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return is_whole and own.admits(value)
+    if kind is float:
+        return is_number(value) and own.admits(value)
+    if get_origin(kind) is Literal:
+        return isinstance(value, str) and value in get_args(kind)
+    is_empty = kind is str and own.is_filled and not value
+    return isinstance(value, get_origin(kind) or kind) and not is_empty
+
+
+def _valid(kinds: Iterable[Any], own: Rule) -> str:
+    """Returns what a field takes, in words."""
+    whole = f" >= {own.least:g}" if own.most == np.inf else f", {own.valid()}"
+    words = {float: own.valid(), int: f"a whole number{whole}", bool: "True or False"}
+    words |= {str: "a text that is not empty" if own.is_filled else "a text"}
+    found = [
+        f"one of {choices(get_args(kind))}"
+        if get_origin(kind) is Literal
+        else words.get(kind) or f"a {(get_origin(kind) or kind).__name__}"
+        for kind in kinds
+        if kind is not type(None)
+    ]
+    return ", or ".join(found)
+
+
+def value_from(kind: Any, text: str, own: Rule = _NO_RULE) -> Any:
+    """Returns the value of a field's type that a text writes; its range is not checked.
+
+    Raises:
+        ValueError: It writes none; the message says what is valid.
+    """
+    words = {float: f"a number{_of(own.unit)}", int: f"a whole number{_of(own.unit, 'of')}"}
+    valid = []
+    for member in members(kind):
+        if get_origin(member) is Literal:
+            if text in get_args(member):
+                return text
+            valid.append(f"one of {choices(get_args(member))}")
+        elif member in (int, float, str, Path):
+            with suppress(ValueError):
+                return member(text)
+            valid.append(words[member])
+    raise ValueError(", or ".join(valid))

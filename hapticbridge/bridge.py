@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, Unpack
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -45,7 +45,6 @@ from hapticbridge.kernel.mujoco_c import quiet, without_timers
 from hapticbridge.options import (
     DEFAULT_OPTIONS,
     BridgeOptions,
-    OptionChanges,
     RunSetup,
     Workspace,
     device_for_run,
@@ -72,7 +71,7 @@ def _no_option(name: str) -> str:
     for option, holder in (("limits", Limits), ("workspace", Workspace)):
         if name in holder.__dataclass_fields__:
             return f"'{name}' belongs to the option {option}: write it in hb.{holder.__name__}(…)"
-    return f"a bridge has no option '{name}'; it has {choices(OptionChanges.__annotations__)}"
+    return f"a bridge has no option '{name}'; it has {choices(BridgeOptions.__dataclass_fields__)}"
 
 
 class Bridge:
@@ -122,9 +121,9 @@ class Bridge:
         clock: Clock | None = None,
         recording: str | Path | None = None,
         observer: RingObserver | None = None,
-        **changes: Unpack[OptionChanges],
+        **changes: Any,
     ) -> None:
-        for name in set(changes) - set(OptionChanges.__annotations__):
+        for name in changes.keys() - BridgeOptions.__dataclass_fields__.keys():
             raise HapticBridgeError(_no_option(name))
         options = replace(options, **changes)
         path = None if recording is None else Path(recording)
@@ -337,7 +336,8 @@ class Bridge:
         repeated.
 
         Args:
-            command: A change of coupling or switches, a reset, a mark, or a stop.
+            command: A change of coupling or switches, a reset, a mark, or a stop. One for a single
+                hand of several names the hand's grip.
             by: Origin of the command, for the recording.
 
         Raises:
@@ -347,7 +347,6 @@ class Bridge:
         if isinstance(command, Stop):
             self.stop(by)
             return
-        self._refuse_several()
         if self._session is None or not self._session.is_open:
             raise CommandError(_NOT_OPEN)
         self._session.commands.offer(command, by)
@@ -361,12 +360,7 @@ class Bridge:
         Args:
             events: Events of the recording (``commands.CHANGES``), in order.
         """
-        self._refuse_several()
         self._open_session().commands.waiting.append((Repeat(tuple(events)), ""))
-
-    def _refuse_several(self) -> None:
-        if self.setup.scene.has_several_hands:
-            raise CommandError("a run of several hands takes no commands but to stop")
 
     def set_input(
         self,

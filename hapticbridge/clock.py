@@ -10,8 +10,7 @@ import sys
 import time
 from typing import Protocol
 
-from hapticbridge.arguments import is_number, shown
-from hapticbridge.errors import HapticBridgeError
+from hapticbridge.arguments import Rule, checked_value
 
 SPIN_NS = 150_000
 """Time in ns before a deadline that is spent spinning instead of sleeping. A sleeping thread wakes
@@ -28,17 +27,17 @@ LOWEST_RATE, HIGHEST_RATE = 1.0, 1e6
 between two ticks, and the clock's nanoseconds become too coarse."""
 
 
+RATE = Rule(unit="Hz", least=LOWEST_RATE, most=HIGHEST_RATE)
+"""Valid rates of a loop."""
+
+
 def period_of(rate: float) -> float:
     """Returns the period in s of a rate in Hz.
 
     Raises:
         HapticBridgeError: The rate is not 1 Hz to 1 MHz.
     """
-    if not is_number(rate) or not LOWEST_RATE <= rate <= HIGHEST_RATE:
-        raise HapticBridgeError(
-            f"rate is {shown(rate)} Hz; it must be {LOWEST_RATE:g} to {HIGHEST_RATE:g}"
-        )
-    return 1.0 / rate
+    return 1.0 / float(checked_value("rate", rate, (float,), RATE))
 
 
 class Clock(Protocol):

@@ -11,8 +11,8 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import Arguments, shown
+from hapticbridge.arguments import check_fields, rule_of, shared, shown
 from hapticbridge.certificate import StepCondition, assumed_damping
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import (
@@ -46,8 +46,6 @@ from hapticbridge.slow_scene import SlowScene
 LONGEST_LINE = 250
 """Largest size of a line in bytes; the longest command has about 170."""
 
-_ARGUMENTS = Arguments(CommandError)
-
 
 @dataclass(frozen=True, slots=True)
 class Couple:
@@ -59,26 +57,22 @@ class Couple:
         rotational_stiffness: Requested K_r in N m/rad, finite and >= 0; None keeps it.
         rotational_damping: Requested B_r in N m s/rad, finite and >= 0; None keeps it. Both
             rotational gains are given or neither, because their bound is a joint one.
+        grip: Grip of the hand; several hands need it, and None is the only hand.
 
     Raises:
         CommandError: A value is out of range.
     """
 
-    stiffness: float
-    damping: float
-    rotational_stiffness: float | None = None
-    rotational_damping: float | None = None
+    stiffness: float = shared(Coupling, "stiffness")
+    damping: float = shared(Coupling, "damping")
+    rotational_stiffness: float | None = shared(Coupling, "rotational_stiffness", None)
+    rotational_damping: float | None = shared(Coupling, "rotational_damping", None)
+    grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        _ARGUMENTS.number("stiffness", self.stiffness, "N/m", least=0.0, is_open=True)
-        _ARGUMENTS.number("damping", self.damping, "N s/m", least=0.0)
-        turning = self.rotational_stiffness, self.rotational_damping
-        if turning == (None, None):
-            return
-        if turning[0] is None or turning[1] is None:
+        check_fields(self, CommandError)
+        if (self.rotational_stiffness is None) != (self.rotational_damping is None):
             raise CommandError("give rotational stiffness and damping together, or neither")
-        _ARGUMENTS.number("rotational stiffness", turning[0], "N m/rad", least=0.0)
-        _ARGUMENTS.number("rotational damping", turning[1], "N m s/rad", least=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +82,7 @@ class Switch:
     Attributes:
         force: True enables force on the device.
         clutch: True lets the device move without the handle.
+        grip: Grip of the hand; None switches every hand.
 
     Raises:
         CommandError: A value is neither true nor false.
@@ -95,12 +90,10 @@ class Switch:
 
     force: bool | None = None
     clutch: bool | None = None
+    grip: str | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None and not isinstance(value, bool):
-                raise CommandError(f"{field.name} is {shown(value)}; it must be true or false")
+        check_fields(self, CommandError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +170,7 @@ def command_of(line: bytes) -> Command:
     try:
         return kind(**values)
     except TypeError:
-        valid = choices(field.name for field in fields(kind)) or "nothing else"
+        valid = choices(each.name for each in fields(kind)) or "nothing else"
         raise CommandError(f"command '{name}' takes {valid}, not {shown(values)}") from None
 
 
@@ -187,7 +180,8 @@ SOFTEST = 0.05
 """Smallest selectable stiffness as a share of the largest, without unit. A softer coupling no
 longer shows the hand where the tool is. A run that began softer may stay so."""
 
-UNITS = {"translation": ("N/m", "N s/m"), "rotation": ("N m/rad", "N m s/rad")}
+_GAINS = [rule_of(each).unit for each in fields(Coupling)]
+UNITS = {"translation": (_GAINS[0], _GAINS[1]), "rotation": (_GAINS[2], _GAINS[3])}
 """Units of stiffness and damping by kind of axis."""
 
 _PREFIX = {"translation": "", "rotation": "rotational "}
@@ -442,6 +436,11 @@ def tuning_ticks(period: float) -> int:
     return max(round(TUNING_TIME / period), 1)
 
 
+def concerns(event: Mapping[str, Any], parameters: RunParameters) -> bool:
+    """Returns True if an event is of a hand: it names the hand's grip, or none."""
+    return bool(event.get("grip", parameters.grip) == parameters.grip)
+
+
 def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling:
     """Returns the coupling of an event ``coupling``.
 
@@ -450,7 +449,7 @@ def coupling_in(event: Mapping[str, Any], parameters: RunParameters) -> Coupling
     """
     tick = event.get("tick")
     try:
-        coupling = Coupling(**{field.name: event.get(field.name) for field in fields(Coupling)})  # type: ignore[arg-type] # what is none is refused there
+        coupling = Coupling(**{each.name: event.get(each.name) for each in fields(Coupling)})  # type: ignore[arg-type] # what is none is refused there
     except HapticBridgeError as error:
         raise RecordingError(f"event 'coupling' at tick {tick!r} is damaged: {error}") from None
     if not parameters.has_law:
@@ -482,21 +481,21 @@ class EventApplier:
     """Applies events of commands and inputs to a live or simulated run.
 
     The loop applies the event that it records, so live run and re-simulation share one path.
-    ``start`` is the scene's state at the start (``run_description.start_state``), as bytes. A scene
-    slower than the loop takes part in a change before its next step.
+    ``hands`` holds kernel and parameters of each hand. ``start`` is the scene's state at the start
+    (``run_description.start_state``), as bytes. A scene slower than the loop takes part in a change
+    before its next step.
     """
 
     def __init__(
         self,
-        binding: BoundKernel,
+        hands: Sequence[tuple[BoundKernel, RunParameters]],
         data: mujoco.MjData,
         method: Method,
-        parameters: RunParameters,
         start: bytes,
         slow: SlowScene | None = None,
     ) -> None:
-        self._binding, self._data, self._slow = binding, data, slow
-        self._method, self._parameters, self._start = method, parameters, start
+        self._hands, self._data, self._slow = tuple(hands), data, slow
+        self._method, self._start = method, start
 
     def apply(self, event: Mapping[str, Any]) -> None:
         """Applies an event of ``CHANGES`` before the tick that it names.
@@ -504,22 +503,33 @@ class EventApplier:
         Raises:
             RecordingError: The event is damaged.
         """
-        kind, parameters = event.get("event"), self._parameters
-        if kind == "coupling":
-            coupling = coupling_in(event, parameters)
-            gains = self._method.gains(coupling, parameters.timestep)
-            goal = replace(parameters, coupling=coupling)
-            self._binding.tune(goal, gains, tuning_ticks(parameters.period))
-            if self._slow is not None:
-                of_scene = goal.of_scene
-                tune = partial(self._slow.bound.tune, of_scene, gains)
-                self._slow.queue_change(partial(tune, tuning_ticks(of_scene.period)))
-        elif kind == "switch":
-            self._binding.command(bits_in(event))
-        elif kind == "reset":
+        kind = event.get("event")
+        if kind == "reset":
             if not self._method.has_coupling:
                 raise RecordingError(f"event 'reset': method '{self._method.name}' has no reset")
             self._reset()
+            return
+        if kind not in CHANGES:
+            return
+        hands = [hand for hand in self._hands if concerns(event, hand[1])]
+        if len(hands) != 1:
+            raise RecordingError(
+                f"event '{kind}' at tick {event.get('tick')!r} is of grip "
+                f"{shown(event.get('grip'))}; it must be one of "
+                f"{choices(parameters.grip for _, parameters in self._hands)}"
+            )
+        [(bound, parameters)] = hands
+        if kind == "switch":
+            bound.command(bits_in(event))
+            return
+        coupling = coupling_in(event, parameters)
+        gains = self._method.gains(coupling, parameters.timestep)
+        goal = replace(parameters, coupling=coupling)
+        bound.tune(goal, gains, tuning_ticks(parameters.period))
+        if self._slow is not None:
+            of_scene = goal.of_scene
+            tune = partial(self._slow.bound.tune, of_scene, gains)
+            self._slow.queue_change(partial(tune, tuning_ticks(of_scene.period)))
 
     @property
     def is_idle(self) -> bool:
@@ -532,7 +542,8 @@ class EventApplier:
         restore_state(self._data.model, self._data, self._start)
         if self._slow is not None:
             self._slow.bound.handle_reset()
-        self._binding.handle_reset()
+        for bound, _ in self._hands:
+            bound.handle_reset()
 
     def write(self, writes: Sequence[Sequence[Any]]) -> None:
         """Applies the writes of an event ``input`` (``inputs.input_writes``).
@@ -568,24 +579,24 @@ class CommandQueue:
     atomically. The queue holds at most ``MAX_WAITING`` commands.
 
     Args:
-        limits: Limits of the coupling on the device.
+        limits: Limits of the coupling on each hand's device, by the hand's grip.
         is_recorded: True for a recorded run, which can be marked.
         now: Returns the time in s; it never runs backwards.
 
     Attributes:
-        limits: Limits of the coupling on the device.
+        limits: Limits of the coupling on each hand's device, by the hand's grip.
         now: Returns the time in s; a test may replace it.
         waiting: Commands in order, each with its origin.
     """
 
     def __init__(
         self,
-        limits: CouplingLimits,
+        limits: Mapping[str, CouplingLimits],
         *,
         is_recorded: bool = True,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.limits, self.now = limits, now
+        self.limits, self.now = dict(limits), now
         self.waiting: deque[tuple[Command | Repeat | Hold, str]] = deque(maxlen=MAX_WAITING)
         self._is_recorded = is_recorded
         self._offering = threading.Lock()  # never taken by the loop
@@ -600,9 +611,24 @@ class CommandQueue:
 
     def warm_up(self) -> None:
         """Computes the tables of limits in advance, so that the first command is not slow."""
-        if self.limits.method.has_law:
-            for span in self.limits.spans:
-                span.needed(span.min_stiffness, 0.0)
+        for limits in self.limits.values():
+            if limits.method.has_law:
+                for span in limits.spans:
+                    span.needed(span.min_stiffness, 0.0)
+
+    def grips_of(self, command: Couple | Switch) -> list[str]:
+        """Returns the grips of the hands that a command is for.
+
+        Raises:
+            CommandError: No hand holds its grip, or a coupling is for several hands.
+        """
+        grips = list(self.limits)
+        if command.grip is None and (len(grips) == 1 or isinstance(command, Switch)):
+            return grips
+        if command.grip not in grips:
+            named = "names no grip" if command.grip is None else f"has grip {shown(command.grip)}"
+            raise CommandError(f"the command {named}; it must be one of {choices(grips)}")
+        return [command.grip]
 
     def offer(self, command: Command, by: str) -> None:
         """Adds a command, or refuses it.
@@ -631,9 +657,12 @@ class CommandQueue:
             self.waiting.append((command, by))
 
     def _check(self, command: Command) -> None:
-        if isinstance(command, Couple):
-            self.limits.check(command)
-        elif isinstance(command, Reset) and not self.limits.method.has_coupling:
+        method = next(iter(self.limits.values())).method
+        if isinstance(command, Couple | Switch):
+            grips = self.grips_of(command)
+            if isinstance(command, Couple):
+                self.limits[grips[0]].check(command)
+        elif isinstance(command, Reset) and not method.has_coupling:
             raise CommandError("a massless tool follows the hand, so there is nothing to reset")
         elif isinstance(command, Mark) and not self._is_recorded:
             raise CommandError("this run is not recorded; start it with a recording to mark it")
@@ -654,17 +683,18 @@ class CommandExecutor:
         note: Records an event of the present tick: its name, then its details.
 
     Attributes:
-        requested: Requested coupling at the end of its present change.
+        requested: Requested coupling of each hand at the end of its present change, by grip.
         later: Postponed resets: tick and origin.
     """
 
     def __init__(
         self, queue: CommandQueue, applier: EventApplier, fade_ticks: int, note: NoteEvent
     ) -> None:
-        self.requested: Coupling = queue.limits.start
+        self.requested = {grip: limits.start for grip, limits in queue.limits.items()}
         self.later: deque[tuple[int, str]] = deque()
         self._queue, self._applier, self._fade_ticks, self._note = queue, applier, fade_ticks, note
-        self._has_force, self._is_clutched, self._is_held = True, False, False
+        self._has_force = dict.fromkeys(queue.limits, True)
+        self._is_clutched, self._is_held = dict.fromkeys(queue.limits, False), False
 
     def act(self, tick: int) -> None:
         """Executes the command that is due before a tick."""
@@ -678,17 +708,21 @@ class CommandExecutor:
             return
         command, by = self._queue.waiting.popleft()
         if isinstance(command, Couple):
-            limits = self._queue.limits
-            self.requested = limits.requested(command, self.requested)
-            law = asdict(limits.law(self.requested))
+            [grip] = self._queue.grips_of(command)
+            limits = self._queue.limits[grip]
+            requested = self.requested[grip] = limits.requested(command, self.requested[grip])
+            law = asdict(limits.law(requested))
             ticks = tuning_ticks(limits.loop.period)
-            self._apply({"event": "coupling", **law, "ticks": ticks, "by": by})
+            named = self._named(grip)
+            self._apply({"event": "coupling", **law, "ticks": ticks, "by": by, **named})
         elif isinstance(command, Switch):
-            if command.force is not None:
-                self._has_force = command.force
-            if command.clutch is not None:
-                self._is_clutched = command.clutch
-            self._switch(by)
+            grips = self._queue.grips_of(command)
+            for grip in grips:
+                if command.force is not None:
+                    self._has_force[grip] = command.force
+                if command.clutch is not None:
+                    self._is_clutched[grip] = command.clutch
+            self._switch(by, grips)
         elif isinstance(command, Reset):
             self.later.append((tick + self._fade_ticks + 1, by))
             self._switch(by, is_fading=True)
@@ -701,11 +735,19 @@ class CommandExecutor:
             for event in command.events:
                 self._apply({n: v for n, v in event.items() if n not in ("tick", "time_ns")})
 
-    def _switch(self, by: str, *, is_fading: bool = False) -> None:
-        force = self._has_force and not is_fading and not self._is_held
-        event = {"event": "switch", "force": force, "clutch": self._is_clutched, "by": by}
-        # a force that fades for a moment only was not switched off by a command
-        self._apply(event | ({"fading": True} if is_fading else {}))
+    def _named(self, grip: str) -> dict[str, str]:
+        """Returns what names one of several hands in an event; nothing for the only hand."""
+        return {"grip": grip} if len(self.requested) > 1 else {}
+
+    def _switch(
+        self, by: str, grips: Iterable[str] | None = None, *, is_fading: bool = False
+    ) -> None:
+        for grip in self.requested if grips is None else grips:
+            force = self._has_force[grip] and not is_fading and not self._is_held
+            clutch = self._is_clutched[grip]
+            event = {"event": "switch", "force": force, "clutch": clutch, "by": by}
+            # a force that fades for a moment only was not switched off by a command
+            self._apply(event | self._named(grip) | ({"fading": True} if is_fading else {}))
 
     def _apply(self, event: dict[str, Any]) -> None:
         self._applier.apply(event)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import check_fields, is_number, option, rule
 from hapticbridge.errors import CouplingError, choices
 
 SQUARED_LEVER = 1e-3
@@ -32,10 +31,15 @@ class Coupling:
     the period in s. The rotational spring is convex for |φ| < π; beyond, it jumps.
 
     Attributes:
-        stiffness: K in N/m, finite and > 0.
-        damping: B in N s/m, finite and >= 0.
-        rotational_stiffness: K_r in N m/rad, finite and >= 0; by default ℓ² K.
-        rotational_damping: B_r in N m s/rad, finite and >= 0; by default ℓ² B.
+        stiffness: Stiffness K of the coupling in N/m. A run without it takes the stiffest that
+            leaves 15 % of the device's damping unused.
+        damping: Damping B of the coupling in N s/m, as requested. The law uses B - KT/2 with
+            'lossless', B - KT with 'compensated', at least 0; B with all others. The device needs
+            b >= KT/2 + B_law.
+        rotational_stiffness: Rotational stiffness K_r in N m/rad; by default that of the coupling's
+            springs at a distance of 32 mm around the grip.
+        rotational_damping: Rotational damping B_r in N m s/rad; by default that of its dampers at
+            this distance.
 
     The defaults are those of the translational springs and dampers at a distance ℓ around the grip
     (``SQUARED_LEVER``). On a device without torque they are never sent: they only hold the tool at
@@ -49,29 +53,19 @@ class Coupling:
         Brown & Colgate 1997, eq. (4) (backward difference).
     """
 
-    stiffness: float
-    damping: float
-    rotational_stiffness: float = _DERIVED
-    rotational_damping: float = _DERIVED
+    stiffness: float = field(metadata=rule(unit="N/m", least=0.0, is_open=True))
+    damping: float = field(metadata=rule(unit="N s/m", least=0.0))
+    rotational_stiffness: float = option(_DERIVED, unit="N m/rad", least=0.0)
+    rotational_damping: float = option(_DERIVED, unit="N m s/rad", least=0.0)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is _DERIVED:
-                translational = getattr(self, field.name.removeprefix("rotational_"))
-                object.__setattr__(self, field.name, SQUARED_LEVER * translational)
-                continue
-            name = field.name.replace("_", " ")
-            if not is_number(value) or not math.isfinite(value):
-                raise CouplingError(
-                    f"coupling {name} is {shown(value)}; it must be a finite number"
-                )
-            if value < 0:
-                raise CouplingError(f"coupling {name} is {value:g}; it must be >= 0")
-            # as a recording stores it: MuJoCo gets −B, and −0 is another bit pattern than −0.0
-            object.__setattr__(self, field.name, float(value))
-        if self.stiffness == 0:
-            raise CouplingError("coupling stiffness is 0 N/m; it must be > 0")
+        for name in ("rotational_stiffness", "rotational_damping"):
+            if getattr(self, name) is _DERIVED:
+                own = getattr(self, name.removeprefix("rotational_"))
+                derived = SQUARED_LEVER * own if is_number(own) else 0.0
+                object.__setattr__(self, name, derived)
+        # as floats, because MuJoCo gets −B, and −0 is another bit pattern than −0.0
+        check_fields(self, CouplingError, "coupling ")
 
     def with_gains(self, gains: Mapping[str, float]) -> Coupling:
         """Returns the coupling with other gains by name.
@@ -79,7 +73,7 @@ class Coupling:
         Raises:
             CouplingError: A name is no gain, or a value out of range.
         """
-        names = [field.name for field in fields(self)]
+        names = [each.name for each in fields(self)]
         if unknown := gains.keys() - names:
             raise CouplingError(
                 f"a coupling has no gain {choices(unknown)}; its gains: {choices(names)}"

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import json
 import math
-import types
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from functools import cache
 from numbers import Integral, Real
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import is_number, members, shown, types_of
 from hapticbridge.errors import HapticBridgeError, RecordingError, choices
 from hapticbridge.files import read_json
 
@@ -74,18 +72,11 @@ def _plain(value: Any) -> Any:
 _INFINITE = ("inf", "-inf")
 
 
-@cache
-def _types(kind: type[Any]) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
-
-
 def _value(kind: Any, value: Any, name: str) -> Any:
     """Returns a JSON value as an object of a type; ``name`` is the value's for messages."""
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _value(arguments[1], value, name)
-    if origin in (Union, types.UnionType):
-        return _member(arguments, value, name)
+    kinds, origin, arguments = members(kind), get_origin(kind), get_args(kind)
+    if kinds != (kind,):
+        return _member(kinds, value, name)
     if not _is_form(kind, value):
         raise HapticBridgeError(f"{name} is {shown(value)}; it must be {_words(kind)}")
     if is_dataclass(kind):
@@ -120,11 +111,9 @@ _WORDS: dict[Any, str] = {
 
 
 def _words(kind: Any) -> str:
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _words(arguments[1])
+    origin = get_origin(kind)
     if origin is Literal:
-        return choices(map(repr, arguments))
+        return choices(get_args(kind))
     return _WORDS.get(origin or kind, "an object")
 
 
@@ -139,8 +128,6 @@ def _is_form(kind: Any, value: Any) -> bool:
         return isinstance(value, list)
     if origin is Mapping or is_dataclass(kind):
         return isinstance(value, dict)
-    if origin is Annotated:
-        return _is_form(get_args(kind)[1], value)
     return type(value) is kind
 
 
@@ -149,7 +136,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _object(kind: Any, value: dict[str, Any], name: str) -> Any:
-    known = _types(kind)
+    known = types_of(kind)
     names = [field.name for field in fields(kind)]
     for words, wrong in (("unknown fields", value.keys() - names), ("no", names - value.keys())):
         if wrong:

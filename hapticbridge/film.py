@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 from hapticbridge import jit
-from hapticbridge.arguments import Arguments
+from hapticbridge.arguments import check_fields, option
 from hapticbridge.confinement import MEMORY, Confined, ForeignSceneError, Fresh, Work, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import install_command
@@ -68,49 +68,47 @@ class Shot:
     """Time, camera and size of a picture or a film.
 
     Attributes:
-        at: Time of a picture in s from the start of the run; None for the last tick.
-        start: Time in the run at which a film begins, in s.
-        stop: Time in the run at which a film ends, in s; None for the end of the run.
-        speed: Speed of a film relative to the run, 0.001 to 1000: at 0.1 a second takes ten.
-        camera: Name of a camera of the scene; None for the free one, as the scene's file sets it.
-        width: Pixels, 16 to 4096 and even.
-        height: Pixels, 16 to 4096 and even.
-        fps: Frames per second of a film, 1 to 120.
+        at: Time of a picture in s from the start of the run. By default 'hapticbridge render' takes
+            that of the largest force; None is the last tick.
+        start: Start of a film in s of the run.
+        stop: End of a film in s of the run; by default the run's end.
+        speed: Speed of a film: 0.1 shows a second of the run in ten.
+        camera: A camera of the scene, by name; by default the free one, as the scene's file sets
+            it.
+        width: Width in pixels, even.
+        height: Height in pixels, even.
+        fps: Frames per second of a film.
 
     Raises:
         HapticBridgeError: A value is out of range.
     """
 
-    at: float | None = None
-    start: float = 0.0
-    stop: float | None = None
-    speed: float = 1.0
+    at: float | None = option(None, unit="s", least=0.0)
+    start: float = option(0.0, unit="s", least=0.0)
+    stop: float | None = option(None, unit="s", least=0.0)
+    speed: float = option(1.0, least=0.001, most=1000.0)
     camera: str | None = None
-    width: int = 800
-    height: int = 600
-    fps: int = 30
+    width: int = option(800, unit="pixels", least=16, most=MAX_PIXELS)
+    height: int = option(600, unit="pixels", least=16, most=MAX_PIXELS)
+    fps: int = option(30, least=1, most=120)
 
     def __post_init__(self) -> None:
-        check = Arguments(HapticBridgeError)
-        for name in ("width", "height"):
-            side = check.whole(name, getattr(self, name), least=16, most=MAX_PIXELS)
+        check_fields(self)
+        for name, side in (("width", self.width), ("height", self.height)):
             if side % 2:
                 raise HapticBridgeError(f"{name} is {side} pixels; films need an even number")
-        check.whole("fps", self.fps, least=1, most=120)
-        if self.at is not None:
-            check.number("time", self.at, "s", least=0.0)
-        check.number("start", self.start, "s", least=0.0)
-        if self.stop is not None:
-            check.number("stop", self.stop, "s", least=0.0)
-            if self.stop <= self.start:
-                raise HapticBridgeError(f"stop is {self.stop:g} s, not after {self.start:g} s")
-        check.number("speed", self.speed, "", least=0.001, most=1000.0)
+        if self.stop is not None and self.stop <= self.start:
+            raise HapticBridgeError(f"stop is {self.stop:g} s, not after {self.start:g} s")
 
     @property
     def is_of_film(self) -> bool:
         """True if a value is set that applies to films only."""
         is_timed = bool(self.start) or self.stop is not None or self.speed != 1.0
-        return is_timed or self.fps != Shot().fps
+        return is_timed or self.fps != USUAL_SHOT.fps
+
+
+USUAL_SHOT = Shot()
+"""Shot without choices of the user."""
 
 
 def draw(
@@ -290,7 +288,7 @@ class _Child:
 # Work of the child
 
 
-def _load(draws: bool, code: tuple[str, str, bool, bool]) -> None:
+def _load(draws: bool, code: tuple[str, str, bool]) -> None:
     """Loads the renderer, if the work draws, and machine code."""
     if draws:
         from mujoco.rendering.classic.gl_context import GLContext  # noqa: PLC0415 - if it draws

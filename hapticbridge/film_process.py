@@ -13,7 +13,7 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.replay import Resimulator, obstacle
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
-from hapticbridge.kernel.codes import JOINT, held_body
+from hapticbridge.kernel.codes import held_body
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import Timeline, force_on_hand
 from hapticbridge.recording import RecordingFile
@@ -160,7 +160,7 @@ class Stage:
             *(
                 peak_forces(block, own.axes)
                 for each, own in zip(hands, self._hands, strict=True)
-                if not own.grip.startswith(JOINT)
+                if not own.is_joint
                 for block in each.blocks()
             ),
             strict=True,
@@ -238,13 +238,12 @@ class Stage:
     @property
     def other_grips(self) -> tuple[str, ...]:
         """Grips of the further hands; a joint has no place in the scene."""
-        grips = (own.grip for own in self._hands[1:])
-        return tuple(grip for grip in grips if not grip.startswith(JOINT))
+        return tuple(own.grip for own in self._hands[1:] if not own.is_joint)
 
     def others(self) -> Iterator[tuple[NDArray[np.void], NDArray[np.float64]]]:
         """Yields the record (1,) of each further hand, and the force on it in N, (3,)."""
         for hand, own in enumerate(self._hands[1:], 1):
-            if not own.grip.startswith(JOINT):
+            if not own.is_joint:
                 yield self.rows[hand : hand + 1], self._force_on(hand)
 
     def contacts(self) -> NDArray[np.float64]:
@@ -267,7 +266,7 @@ class Stage:
         A joint that is held has no handle in the scene.
         """
         for hand, own in enumerate(self._hands):
-            if not own.grip.startswith(JOINT):
+            if not own.is_joint:
                 self._add_coupling_of(hand, scene)
 
     def _add_coupling_of(self, hand: int, scene: mujoco.MjvScene) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import check_fields, option, unit_of
 from hapticbridge.certificate import assumed_damping
 from hapticbridge.clock import Clock, RealClock, SimulatedClock
 from hapticbridge.device import AXES, Device, DeviceInfo
@@ -28,7 +29,7 @@ from hapticbridge.kernel.codes import (
     WARNINGS,
 )
 from hapticbridge.kernel.handle import stretch_at
-from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, MAX_BUTTONS, OFF, GuardParameters
+from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, OFF, GuardParameters
 from hapticbridge.kernel.tick_guard import FARTHEST
 from hapticbridge.loop_setting import IN_TIME, Lag
 from hapticbridge.units import format_energy
@@ -61,68 +62,54 @@ blow. Detection takes one tick; with the work of 10 N at 1 m/s in it, the sum st
 Scenes whose motors push the hand need more."""
 
 
+def _limit(default: float | None, unit: str, **values: str) -> Any:
+    return option(default, unit=unit, least=0.0, is_open=True, is_finite=False, **values)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
     """Limits of the wrench and of the run.
 
     Attributes:
-        force: Largest norm of the force in N, > 0; a larger force keeps its direction. The tool
-            gets no more than it either (``kernel.force_level``).
-        torque: Largest norm of the torque in N m, > 0.
+        force: Largest force on the device in N, by default the device's own; a larger force keeps
+            its direction. The tool gets no more than it either.
+        torque: Largest torque on the device in N m, by default the device's own.
         hold_force: Largest force in N with which the coupling holds the tool along axes that the
-            device lacks, > 0; beyond it the handle slips. The tool's own weight comes on top.
-        hold_torque: Largest torque in N m about axes that the device lacks, > 0.
-        ramp: Time in s of the linear rise at the start, 0 to 60. The handle follows the device by
-            the share of the force that is sent. None takes 0.5 s on a real device, and 0 on a
-            simulated one, whose hand a sudden force does not surprise.
-        stretch: Largest distance between handle and grip divided by the scale, in m, > 0. Beyond
-            this and the next two limits the run is stopped.
-        angle: Largest angle between handle and grip in rad, > 0 and < π, or inf.
-        energy: Largest energy in J given to the device beyond the hand's own work, > 0.
-        reach: Largest distance in m of the device from the origin of its frame, the middle of its
-            workspace, > 0. inf means no limit, None the device's own if known. Beyond it the device
-            moves without handle and force, as with a clutch; the run goes on.
+            device lacks; beyond it the handle slips. The tool's own weight comes on top.
+        hold_torque: Largest torque in N m with which the tool keeps its orientation where the
+            device cannot turn it.
+        ramp: Time in s over which the force rises at the start, and the handle begins to follow
+            the device. By default 0.5 on a real device, and 0 on a simulated one, whose hand a
+            sudden force does not surprise.
+        stretch: Largest distance between handle and tool divided by the scale, in m; beyond it the
+            run is stopped.
+        angle: Largest angle between handle and tool in rad, below pi; beyond it the run is stopped.
+        energy: Largest energy in J that the hand may get beyond what it put in. A wrench that would
+            pass it is not sent and the run is stopped. inf for scenes whose motors are meant to
+            push the hand.
+        reach: Largest distance in m of the device from the middle of its workspace; beyond it the
+            device moves without handle and force, and the run goes on. By default the reach of its
+            data sheet, else inf. A smaller limit keeps force away from its mechanical stops.
 
     Raises:
-        DeviceError: A value is not finite or out of range.
+        DeviceError: A value is out of range.
     """
 
-    force: float
-    torque: float
-    hold_force: float = USUAL_HOLD_FORCE
-    hold_torque: float = USUAL_HOLD_TORQUE
-    ramp: float | None = None
-    stretch: float = USUAL_STRETCH
-    angle: float = USUAL_ANGLE
-    energy: float = USUAL_ENERGY
-    reach: float | None = None
+    force: float = _limit(math.inf, "N", flag="force-limit")
+    torque: float = _limit(math.inf, "N m", flag="torque-limit")
+    hold_force: float = _limit(USUAL_HOLD_FORCE, "N")
+    hold_torque: float = _limit(USUAL_HOLD_TORQUE, "N m")
+    ramp: float | None = option(None, unit="s", least=0.0, most=LONGEST_RAMP)
+    stretch: float = _limit(USUAL_STRETCH, "m", flag="stretch-limit")
+    angle: float = _limit(USUAL_ANGLE, "rad", flag="angle-limit")
+    energy: float = _limit(USUAL_ENERGY, "J", flag="energy-limit")
+    reach: float | None = _limit(None, "m", flag="reach-limit")
 
     def __post_init__(self) -> None:
-        for name, unit in (("force", "N"), ("torque", "N m")):
-            value = getattr(self, name)
-            if not is_number(value) or not 0 < value < math.inf:
-                raise DeviceError(
-                    f"{name} limit is {shown(value)} {unit}; it must be finite and > 0"
-                )
-        ramp = 0.0 if self.ramp is None else self.ramp
-        if not is_number(ramp) or not 0 <= ramp <= LONGEST_RAMP:
-            raise DeviceError(f"start ramp is {shown(ramp)} s; it must be 0 to {LONGEST_RAMP:g}")
-        for name, unit in (
-            ("stretch", "m"),
-            ("energy", "J"),
-            ("reach", "m"),
-            ("hold_force", "N"),
-            ("hold_torque", "N m"),
-        ):
-            value = getattr(self, name)
-            if value is not None and not (is_number(value) and value > 0):
-                words = name.replace("_", " ")
-                raise DeviceError(
-                    f"{words} limit is {shown(value)} {unit}; it must be > 0, inf for none"
-                )
-        if not is_number(self.angle) or not (0 < self.angle < math.pi or self.angle == math.inf):
+        check_fields(self, DeviceError)
+        if math.pi <= self.angle < math.inf:
             raise DeviceError(
-                f"angle limit is {shown(self.angle)} rad; it must be > 0 and < pi, inf for none"
+                f"angle limit is {self.angle:g} rad; it must be > 0 and < pi, inf for none"
             )
 
     def reach_of(self, info: DeviceInfo) -> float:
@@ -148,24 +135,27 @@ UNLIMITED = Limits(
 """No limits, for simulations without a device; no finite force comes near."""
 
 
-def limits_for(info: DeviceInfo, limits: Limits | None) -> Limits:
-    """Returns the requested limits of a run, or else the device's own.
+DEVICE_LIMITS = Limits()
+"""Limits of the device's own."""
+
+
+def limits_for(info: DeviceInfo, limits: Limits) -> Limits:
+    """Returns the requested limits of a run, with the device's own force and torque where none are.
 
     Raises:
         DeviceError: A requested limit exceeds the device's. Any limit is accepted for a prescribed
             motion, which has no hand.
     """
-    if limits is None:
-        return Limits(force=info.force_limit, torque=info.torque_limit)
-    own = {"force": (info.force_limit, "N"), "torque": (info.torque_limit, "N m")}
-    for name, (most, unit) in own.items():
-        requested = getattr(limits, name)
-        if requested > most and not info.is_prescribed:
+    chosen = {}
+    for name, most in (("force", info.force_limit), ("torque", info.torque_limit)):
+        requested, unit = getattr(limits, name), unit_of(Limits, name)
+        chosen[name] = most if requested == math.inf else requested
+        if chosen[name] > most and not info.is_prescribed:
             raise DeviceError(
                 f"{name} limit is {requested:g} {unit}; the device '{info.name}' bears "
                 f"{most:g} {unit}"
             )
-    return limits
+    return replace(limits, **chosen)
 
 
 # Checks before force is enabled
@@ -433,19 +423,9 @@ FASTEST_TURN = 300.0
 tick of 1 kHz is 3000."""
 
 
-def button_mask(button: int | None, what: str) -> int:
-    """Returns the bit of a button; 0 for None.
-
-    ``what`` names the button's purpose for the message.
-
-    Raises:
-        DeviceError: The number is out of range.
-    """
-    if button is None:
-        return 0
-    if isinstance(button, bool) or not isinstance(button, int) or not 0 <= button < MAX_BUTTONS:
-        raise DeviceError(f"{what} button is {button!r}; it must be 0 to {MAX_BUTTONS - 1}")
-    return 1 << button
+def button_mask(button: int | None) -> int:
+    """Returns the bit of a button; 0 for None."""
+    return 0 if button is None else 1 << button
 
 
 def _twist_damping(info: DeviceInfo, period: float) -> float:

@@ -1,6 +1,6 @@
 """Several hands in one scene: what each holds, with which device, and their devices as one.
 
-``kernel.hands`` is the arithmetic of their tick, ``session`` runs it.
+``kernel.tick`` is the arithmetic of their tick, ``session`` runs it.
 """
 
 from __future__ import annotations
@@ -8,23 +8,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import check_fields, option, rule, shared
 from hapticbridge.clock import Clock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import Device, DeviceInfo
 from hapticbridge.device.base import checked_close, checked_read, checked_start, checked_write
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
-from hapticbridge.guard import Limits, limits_for
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.options import AUTO, BridgeOptions, RunSetup, Workspace, device_for_run
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.rendering import METHODS, method_named
 from hapticbridge.scene import Scene, load_scene
 
 
@@ -38,9 +39,12 @@ class GripAxis:
     or torque on the joint, F the force on the fingers in N.
 
     Attributes:
-        joint: Name of a hinge or slide of the scene.
-        scale: Joint motion per motion of the grip, in rad/m or without unit, not 0; below 0 a joint
-            that falls while the grip closes. None maps the grip's travel to the joint's range.
+        joint: Hinge or slide of the scene that the device's grip axis moves, as the jaw of pliers.
+            By default 'hapticbridge run' takes the one that the scene names in its custom text
+            'grip_axis'; 'none' leaves it free.
+        scale: Motion of that joint per motion of the grip, in rad/m or without unit, not 0; below 0
+            for a joint that falls while the grip closes. By default the joint's range over the
+            grip's travel.
         coupling: Gains of the coupling to the joint, or some of them by name, in N m/rad and
             N m s/rad for a hinge; None selects the stiffest that is safe.
 
@@ -48,16 +52,14 @@ class GripAxis:
         HapticBridgeError: The joint is not a text, or the scale out of range.
     """
 
-    joint: str
-    scale: float | None = None
+    joint: str = field(metadata=rule(is_filled=True))
+    scale: float | None = option(None)
     coupling: Coupling | Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.joint, str) or not self.joint:
-            raise HapticBridgeError(f"joint is {shown(self.joint)}; it must name a joint")
-        scale = 1.0 if self.scale is None else self.scale
-        if not is_number(scale) or scale == 0.0 or not math.isfinite(scale):
-            raise HapticBridgeError(f"scale is {shown(scale)}; it must be finite and not 0")
+        check_fields(self)
+        if self.scale == 0.0:
+            raise HapticBridgeError("scale is 0.0; it must be finite and not 0")
 
     def workspace(self, scene: Scene, info: DeviceInfo) -> Workspace:
         """Returns the map from the grip to the joint.
@@ -89,13 +91,17 @@ class Grasp:
     """A grip of the scene that one of several hands holds, with its own device.
 
     Attributes:
-        grip: Site, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``, as for ``load_scene``; different in
-            every hand, and no joint in the first.
-        device: An open device, or a string for ``open_device``. A simulated one follows
-            ``SCENE_GRIP.csv`` beside the scene, if there is such a file.
+        grip: Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m
+            in the body's frame; or joint:NAME. If the scene has none of that name, the most
+            plausible ones are listed. Several hands differ, and the first holds no joint.
+        device: 'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1',
+            'trajectory:FILE' (CSV or recording), 'mouse' (drag the handle in the view, which it
+            shows by itself), or a device from the list of 'hapticbridge devices'. In code an open
+            device, too. A simulated one of several follows SCENE_GRIP.csv beside the scene, if
+            there is such a file.
         coupling: As for ``Bridge``, for this hand.
         workspace: Map from this device's frame to the scene's; None takes that of the options.
-        limits: Limits of this hand; None takes those of the options, or else the device's own.
+        limits: Limits of this hand; None takes those of the options.
         clutch: Number of this device's button, from 0, that lets it move without the handle.
         dead_man: Number of this device's button, from 0, that must be held for any force on it.
         grip_axis: Joint that the device's grip axis moves; None leaves the axis without force.
@@ -104,25 +110,24 @@ class Grasp:
         HapticBridgeError: The grip is not a text.
     """
 
-    grip: str
+    grip: str = field(metadata=rule(is_filled=True))
     device: Annotated[Device | str, str] = "simulated"
     _: KW_ONLY
     coupling: Coupling | Mapping[str, float] | None = None
     workspace: Workspace | None = None
     limits: Limits | None = None
-    clutch: int | None = None
-    dead_man: int | None = None
+    clutch: int | None = shared(BridgeOptions, "clutch")
+    dead_man: int | None = shared(BridgeOptions, "dead_man")
     grip_axis: GripAxis | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.grip, str) or not self.grip:
-            raise HapticBridgeError(f"grip is {shown(self.grip)}; it must name a site or a body")
+        check_fields(self)
 
     @property
     def grips(self) -> tuple[str, ...]:
         """The grips of the device, one or, with a grip axis, two."""
         axis = self.grip_axis
-        return (self.grip,) if axis is None else (self.grip, f"{JOINT}{axis.joint}")
+        return (self.grip,) if axis is None else (self.grip, str(Grip(axis.joint, "joint")))
 
 
 def check_grasps(grasps: Sequence[Grasp]) -> tuple[str, ...]:
@@ -225,9 +230,10 @@ def resolve_hands(
                 "leave it out"
             )
         # a hand that closes the grip to its stop must not lose the joint there
-        axis, of_axis = info.grip_axis, limits_for(info.grip_axis, None)
-        limits = replace(of_axis if own.limits is None else own.limits, reach=math.inf)
-        limits = replace(limits, force=of_axis.force, torque=of_axis.torque)
+        axis, limits = (
+            info.grip_axis,
+            replace(own.limits, reach=math.inf, force=math.inf, torque=math.inf),
+        )
         workspace = grasp.grip_axis.workspace(scene.of_hand(len(setups)), axis)
         own = replace(own, workspace=workspace, limits=limits)
         resolve(axis, grasp.grip_axis.coupling, own)
@@ -250,14 +256,19 @@ def _workspace_of_joint(grasp: Grasp, options: BridgeOptions) -> Workspace:
     return grasp.workspace
 
 
+def _methods() -> list[str]:
+    """Returns the names of the methods that several hands may have."""
+    return [name for name, method in METHODS.items() if method.scheme.properties.allows_hands]
+
+
 def _refuse_unsuited(options: BridgeOptions) -> None:
     """Refuses options that several hands cannot have."""
     for is_chosen, sentence in (
         (
-            options.method not in ("implicit", "compensated"),
-            f"method '{options.method}' has one hand; several need 'implicit' or 'compensated'",
+            not method_named(options.method or "").scheme.properties.allows_hands,
+            f"method '{options.method}' has one hand; several need one of {choices(_methods())}",
         ),
-        (options.substeps != 1, f"several hands take one substep, not {options.substeps}"),
+        ((options.substeps or 1) != 1, f"several hands take one substep, not {options.substeps}"),
         (
             options.scene_rate != AUTO and options.scene_ticks,
             f"the scene steps in every tick for several hands, not at {options.scene_rate} Hz",

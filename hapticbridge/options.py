@@ -10,16 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, TypedDict, cast
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import check_fields, is_number, option, shown
 from hapticbridge.certificate import default_coupling
-from hapticbridge.check.physics import site_inertia
-from hapticbridge.clock import Clock, RealClock, period_of
+from hapticbridge.clock import RATE, Clock, RealClock, period_of
 from hapticbridge.commands import CouplingLimits
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, Device, DeviceInfo, device_for
@@ -30,10 +29,9 @@ from hapticbridge.errors import (
     HapticBridgeError,
     RecordingError,
     SceneError,
-    choices,
 )
 from hapticbridge.guard import (
-    CONTROLLERS,
+    DEVICE_LIMITS,
     UNLIMITED,
     Limits,
     button_mask,
@@ -42,12 +40,13 @@ from hapticbridge.guard import (
     refuse_simulated_time,
 )
 from hapticbridge.kernel.parameters import (
+    MAX_BUTTONS,
     MAX_SCENE_TICKS,
     SAME_AXES,
+    SUBSTEPS,
     UNGUARDED,
     GuardParameters,
     RunParameters,
-    checked_substeps,
     refuse_scene_ticks,
     refuse_substeps,
     rotation_numbers,
@@ -57,6 +56,7 @@ from hapticbridge.pose import IDENTITY_POSE
 from hapticbridge.realtime import busy_step_time, scene_ticks_for, wants_real_time
 from hapticbridge.rehearsal import TIPPED, holding_force, start_handle, static_load, toppling_force
 from hapticbridge.rendering import (
+    Contact,
     Method,
     default_method,
     method_named,
@@ -64,6 +64,7 @@ from hapticbridge.rendering import (
     resolve_contact_stiffness,
 )
 from hapticbridge.scene import Scene
+from hapticbridge.scene.physics import site_inertia
 
 # Options of a user
 
@@ -78,29 +79,24 @@ class Workspace:
     device in N. p_0 is the device's start and h_0 the grip's; with absolute poses both are zero.
 
     Attributes:
-        scale: Handle motion per device motion, without unit, finite and > 0.
-        force_scale: Force on the device per force on the tool, without unit, finite and > 0. None
-            takes ``scale``, which keeps power equal on both sides.
-        axes: Rotation A from the device's axes to the scene's: 3 × 3, or 9 numbers row by row.
-        absolute: True takes the device's poses as poses in the scene instead of relative to its
-            start.
+        scale: Handle motion per device motion.
+        force_scale: Force on the device per force on the tool. By default equal to the scale, which
+            keeps power equal on both sides.
+        axes: Rotation from the device's axes to the scene's: 9 numbers, row by row.
+        absolute: Take the device's poses as poses in the scene instead of relative to its start.
 
     Raises:
         HapticBridgeError: A scale is out of range, or the axes are not a right-handed rotation.
     """
 
-    scale: float = 1.0
-    force_scale: float | None = None
+    scale: float = option(1.0, least=0.0, is_open=True)
+    force_scale: float | None = option(None, least=0.0, is_open=True)
     axes: Annotated[ArrayLike, tuple[float, ...]] = SAME_AXES
     absolute: bool = False
 
     def __post_init__(self) -> None:
-        for name, value in zip(("scale", "force scale"), self.scales, strict=True):
-            if not is_number(value) or not 0 < value < math.inf:
-                raise HapticBridgeError(f"{name} is {shown(value)}; it must be finite and > 0")
+        check_fields(self)
         object.__setattr__(self, "axes", rotation_numbers(self.axes))
-        if not isinstance(self.absolute, bool):
-            raise HapticBridgeError(f"absolute is {shown(self.absolute)}; it must be True or False")
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -117,25 +113,12 @@ SAME_FRAME = Workspace()
 """Workspace with equal axes and scales; the device starts at the grip."""
 
 
-_FLAG, _FLAG_OR_NONE, _NAME = bool, bool | None, str | None
-_WORDS: dict[Any, str] = {
-    _FLAG: "True or False",
-    _FLAG_OR_NONE: "True, False or None",
-    _NAME: "a name, or None for the default",
-    Workspace: "a Workspace",
-    Limits | None: "Limits, or None for the device's own",
-}
-_KINDS: dict[str, Any] = {
-    **dict.fromkeys(("i_know", "tool_weight", "live"), _FLAG),
-    **dict.fromkeys(("realtime", "pipelined"), _FLAG_OR_NONE),
-    **dict.fromkeys(("method", "contact", "controller"), _NAME),
-    "workspace": Workspace,
-    "limits": Limits | None,
-}
-
-
 AUTO: Literal["auto"] = "auto"
 """Rate of the scene that is chosen by what its step takes."""
+
+
+def _button() -> Any:
+    return option(None, least=0, most=MAX_BUTTONS - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,80 +126,75 @@ class BridgeOptions:
     """Options of a bridge; the defaults suit a device with known damping.
 
     Attributes:
-        rate: Ticks per second in Hz, 1 to 1e6.
-        substeps: MuJoCo steps per tick, 1 to 100. With more than one, the device receives the mean
-            of their wrenches and needs another damping (``loop_setting.required_damping``). For a
-            slower scene they are the steps between two of its results.
-        scene_rate: Results of the scene per second in Hz. Below ``rate`` the scene steps in a
-            thread of its own, and the tool is shown between its results (``slow_scene``). The scene
-            then has the nearest period of whole ticks. "auto" steps it in every tick if it can keep
-            the rate on a real clock, measured at its start, else as fast as it can.
-        method: Name of the rendering method (``rendering.METHODS``). None selects ``lossless``, or
-            ``implicit`` with substeps, because ``lossless`` takes none.
-        contact: ``rigid``, strictly passive contacts at the level of velocities
-            (``kernel.rigid_contact``), or ``scene``, MuJoCo's contacts with the settings of the
-            MJCF. None is rigid for every method that can.
-        contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's stiffness.
-        i_know: True accepts a hazardous method (``Method.hazard``) on a real device.
+        rate: Ticks per second.
+        substeps: MuJoCo steps per tick; with more than one, the mean of their wrenches is sent, and
+            the device needs another damping. For a slower scene they are the steps between two of
+            its results. By default one; 'hapticbridge run' takes as many as keep the file's own
+            time step if it is shorter and the scene alone would move noticeably differently.
+        scene_rate: Results of the scene per second. Below the rate the scene steps in a thread of
+            its own, and the tool is shown between its results, passively; its period is then the
+            nearest one of whole ticks. 'auto' steps it in every tick if it can keep the rate on a
+            real clock, measured at its start, else as often as it can.
+        method: Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's
+            step, half carried over; second order away from contact. 'implicit', the default with
+            substeps: all of the coupling inside the step, which adds K T to the damping.
+            'compensated': 'implicit' with the added K T subtracted from the coupling's damping. Or
+            a method that exists to be compared, such as 'explicit', 'weld' or 'direct' (a tool
+            without mass); an unknown name lists them.
+        contact: Contacts. 'rigid', the default: strictly passive, sharp, with Coulomb friction in
+            an elliptic cone. 'scene': MuJoCo's contacts with the settings of the MJCF, as methods
+            for comparison have them.
+        contact_stiffness: Stiffness per contact of method 'direct'; by default that of the
+            coupling.
+        i_know: Accept a method that may kick on a real device. The first three never need it.
         workspace: Map from the device's frame to the scene's.
-        limits: Limits of the wrench and of the run; None takes the device's own.
-        controller: Passivity controller. ``damper`` acts when the device was given more than its
-            damping dissipates and the scene released. ``environment`` acts when the scene
-            created more than the coupling's slack. ``off`` never acts. None selects ``damper`` if
-            the device condition does not hold, else ``environment``.
-        clutch: Number of the device's button, from 0, that lets it move without the handle.
-        dead_man: Number of the button, from 0, that must be held for any force.
-        mark: Number of the button, from 0, that writes an event ``mark`` at each press.
-        tool_weight: True lets the hand feel the tool's weight, unless the device cannot hold it
-            (``RunSetup.holding``). False carries it (``Scene.carry_tool``).
-        realtime: True requests real time from the system while the loop runs. A refused request is
-            reported once, with the command that grants it. None requests it for a real device.
-        pipelined: True computes ahead, after the wrench was sent, what needs no new sample
-            (``kernel.tick.can_split``). The numbers are equal to the bit, the wrench is sent
-            sooner, and the whole tick takes 5 % longer. Between two ticks ``Scene.data`` then holds
-            the contacts of the new positions, without forces. None does so on a real clock.
-        live: True shows the state of the run on standard error, from the recorder's process.
+        limits: Limits of the wrench and of the run.
+        controller: Passivity controller, damping added against energy that came from nowhere.
+            'damper' acts when the hand got more than it put in, 'environment' when the scene has
+            created more than the coupling's slack, 'off' never. By default 'environment', or
+            'damper' if the device condition fails.
+        clutch: Button of the device, from 0. While it is held the device moves without handle and
+            force.
+        dead_man: Button of the device, from 0, that must be held for any force.
+        mark: Button of the device, from 0. Each press writes an event 'mark' into the recording;
+            'hapticbridge export --from S --to S' cuts a recording.
+        tool_weight: Weight of the tool in the hand, unless the device cannot hold it. With
+            --no-tool-weight, or False, the bridge carries it.
+        realtime: Request real-time priority and locked memory for the loop, and print what the
+            system refuses (see 'hapticbridge doctor'). By default requested for a real device.
+        pipelined: Compute ahead, after the wrench was sent, what needs no new sample. The numbers
+            are equal to the bit, the wrench is sent sooner, and the whole tick takes 5 % longer.
+            Between two ticks the scene's data then hold the contacts of the new positions, without
+            forces. By default done on a real clock.
+        live: Show the state of the run on standard error, from the recorder's process.
 
     Raises:
         HapticBridgeError: A value is out of range; the message names the valid ones.
     """
 
-    rate: float = 1000.0
-    substeps: int = 1
-    scene_rate: float | Literal["auto"] = AUTO
+    rate: float = option(1000.0, unit=RATE.unit, least=RATE.least, most=RATE.most)
+    substeps: int | None = field(default=None, metadata=SUBSTEPS)
+    scene_rate: float | Literal["auto"] = option(AUTO, unit="Hz")
     method: str | None = None
-    contact: str | None = None
-    contact_stiffness: float | None = None
+    contact: Contact | None = None
+    contact_stiffness: float | None = option(None, unit="N/m")
     i_know: bool = False
     workspace: Workspace = SAME_FRAME
-    limits: Limits | None = None
-    controller: str | None = None
-    clutch: int | None = None
-    dead_man: int | None = None
-    mark: int | None = None
+    limits: Limits = DEVICE_LIMITS
+    controller: Literal["damper", "environment", "off"] | None = None
+    clutch: int | None = _button()
+    dead_man: int | None = _button()
+    mark: int | None = _button()
     tool_weight: bool = True
     realtime: bool | None = None
     pipelined: bool | None = None
-    live: bool = False
+    live: bool = option(False, no_flag="a run of the command line shows it on a terminal")
 
     def __post_init__(self) -> None:
-        for name, kind in _KINDS.items():
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                raise HapticBridgeError(
-                    f"{name.replace('_', ' ')} is {shown(value)}; it must be {_WORDS[kind]}"
-                )
-        period_of(self.rate)
+        check_fields(self)
         if self.scene_rate != AUTO:
             refuse_scene_ticks(self.rendering_method.scheme, self.scene_ticks)
-        refuse_substeps(self.rendering_method.scheme, checked_substeps(self.substeps))
-        if self.controller is not None and self.controller not in CONTROLLERS:
-            raise DeviceError(
-                f"unknown controller {self.controller!r}; choices: {choices(CONTROLLERS)}"
-            )
-        for button, purpose in ((self.clutch, "clutch"), (self.dead_man, "dead-man")):
-            button_mask(button, purpose)
-        button_mask(self.mark, "mark")
+        refuse_substeps(self.rendering_method.scheme, self.substeps or 1)
         if self.clutch is not None and self.clutch == self.dead_man:
             raise DeviceError(
                 f"clutch and dead-man are both button {self.clutch}; they exclude each other"
@@ -243,7 +221,7 @@ class BridgeOptions:
     def rendering_method(self) -> Method:
         """The named method, or the default for these substeps, with the chosen contact."""
         if self.method is None:
-            method = default_method(checked_substeps(self.substeps))
+            method = default_method(self.substeps or 1)
         else:
             method = method_named(self.method)
         return method.with_contact(self.contact)
@@ -251,28 +229,6 @@ class BridgeOptions:
 
 DEFAULT_OPTIONS = BridgeOptions()
 """Options of a bridge without choices of the user."""
-
-
-class OptionChanges(TypedDict, total=False):
-    """Fields of ``BridgeOptions`` as keyword arguments."""
-
-    rate: float
-    substeps: int
-    scene_rate: float | Literal["auto"]
-    method: str | None
-    contact: str | None
-    contact_stiffness: float | None
-    i_know: bool
-    workspace: Workspace
-    limits: Limits | None
-    controller: str | None
-    clutch: int | None
-    dead_man: int | None
-    mark: int | None
-    tool_weight: bool
-    realtime: bool | None
-    pipelined: bool | None
-    live: bool
 
 
 # Setup of a run
@@ -377,7 +333,7 @@ def _usual_coupling(
         steady_rotational_stiffness(info, scene_period, *scales),
     )
     law = replace(law, stiffness=share * law.stiffness, rotational_stiffness=turned)
-    return method.requested_coupling(law, scene_period / options.substeps)
+    return method.requested_coupling(law, scene_period / (options.substeps or 1))
 
 
 def _refuse_buttons(options: BridgeOptions, info: DeviceInfo, *, is_recorded: bool) -> None:
@@ -467,7 +423,7 @@ class RunSetup:
             HapticBridgeError: Two of them exclude each other; the message names both.
         """
         method, period = options.rendering_method, period_of(options.rate)
-        substeps, ticks = options.substeps, options.scene_ticks
+        substeps, ticks = options.substeps or 1, options.scene_ticks
         is_real_clock = clock.name == RealClock.name
         if options.scene_rate == AUTO and is_real_clock and method.can_be_slow:
             ticks = scene_ticks_for(substeps * busy_step_time(scene, method, period), period)
@@ -493,7 +449,7 @@ class RunSetup:
             contact_stiffness=resolve_contact_stiffness(
                 method, requested, options.contact_stiffness
             ),
-            mark=button_mask(options.mark, "mark"),
+            mark=button_mask(options.mark),
             tool_weight=options.tool_weight,
             is_realtime=wants_real_time(options.realtime, clock, is_real=info.is_real),
             is_pipelined=is_real_clock if options.pipelined is None else options.pipelined,
@@ -508,8 +464,8 @@ class RunSetup:
         )
         guard = replace(
             guard,
-            clutch=button_mask(options.clutch, "clutch"),
-            dead_man=button_mask(options.dead_man, "dead-man"),
+            clutch=button_mask(options.clutch),
+            dead_man=button_mask(options.dead_man),
         )
         return replace(setup, guard=guard)
 

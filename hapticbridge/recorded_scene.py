@@ -22,10 +22,9 @@ from hapticbridge import jit
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.kernel.handle import stretch_at
-from hapticbridge.kernel.hands import simulate_hands
 from hapticbridge.kernel.mujoco_c import library_path
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.kernel.state import BoundHands, BoundKernel
+from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import simulate_recorded
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
 from hapticbridge.recording import RecordingFile
@@ -90,18 +89,14 @@ def report_errors(report: Callable[[str], None]) -> None:
     pointer.value = ctypes.cast(_HANDLERS[-1], ctypes.c_void_p).value
 
 
-def machine_code_for(
-    recording: RecordingFile, parameters: RunParameters
-) -> tuple[str, str, bool, bool]:
+def machine_code_for(recording: RecordingFile, parameters: RunParameters) -> tuple[str, str, bool]:
     """Returns the arguments of ``load_machine_code`` for a run."""
     method, is_slow = method_of(recording.meta), parameters.scene_ticks > 0
-    return method.name, method.contact, is_slow, recording.has_several_hands
+    return method.name, method.contact, is_slow
 
 
 @cache
-def load_machine_code(
-    name: str, contact: str, is_slow: bool, has_several_hands: bool = False
-) -> None:
+def load_machine_code(name: str, contact: str, is_slow: bool) -> None:
     """Loads the machine code of a method, which is first compiled and kept on disk if missing.
 
     A child process may not write it, and each would load it again.
@@ -115,20 +110,6 @@ def load_machine_code(
         parameters = unguarded_parameters(scene, coupling, period, 1, method)
         if method.has_law:
             static_load(scene, parameters)
-        if has_several_hands:
-            hands = BoundHands(scene.model, scene.data, [parameters])
-            alone = np.zeros((1, 1), SAMPLE_DTYPE)
-            alone["quaternion"][..., 0] = 1.0
-            simulate_hands(
-                hands.states,
-                alone,
-                np.zeros((1, 1), np.int64),
-                np.zeros(1),
-                hands.rows,
-                np.zeros((1, 1), TICK_DTYPE),
-            )
-            hands.release()
-            return
         parameters = replace(parameters, scene_ticks=2 * is_slow)
         kernel = BoundKernel(scene.model, scene.data, parameters)
         sample, nothing = np.zeros(1, SAMPLE_DTYPE), np.zeros(1)
@@ -140,7 +121,8 @@ def load_machine_code(
             slow.simulate(sample, flags, nothing, flags, rows)
             slow.close()
         else:
-            simulate_recorded(kernel.state, sample, flags, nothing, kernel.row, rows)
+            by_hand = sample[:, None], flags[:, None], nothing, kernel.row, rows[:, None]
+            simulate_recorded(kernel.state, *by_hand)
         kernel.release()
     finally:
         scene.release()

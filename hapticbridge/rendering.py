@@ -20,7 +20,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 
@@ -29,8 +29,8 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device.base import AXES, DeviceInfo
 from hapticbridge.errors import DeviceError, HapticBridgeError, SceneError, choices
 from hapticbridge.kernel.codes import (
-    JOINT,
     WELD_NAME,
+    Grip,
     Scheme,
     added_id,
 )
@@ -50,7 +50,9 @@ from hapticbridge.theory.bounds import (
     law_damping,
 )
 
-RIGID, SCENE = "rigid", "scene"
+Contact = Literal["rigid", "scene"]
+RIGID: Contact = "rigid"
+SCENE: Contact = "scene"
 CONTACTS = (RIGID, SCENE)
 """Contacts by name: rigid and strictly passive (``kernel.rigid_contact``), or MuJoCo's with the
 scene's own settings."""
@@ -123,7 +125,7 @@ class Method:
         return self.scheme in SLOW_SCHEMES
 
     @property
-    def contact(self) -> str:
+    def contact(self) -> Contact:
         """Contact by its name in ``CONTACTS``."""
         return RIGID if self.is_rigid else SCENE
 
@@ -289,7 +291,7 @@ class RunCoupling:
 
         Any other grip's coupling stays as it is.
         """
-        if not grip.startswith(JOINT):
+        if not Grip.from_text(grip).is_joint:
             return self
         ratio = scale * force_scale
 
@@ -418,11 +420,11 @@ def default_method(substeps: int = 1) -> Method:
 
     ``implicit`` dissipates some energy on the way to a contact and ``lossless`` does not, so energy
     created by the scene's own contacts uses more slack: at most 1.2 % instead of 1.1 % when
-    tapping, and equal shares with jamming pegs (``scripts/bench_methods --same device``). Rigid
+    tapping, and equal shares with jamming pegs (``scripts/bench methods --same device``). Rigid
     contacts create none by either. Near contact
     ``lossless`` adds K T to B', but reports K T/2. When tapping at 6 Hz it is 54 µm RMS off its
     reported effective coupling. ``implicit`` is 26 µm off its own report, B + K T/2, and 116 µm off
-    B (``scripts/bench_front``).
+    B.
     """
     return LOSSLESS_COUPLING if substeps == 1 else IMPLICIT
 

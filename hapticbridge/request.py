@@ -19,7 +19,7 @@ from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.hands import Grasp, resolve_hands
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.kernel.parameters import UNGUARDED, RunParameters
 from hapticbridge.options import AUTO, DEFAULT_OPTIONS, BridgeOptions, RunSetup
 from hapticbridge.pose import IDENTITY_POSE
@@ -160,7 +160,7 @@ class UncompiledScene:
     @property
     def joint(self) -> int:
         """0 if the hand holds a joint, else −1."""
-        return 0 if self.grip.startswith(JOINT) else -1
+        return 0 if Grip.from_text(self.grip).is_joint else -1
 
     def grip_pose(self) -> tuple[float, ...]:
         """Returns a pose, because only the compiled scene has the grip's."""

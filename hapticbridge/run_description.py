@@ -10,6 +10,7 @@ import json
 import math
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -193,7 +194,7 @@ CARRIED = "carried"
 
 _FLOATS = ("scale", "force_scale", "force_limit", "torque_limit", "contact_stiffness")
 _POSES = ("device_origin", "handle_origin", "device_start")
-_GAINS = ("stiffness", "damping", "rotational_stiffness", "rotational_damping")
+_GAINS = tuple(field.name for field in fields(Coupling))
 
 
 def attachments(scene: Scene) -> list[Attachment]:

@@ -37,7 +37,6 @@ from hapticbridge.hands import DeviceGroup
 from hapticbridge.inputs import Write
 from hapticbridge.jit import direct
 from hapticbridge.kernel.codes import OK, RING_FULL
-from hapticbridge.kernel.hands import answer_hands, before_hands, finish_hands
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import STATE_DTYPE, BoundHands, BoundKernel
 from hapticbridge.kernel.tick import (
@@ -182,7 +181,7 @@ class TickKernel:
 
     Attributes:
         before, answer, finish: Machine code of ``before_step``, ``answer_step`` and
-            ``finish_tick`` of ``kernel.tick``, or of their like in ``kernel.hands``.
+            ``finish_tick`` of ``kernel.tick``.
         sample: Each device's newest sample.
         rows, cursors: Records and cursors of the ring.
         bound: Kernel state that belongs to the scene; of several hands, that of the first.
@@ -197,7 +196,7 @@ class TickKernel:
 
     def __init__(self, sample: NDArray[np.void], stream: RecordStream) -> None:
         self.sample, self.rows, self.cursors = sample, stream.rows, stream.cursors
-        state, row = np.zeros(1, STATE_DTYPE), np.zeros(1, TICK_DTYPE)
+        state, row = np.zeros(sample.size, STATE_DTYPE), np.zeros(sample.size, TICK_DTYPE)
         rows, cursors = self.rows, self.cursors
         head, numbers = np.zeros(1, np.int64), np.zeros(1)
         self._publish_positions = direct(publish_positions, state, cursors, head, numbers)
@@ -206,29 +205,18 @@ class TickKernel:
         self.answer: Callable[..., int]
         self.finish: Callable[..., int]
         self._publish = direct(publish, row, rows, cursors, 0, 0, 0, 0, 0)
-        if sample.size > 1:
-            self._load_hands(sample.size)
-            return
         self.before = direct(before_step, state, sample, row, 0, 0.0)
         self.answer = direct(answer_step, state, row, 0)
         self.finish = direct(finish_tick, state, row, rows, cursors, 0, 0, 0, 0, 0, True)
 
-    def _load_hands(self, count: int) -> None:
-        """Loads the machine code of several hands, whose ticks have one step and no half."""
-        states, own = np.zeros(count, STATE_DTYPE), np.zeros(count, TICK_DTYPE)
-        rows, cursors = self.rows, self.cursors
-        self.before = direct(before_hands, states, self.sample, own, 0, 0.0)
-        self.answer = direct(answer_hands, states, own, 0)
-        self.finish = direct(finish_hands, states, own, rows, cursors, 0, 0, 0, 0, 0, True)
-
     def bind_hands(self, hands: BoundHands) -> None:
         """Attaches the arrays of a scene that several hands hold."""
         self.hands, self.bound = hands, hands.hands[0]
-        self.state, self.row = hands.states, hands.rows
+        self.state, self.row = hands.state, hands.row
         self.step, self.substeps, self.is_ahead = hands.step, range(1), False
         self.first_half, self.second_half = mujoco.mj_fwdPosition, mujoco.mj_step2
         self.external_flags = np.zeros(1, np.int64)  # each hand's state has its own
-        self.wrench = hands.states["loop"]["wrench_on_device"]
+        self.wrench = hands.state["loop"]["wrench_on_device"]
 
     def bind(self, bound: BoundKernel, setup: RunSetup, slow: SlowScene | None) -> None:
         """Attaches the arrays of a scene and the steps of a method."""
@@ -302,7 +290,7 @@ class Session:
         stop: StopRequest,
     ) -> None:
         self._request, self._setups = request, tuple(setups)
-        setup = self.setup = setups[0]
+        self.setup = setups[0]
         self.device, self.clock, self.output, self.stop = device, clock, output, stop
         self.tick = self.overruns = self.skipped = 0
         self.end, self._is_timed, self._slept = -1, False, 0
@@ -314,7 +302,8 @@ class Session:
         self._is_begun = self._is_held = self._has_warned = False
         self.slow: SlowScene | None = None
         self.inputs: deque[list[Write]] = deque()
-        self.commands = CommandQueue(setup.coupling_limits, is_recorded=output.path is not None)
+        limits = {each.scene.grip: each.coupling_limits for each in self._setups}
+        self.commands = CommandQueue(limits, is_recorded=output.path is not None)
         with ExitStack() as resources:
             resources.callback(device.close)  # ``_open`` says why it is called twice
             self._open(resources)
@@ -362,25 +351,18 @@ class Session:
         self.hand_parameters = self._parameters(effective)
         self.parameters = self.hand_parameters[0]
         start = start_state(scene.model, scene.data).tobytes()
-        if isinstance(self.device, DeviceGroup):
-            hands = BoundHands(scene.model, scene.data, self.hand_parameters)
-            resources.callback(hands.release)
-            self.kernel.bind_hands(hands)
-            self.device.external_flags = hands.states["loop"]["external_flags"]
-        else:
-            self._bind_one(resources)
+        self._bind(resources)
         bound = self.kernel.bound
         self._refuse_stretched_start()
         if self.stream.is_read:
             self._start_stream()
         if self.output.observer is not None:
             self.commands.warm_up()
-        self._applier = EventApplier(
-            bound, scene.data, setup.method, self.parameters, start, self.slow
-        )
-        self.executor = CommandExecutor(
-            self.commands, self._applier, setup.guard.fade_ticks, self.event
-        )
+        bounds = (self.kernel.hands or bound).hands
+        parts = tuple(zip(bounds, self.hand_parameters, strict=True))
+        self._applier = EventApplier(parts, scene.data, setup.method, start, self.slow)
+        fade_ticks = max(each.guard.fade_ticks for each in self._setups)
+        self.executor = CommandExecutor(self.commands, self._applier, fade_ticks, self.event)
         self.mark: MarkButton | None = None
         if setup.mark:
             self.mark = MarkButton(setup.mark, sample, lambda: self.event("mark", by="button"))
@@ -424,9 +406,15 @@ class Session:
             self._update_scenes()
         return found
 
-    def _bind_one(self, resources: ExitStack) -> None:
-        """Binds the kernel of one hand, and the loop of a slower scene."""
+    def _bind(self, resources: ExitStack) -> None:
+        """Binds the kernel of all hands, or of one and the loop of a slower scene."""
         scene, parameters = self.setup.scene, self.parameters
+        if isinstance(self.device, DeviceGroup):
+            hands = BoundHands(scene.model, scene.data, self.hand_parameters)
+            resources.callback(hands.release)
+            self.kernel.bind_hands(hands)
+            self.device.external_flags = hands.state["loop"]["external_flags"]
+            return
         bound = BoundKernel(scene.model, scene.data, parameters)
         resources.callback(bound.release)
         if parameters.scene_ticks:

@@ -22,7 +22,7 @@ from hapticbridge.certificate import (
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.hand_energy import INSTANT, HandEnergy, worst_of
-from hapticbridge.kernel.codes import JOINT, Scheme, coupling_ids, held_body
+from hapticbridge.kernel.codes import Grip, Scheme, coupling_ids, held_body
 from hapticbridge.kernel.lossless import spring_at_the_end, tree_of_tool
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.loop_setting import fresh_share
@@ -373,7 +373,7 @@ class Summary:
         reached = " and ".join(f"{name} limit" for name in self.limits_reached)
         reached = f" ({reached} reached)" if reached else ""
         peak = format_wrenches(hand if self.has_hand else None, tool)
-        if self.grip.startswith(JOINT):
+        if Grip.from_text(self.grip).is_joint:
             peak = f"{format_si(self.peak_force, 'N')} on the fingers"
         yield "peak", peak + reached
         if self.reach is not None:

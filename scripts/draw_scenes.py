@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hapticbridge import Bridge, Grasp, HapticBridgeError, SimulatedClock, load_scene
 from hapticbridge.hands import GripAxis
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene, custom_numbers, custom_text, scene_names, scene_path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +54,7 @@ def picture(name: str) -> Image.Image:
     """
     scene = load_scene(name)
     if joint := custom_text(scene.model, "grip_axis"):
-        scene = load_scene(name, (scene.grip, f"{JOINT}{joint}"))
+        scene = load_scene(name, (scene.grip, str(Grip(joint, "joint"))))
     advance(scene)
     model, data = scene.model, scene.data
     mujoco.mj_forward(model, data)

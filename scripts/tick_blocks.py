@@ -1,4 +1,4 @@
-"""Blocks of ticks of the imported checkout, timed on request: for ``bench_tick --against``.
+"""Blocks of ticks of the imported checkout, timed on request: for ``scripts/bench tick --against``.
 
 A line on stdin is a JSON object. ``{"scene": NAME, "method": NAME, "in_contact": BOOL}`` opens a
 bridge as it runs by default, pipelined and with a whole guard; ``{}`` runs its next block. A line

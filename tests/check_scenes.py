@@ -10,7 +10,7 @@ import numpy as np
 from outside_scenes import hand_rows
 
 from hapticbridge.check.case import Fault, SceneUnderCheck, open_case
-from hapticbridge.check.run_faults import find_faults
+from hapticbridge.check.findings import find_faults
 from hapticbridge.scene import read_scene, scene_path
 
 MAIN = """<mujoco model="bench">

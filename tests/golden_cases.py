@@ -1,4 +1,4 @@
-"""Runs, recordings and help texts whose outcome is frozen in ``tests/golden``.
+"""Runs, recordings and printed words whose outcome is frozen in ``tests/golden``.
 
 ``scripts/freeze`` writes the outcome anew, ``test_determinism`` holds today's code to it. All that
 is used here is public: ``hb.Bridge``, ``hb.audit``, the command line.
@@ -16,7 +16,7 @@ import platform
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 import hapticbridge as hb
 from hapticbridge.cli import main, terminal
-from hapticbridge.cli.main import COMMANDS as TABLE
 from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.device import force_dimension
 from hapticbridge.device.touch import servo
@@ -619,23 +618,6 @@ def audits(folder: Path) -> Json:
             for name, path in tampered_files(whole, folder)
         },
     }
-
-
-COMMANDS = ("", *TABLE)
-"""Commands whose help is frozen; the empty one is the program itself."""
-
-
-def help_file(name: str) -> Path:
-    """Returns the file of a command's help."""
-    return GOLDEN / "help" / f"{name or 'hapticbridge'}.txt"
-
-
-def help_text(name: str) -> str:
-    """Returns what ``hapticbridge NAME --help`` prints in 100 columns, without colour."""
-    words, plain = io.StringIO(), {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
-    with patch.dict(os.environ, plain), redirect_stdout(words), suppress(SystemExit):
-        main([name, "--help"] if name else ["--help"])
-    return "\n".join(line.rstrip() for line in words.getvalue().splitlines()) + "\n"
 
 
 SESSIONS = sorted(path.stem for path in (GOLDEN / "sessions").glob("*.txt"))

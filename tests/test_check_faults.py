@@ -29,12 +29,11 @@ from outside_scenes import hand_rows, mjcf
 from hapticbridge.check import lean
 from hapticbridge.check.case import Fault, length, open_case, weight
 from hapticbridge.check.contact_faults import shape_faults
+from hapticbridge.check.findings import find_faults, worst_faults
 from hapticbridge.check.inventory import take_inventory
 from hapticbridge.check.lean import MAY_GO
-from hapticbridge.check.model_faults import worst_faults
 from hapticbridge.check.observe import Setting
-from hapticbridge.check.physics import depth_under
-from hapticbridge.check.run_faults import find_faults, run_faults
+from hapticbridge.check.run_faults import run_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS, Simplification
 from hapticbridge.check.version import SceneVariant, name_everything, witness
 from hapticbridge.cli import main
@@ -43,6 +42,7 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.device import Motion
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.scene import compile_scene, read_scene, scene_names, scene_path
+from hapticbridge.scene.physics import depth_under
 
 CONSEQUENCES = {"energy created", "MuJoCo warning", "solver iterations"}
 """Faults in the motion to which a planted one may lead."""

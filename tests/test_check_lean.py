@@ -344,7 +344,7 @@ KEPT = {
 def test_shipped_scenes_model_nothing_that_may_go(name: str) -> None:
     """No freedom, contact dimension, pair, cone or hull, but for the reasons above.
 
-    The motion is its own, three times as fast to save time; ``scripts/bench_lean`` takes it as is.
+    The motion is its own, three times as fast to save time.
     """
     source = read_scene(name)
     name_everything(source.spec)

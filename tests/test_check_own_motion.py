@@ -7,6 +7,7 @@ from pathlib import Path
 from cli_cases import Called
 
 from hapticbridge.check.case import open_case
+from hapticbridge.check.findings import own_motion_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import (
     NO_HAND,
@@ -15,7 +16,6 @@ from hapticbridge.check.own_motion import (
     own_motion,
     own_substeps,
 )
-from hapticbridge.check.run_faults import own_motion_faults
 from hapticbridge.kernel.ledger import ENERGY_TOLERANCE
 from hapticbridge.scene import SceneSource, compile_scene, read_scene
 from hapticbridge.scene.checks import first_pump

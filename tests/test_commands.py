@@ -153,7 +153,7 @@ def test_the_last_of_these_commands_is_refused_and_the_others_wait(
     method: str, is_recorded: bool, offers: list[tuple[float, Command]], message: str
 ) -> None:
     now = 100.0
-    queue = CommandQueue(allowance(method), is_recorded=is_recorded, now=lambda: now)
+    queue = CommandQueue({"grip": allowance(method)}, is_recorded=is_recorded, now=lambda: now)
     for after, command in offers[:-1]:
         now += after
         queue.offer(command, "test")
@@ -175,7 +175,7 @@ numbers = st.floats() | st.integers() | st.booleans() | st.none() | st.text(max_
 def test_nothing_gets_in_that_needs_more_than_the_device_has(
     method: str, stiffness: object, damping: object
 ) -> None:
-    queue = CommandQueue(allowance(method))
+    queue = CommandQueue({"grip": allowance(method)})
     line = b'{"command": "couple", "stiffness": %s, "damping": %s}'
     said = line % tuple(_json(value) for value in (stiffness, damping))
     try:
@@ -185,8 +185,8 @@ def test_nothing_gets_in_that_needs_more_than_the_device_has(
         return
     [(command, _)] = queue.waiting
     assert isinstance(command, Couple)
-    felt = queue.limits.requested(command, COUPLING)
-    used = queue.limits.law(felt)
+    felt = queue.limits["grip"].requested(command, COUPLING)
+    used = queue.limits["grip"].law(felt)
     assert math.isfinite(used.stiffness)
     assert used.stiffness * T / 2 + used.damping <= 2.0 * (1 + 1e-8)
 

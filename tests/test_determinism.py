@@ -1,4 +1,4 @@
-"""Runs, audits and help texts are what they were when ``scripts/freeze`` froze them.
+"""Runs, audits and printed words are what they were when ``scripts/freeze`` froze them.
 
 Fields, words, verdicts and numbers are held to on every machine. Bits are held to where they were
 frozen. Elsewhere the audit finds the bits of the live loop again, and so does the compiled sweep
@@ -50,12 +50,6 @@ def test_recordings_and_their_verdicts_are_the_frozen_ones(tmp_path: Path) -> No
     hold(frozen(golden.AUDITS), golden.audits(tmp_path))
 
 
-@pytest.mark.parametrize("name", golden.COMMANDS)
-def test_a_command_prints_the_help_that_was_frozen(name: str) -> None:
-    text = golden.help_file(name).read_text(encoding="utf-8")
-    hold(text.splitlines(), golden.help_text(name).splitlines())
-
-
 @pytest.mark.parametrize("name", golden.SESSIONS)
 def test_commands_print_what_was_frozen(name: str, tmp_path: Path) -> None:
     text = golden.session_file(name).read_text(encoding="utf-8")
@@ -66,11 +60,6 @@ def test_commands_print_what_was_frozen(name: str, tmp_path: Path) -> None:
             assert (told.count("\nerror: "), told[-5:]) == (1, "\n(2)\n"), told
         assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
     hold(text.splitlines(), found.splitlines())
-
-
-def test_every_command_has_its_help_frozen() -> None:
-    files = {path.name for path in (golden.GOLDEN / "help").iterdir()}
-    assert files == {golden.help_file(name).name for name in golden.COMMANDS}
 
 
 FROZEN = {"tick": "0123456789ab", "work": [1.0], "verdict": "passive", "buttons": "zero"}

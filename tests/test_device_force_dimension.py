@@ -225,8 +225,8 @@ def test_a_spec_names_the_library_the_device_and_its_numbers() -> None:
     for count, option, words in (
         (2, "", r"2 devices .*choose one with serial=, one of '0', '1'"),
         (0, "", r"is plugged in \(looked for a device of Force Dimension"),
-        (1, ",gravity=2", "gravity = 2"),
-        (1, ",mass=0", "mass = 0"),
+        (1, ",gravity=2", "gravity is 2"),
+        (1, ",mass=0", "mass is 0"),
         (1, ",damping=-1", "d"),
     ):
         stub.call("count", count)

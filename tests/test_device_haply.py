@@ -305,7 +305,7 @@ def test_numbers_and_limits_come_from_whoever_knows_them() -> None:
     assert (info.force_limit, info.axes, info.is_real) == (FORCE_LIMIT, ("x", "y", "z"), True)
     info = HaplyBench().opened(damping=1.2, force_limit=5.0).info
     assert (info.damping, info.force_limit) == (1.2, 5.0)
-    with pytest.raises(DeviceError, match="damping = -1"):
+    with pytest.raises(DeviceError, match="damping is -1"):
         HaplyBench().opened(damping=-1)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from hapticbridge.device.pid.device import open_pid
 from hapticbridge.device.profile import read_profile
 from hapticbridge.device.spacemouse import open_spacemouse
 from hapticbridge.errors import DeviceError, SafetyTrip
-from hapticbridge.guard import limits_for
+from hapticbridge.guard import Limits
 from hapticbridge.identify import identify
 from hapticbridge.identify.identify import measured_profile
 from hapticbridge.options import Workspace
@@ -103,7 +103,7 @@ def haply() -> Rig:
     (inverse,) = bench.service.devices.values()
     later = lambda s: bench.time.advance(bench.time.now + s)  # noqa: E731
     # this hand moves at once, so that a force that rises slowly would leave the peg beside the hole
-    scene = {"scene": "peg_in_hole", "limits": replace(limits_for(device.info, None), ramp=0.0)}
+    scene = {"scene": "peg_in_hole", "limits": Limits(ramp=0.0)}
     force = lambda: inverse.force  # noqa: E731
     return Rig(device, DrivingClock(bench.time), bench.service, bench, force, later, scene)
 

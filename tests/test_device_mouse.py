@@ -61,7 +61,7 @@ def test_the_hand_goes_smoothly_where_it_is_dragged_and_no_faster_than_its_sheet
 
 
 def test_a_speed_that_is_none_is_refused() -> None:
-    with pytest.raises(DeviceError, match=r"speed = 0.0: must be a finite number > 0 m/s"):
+    with pytest.raises(DeviceError, match=r"speed is 0.0 m/s; it must be finite and > 0"):
         MouseDevice(speed=0.0)
 
 

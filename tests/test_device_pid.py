@@ -262,9 +262,9 @@ def test_a_profile_says_the_scale_of_its_numbers(monkeypatch: pytest.MonkeyPatch
         ({"damping": 1.0}, r"damping is in newtons and metres, .* state newtons= and travel= too"),
         ({"newtons": 2.0, "mass": 1.0}, r"mass is in newtons and metres, .* state travel= too"),
         ({**SCALE, "damping": -1.0}, r"damping = -1\.0"),
-        ({"newtons": 0.0}, r"newtons = 0\.0: must be a finite number > 0 N"),
-        ({"travel": math.nan}, "travel = nan: must be a finite number > 0 m"),
-        ({"reverse": "z"}, "reverse = 'z': must be 'x', 'y' or 'xy'"),
+        ({"newtons": 0.0}, r"newtons is 0\.0 N; it must be finite and > 0"),
+        ({"travel": math.nan}, "travel is nan m; it must be finite and > 0"),
+        ({"reverse": "z"}, "reverse is 'z'; it must be 'x', 'y' or 'xy'"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options: dict[str, object], words: str) -> None:

@@ -407,12 +407,12 @@ TOO_FAST = SimulatedDevice(friction=0.1, hand=Hand(mass=0, stiffness=1e12))
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: SimulatedDevice(mass=0.0), "mass = 0.0: must be a finite number > 0 kg"),
+        (lambda: SimulatedDevice(mass=0.0), "mass is 0.0 kg; it must be finite and > 0"),
         (lambda: SimulatedDevice(damping=-1.0), "damping = -1.0"),
         (lambda: SimulatedDevice(friction=math.nan), "friction = nan"),
         (lambda: SimulatedDevice(resolution=math.inf), "resolution = inf"),
         (lambda: SimulatedDevice(force_limit=-2.0), "force_limit = -2.0"),
-        (lambda: SimulatedDevice(delay=101), "delay = 101: must be 0 to 100 whole samples"),
+        (lambda: SimulatedDevice(delay=101), "delay is 101; it must be 0 to 100 whole samples"),
         (lambda: SimulatedDevice(delay=1.5), "delay = 1.5"),  # type: ignore[arg-type]
         (lambda: Hand(stiffness=-1.0), "hand stiffness = -1.0"),
         (lambda: Hand(mass="heavy"), "hand mass = 'heavy'"),  # type: ignore[arg-type]

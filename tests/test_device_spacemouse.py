@@ -181,9 +181,9 @@ def test_starting_again_goes_back_to_the_origin() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"speed": 0.0}, "speed = 0.0: must be a finite number > 0 m/s"),
+        ({"speed": 0.0}, "speed is 0.0 m/s; it must be finite and > 0"),
         ({"turn": -1.0}, "turn = -1.0"),
-        ({"dead_band": 1.0}, "dead_band = 1.0: must be below 1"),
+        ({"dead_band": 1.0}, "dead_band is 1.0; it must be below 1"),
         ({"dead_band": -0.1}, "dead_band = -0.1"),
         ({"serial": "7"}, "no device 'spacemouse' has serial '7'"),
     ],

@@ -314,8 +314,8 @@ def test_a_spec_names_library_device_and_numbers(virtual: HdStub) -> None:
     for option, words in (
         (",config=Left Device", r"the device 'Left Device' of OpenHaptics cannot be opened: its "
          r"connection is not set up: run the maker's Touch Setup"),
-        (",turn=2", r"turn = 2\.0: must be 1"),
-        (",damping=-1", "damping = -1"),
+        (",turn=2", r"turn is 2\.0; it must be 1"),
+        (",damping=-1", "damping is -1"),
     ):  # fmt: skip
         with pytest.raises(DeviceError, match=words):
             open_device(spec + option)

@@ -164,8 +164,8 @@ def test_of_two_the_serial_number_chooses() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"damping": -1.0}, "damping = -1.0: must be a finite number >= 0 N s/m"),
-        ({"mass": 0.0}, "mass = 0.0: must be a finite number > 0 kg"),
+        ({"damping": -1.0}, "damping is -1.0 N s/m; it must be finite and >= 0"),
+        ({"mass": 0.0}, "mass is 0.0 kg; it must be finite and > 0"),
         ({"firmware": "/no/such/file"}, "firmware = '/no/such/file': cannot be read"),
         ({}, "no device 'falcon' is plugged in .*0403:cb48.*hapticbridge devices"),
     ],

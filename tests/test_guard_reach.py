@@ -84,7 +84,7 @@ def test_a_profile_tells_a_device_its_reach() -> None:
     assert profile_named("falcon").fill(known).reach == 0.07
     text = DeviceInfo.to_json(known)
     assert DeviceInfo.from_json(text) == known
-    with pytest.raises(DeviceError, match=r"reach = 0: must be a finite number > 0 m"):
+    with pytest.raises(DeviceError, match=r"reach is 0 m; it must be finite and > 0"):
         replace(info, reach=0)
 
 

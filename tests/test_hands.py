@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from two_hands import BAR, PEG_AND_BLOCK, SCENES, two_handed
 
 import hapticbridge as hb
 from hapticbridge.cli.main import main
+from hapticbridge.commands import Command, Couple, Reset, Switch
 from hapticbridge.device import device_for
 from hapticbridge.device.driver import ignore_message
 from hapticbridge.device.spacemouse import open_spacemouse
@@ -24,6 +26,7 @@ from hapticbridge.errors import DeviceLost, HapticBridgeError
 from hapticbridge.hands import DeviceGroup
 from hapticbridge.record import TickFlag, has_flag
 from hapticbridge.recording.format import MAX_HANDS
+from hapticbridge.whatif import what_if
 
 SHARED = ("tick", "deadline_ns", "read_ns", "kinetic", "potential")
 
@@ -273,14 +276,95 @@ def twice(device: Scripted) -> tuple[hb.Grasp, hb.Grasp]:
     return hb.Grasp("left", device), hb.Grasp("right", device)
 
 
-def test_commands_are_refused_but_for_the_end() -> None:
-    from hapticbridge.commands import Reset
+RESET = 1100
+COMMANDS: dict[int, Command] = {
+    100: Couple(400.0, 0.3, grip="right"),
+    700: Switch(force=False, grip="left"),
+    900: Switch(force=True, grip="left"),
+    RESET: Reset(),
+    1800: Switch(clutch=True),
+}
 
-    with bridge_of(TWO) as bridge:
-        with pytest.raises(HapticBridgeError, match="takes no commands but to stop"):
-            bridge.command(Reset())
-        bridge.run(0.01, on_tick=lambda tick: bridge.stop() if tick == 5 else None)
-        assert bridge.summary().ticks < 10
+
+def commanded(path: Path, commands: dict[int, Command]) -> dict[str, NDArray[np.float64]]:
+    """Records two moving hands and commands; returns the gains of both in each tick."""
+    devices = Scripted("a", 2e-3), Scripted("b", -1e-3, damping=3.0)
+    hands = [hb.Grasp(grip, each) for grip, each in zip(("left", "right"), devices, strict=True)]
+    stiffness = np.zeros((2000, 2))
+    with bridge_of(hands, recording=path) as bridge:
+
+        def act(tick: int) -> None:
+            bridge.session.commands.now = lambda: tick * 1e-3
+            if tick in commands:
+                bridge.command(commands[tick], "test")
+            assert bridge.session.kernel.hands is not None
+            stiffness[tick] = bridge.session.kernel.hands.state["coupling"]["stiffness"]
+
+        bridge.run(2.0, on_tick=act)
+    return {"stiffness": stiffness}
+
+
+def test_a_command_is_for_its_hand_and_repeats_to_the_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    stiffness = commanded(path, COMMANDS)["stiffness"]
+    assert np.all(stiffness[:, 0] == stiffness[0, 0])
+    assert stiffness[0, 1] != 400.0
+    assert np.all(stiffness[700:, 1] == 400.0)
+    left, right = (hb.read_recording(path, hand=hand) for hand in (0, 1))
+    force = [np.linalg.norm(each.ticks["wrench_on_device"], axis=1) for each in (left, right)]
+    assert np.all(force[0][850:900] == 0.0)
+    assert np.all(force[1][850:900] > 0.0)
+    for each in (left, right):  # both let go before the scene is reset, and hold it again
+        [reset] = [event["tick"] for event in each.events if event["event"] == "reset"]
+        assert np.all(each.ticks["wrench_on_device"][reset - 1] == 0.0)
+        home = each.ticks["tool_position"][0]
+        assert each.ticks["tool_position"][reset] == pytest.approx(home, abs=1e-5)
+        assert np.linalg.norm(each.ticks["wrench_on_device"][1700]) > 0.0
+        assert np.all(has_flag(each.ticks[1801:], TickFlag.CLUTCH))
+    report = hb.audit(path, in_process=True)
+    assert (report.verdict, report.resimulation) == ("passive", "bit for bit")
+
+
+@pytest.mark.parametrize("grip", ["left", "elsewhere"])
+def test_a_command_that_is_given_to_another_hand_is_noticed(grip: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    commanded(path, {100: COMMANDS[100]})
+
+    forged = tmp_path / "forged.mcap"
+    rewrite(path, forged, lambda ticks: None, grip="right")
+    assert hb.audit(forged, in_process=True).verdict == "passive"
+    rewrite(path, forged, lambda ticks: None, grip=grip)
+    assert hb.audit(forged, in_process=True).verdict == "invalid"
+
+
+def test_a_what_if_repeats_the_commands_of_each_hand(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    commanded(path, COMMANDS)
+    again = what_if(path, {"rate": 500}).runs[1].recording
+    changes, before = (
+        [event for event in each.events if event["event"] in ("coupling", "switch")]
+        for each in (again, hb.read_recording(path, hand=0))
+    )
+    assert [(each["tick"], each["grip"]) for each in changes] == [
+        (math.ceil(each["tick"] / 2), each["grip"]) for each in before
+    ]
+    softer = what_if(path, {"right:stiffness": 300.0}).runs[1].recording
+    assert not [event for event in softer.events if event["event"] == "coupling"]
+    assert len([event for event in softer.events if event["event"] == "switch"]) == len(before) - 1
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (Couple(400.0, 0.3), "the command names no grip; it must be one of 'left', 'right'"),
+        (Couple(400.0, 0.3, grip="middle"), "the command has grip 'middle'; it must be one of"),
+        (Switch(force=False, grip="middle"), "the command has grip 'middle'; it must be one of"),
+        (Couple(5e4, 0.3, grip="right"), "needs a device of"),
+    ],
+)
+def test_a_command_for_no_hand_is_refused(command: Command, message: str) -> None:
+    with bridge_of(TWO) as bridge, pytest.raises(HapticBridgeError, match=message):
+        bridge.command(command)
 
 
 def test_a_run_of_two_hands_resumes_after_a_pause(tmp_path: Path) -> None:
@@ -375,9 +459,17 @@ def test_changed_metadata_of_hands_are_noticed(value: str, message: str, tmp_pat
 
 
 def rewrite(
-    path: Path, forged: Path, edit: Callable[[list[NDArray[np.void]]], None], **meta: str
+    path: Path,
+    forged: Path,
+    edit: Callable[[list[NDArray[np.void]]], None],
+    *,
+    grip: str = "",
+    **meta: str,
 ) -> None:
-    """Writes a recording of two hands again, with its checksums made anew."""
+    """Writes a recording of two hands again, with its checksums made anew.
+
+    Changes of a coupling are given to the hand at ``grip``.
+    """
     from hapticbridge.recording import RecordingWriter
     from hapticbridge.recording.format import Attachment
     from hapticbridge.recording.reader import open_hands
@@ -387,7 +479,10 @@ def rewrite(
     edit(ticks)
     files = [Attachment(n, "application/octet-stream", d) for n, d in first.attachments.items()]
     writer = RecordingWriter(forged, first.meta, files, int(first.meta["epoch_ns"]))
-    events = list(first.events)
+    events = [dict(event) for event in first.events]
+    for event in events:
+        if event["event"] == "coupling":
+            event["grip"] = grip
     writer.write_event(events[0], events[0]["time_ns"])
     for hand, rows in enumerate(ticks):
         writer.write_ticks(rows, hand)

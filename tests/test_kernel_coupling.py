@@ -30,8 +30,20 @@ from kernel_runs import (
 )
 from scipy.spatial.transform import Rotation
 
+from hapticbridge.audit import spring as audit_spring
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import CouplingError
+from hapticbridge.kernel.law import (
+    Spring,
+    energy_at_level,
+    is_bent,
+    is_straight,
+    length_at,
+    limited,
+    share_of_gains,
+    spring_energy,
+    spring_length,
+)
 from hapticbridge.kernel.tick import after_step, before_step
 from hapticbridge.record import TICK_DTYPE
 
@@ -175,3 +187,57 @@ def test_invalid_gains_are_refused_by_name_and_only_the_stiffness_must_not_be_ze
     Coupling(**values)
     with pytest.raises(CouplingError, match=f"coupling {name.replace('_', ' ')} is"):
         Coupling(**{**values, name: value})
+
+
+SPRING = Spring(stiffness=2000.0, level=3.0)
+"""A spring that reaches its level at 1.5 mm."""
+
+LENGTHS = np.array([0.0, 0.4e-3, 1.5e-3, 1.6e-3, 4e-3])
+
+
+def _force(length: float) -> float:
+    return limited(SPRING, (0.0, SPRING.stiffness * length, 0.0))[1]
+
+
+def test_energy_and_length_of_a_spring_follow_from_its_force() -> None:
+    for length in LENGTHS:
+        edges = np.linspace(0.0, length, 20001)
+        middles = 0.5 * (edges[1:] + edges[:-1])
+        energy = sum(map(_force, middles)) * (edges[1] - edges[0])
+        assert spring_energy(SPRING, length) == pytest.approx(energy, rel=1e-6, abs=1e-15)
+        assert spring_length(SPRING, spring_energy(SPRING, length)) == pytest.approx(length)
+    assert _force(length_at(SPRING, 1.7)) == pytest.approx(1.7)
+    at_level = spring_energy(SPRING, length_at(SPRING, SPRING.level))
+    assert energy_at_level(SPRING) == pytest.approx(at_level)
+
+
+def test_a_spring_is_bent_where_its_force_is_not_that_of_the_linear_law() -> None:
+    for size in SPRING.stiffness * LENGTHS:
+        force = _force(size / SPRING.stiffness)
+        assert is_bent(SPRING, size) == (force != size)
+        for change in (0.5, 2.0):
+            rises = _force((size + change) / SPRING.stiffness) - force
+            assert is_straight(SPRING, size, change) == (rises == pytest.approx(change))
+
+
+@pytest.mark.parametrize("compliance", [0.0, 0.3, 5.0])
+@pytest.mark.parametrize("answer", [0.5, 3.0, 4.0, 60.0])
+def test_a_share_of_the_gains_gives_the_springs_force(answer: float, compliance: float) -> None:
+    last = 0.7  # any share that was tried before
+    share = share_of_gains(SPRING, last * answer / (1 + last * compliance), last, compliance)
+    u = answer / (1 + share * compliance)
+    assert share * u == pytest.approx(_force(u / SPRING.stiffness))
+
+
+def test_the_audits_spring_is_the_kernels() -> None:
+    twin = audit_spring.Spring(np.full(len(LENGTHS), SPRING.stiffness), SPRING.level)
+    stretch = LENGTHS[:, None] * np.array([0.48, -0.6, 0.64])
+    kernel = [spring_energy(SPRING, length) for length in LENGTHS]
+    np.testing.assert_allclose(twin.energy(stretch), kernel, rtol=1e-12)
+    u = SPRING.stiffness * stretch
+    forces = [limited(SPRING, tuple(each)) for each in u]
+    np.testing.assert_allclose(twin.limited(u), forces, rtol=1e-12)
+    np.testing.assert_allclose(twin.force(stretch), forces, rtol=1e-12)
+    sizes = np.linalg.norm(u, axis=1)
+    straight = [is_straight(SPRING, size, 0.5) for size in sizes]
+    assert twin.is_straight(sizes, np.full(len(sizes), 0.5)).tolist() == straight

@@ -18,7 +18,6 @@ from two_hands import (
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import HapticBridgeError, SceneError
-from hapticbridge.kernel.hands import whole_tick_of_hands
 from hapticbridge.kernel.state import BoundHands, BoundKernel
 from hapticbridge.kernel.tick import whole_tick
 from hapticbridge.record import SAMPLE_DTYPE, TICK_DTYPE
@@ -40,12 +39,12 @@ def test_one_hand_among_several_equals_one_hand_to_the_bit() -> None:
         kernel = BoundKernel(scene.model, scene.data, parameters)
         if is_among_several:
             hands = BoundHands(scene.model, scene.data, [parameters])
-            kernel, row = hands.hands[0], hands.rows
+            kernel, row = hands.hands[0], hands.row
         kept = []
         for k in range(400):
             sample["position"][0] = 2e-3 * np.sin(0.02 * k), 0.0, -5e-5 * k
             if is_among_several:
-                assert whole_tick_of_hands(hands.states, sample, row, PERIOD)
+                assert whole_tick(hands.state, sample, row, PERIOD)
             else:
                 row = kernel.row
                 assert whole_tick(kernel.state, sample, row, PERIOD)
@@ -61,18 +60,18 @@ def test_a_bar_in_two_hands_carries_the_force_from_one_to_the_other() -> None:
     samples = unmoved()
     samples["position"][1, 0] = 0.01
     for _ in range(3000):
-        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
-    pull = bound.rows["wrench_on_tool"][:, 0]
+        assert whole_tick(bound.state, samples, bound.row, PERIOD)
+    pull = bound.row["wrench_on_tool"][:, 0]
     # two springs in series, 10 mm long together: 800/2 N/m · 10 mm
     assert pull == pytest.approx([-4.0, 4.0], abs=1e-6)
-    assert bound.rows["wrench_on_device"][:, 0] == pytest.approx([4.0, -4.0], abs=1e-6)
+    assert bound.row["wrench_on_device"][:, 0] == pytest.approx([4.0, -4.0], abs=1e-6)
 
 
 def test_both_accounts_judge_one_environment_whose_work_adds_up() -> None:
     scene = two_handed(PEG_AND_BLOCK)
     bound = bound_hands(scene, (COUPLING, COUPLING), PERIOD, IMPLICIT)
     samples, work = unmoved(), np.zeros(2)
-    data, before = scene.data, bound.rows["tool_position"].copy()
+    data, before = scene.data, bound.row["tool_position"].copy()
     turned = np.zeros(3)
     for hand in range(2):
         before[hand] = data.site(scene.of_hand(hand).grip).xpos
@@ -80,19 +79,19 @@ def test_both_accounts_judge_one_environment_whose_work_adds_up() -> None:
     for k in range(1500):
         samples["position"][0, 2] = -1e-5 * min(k, 1000)
         samples["position"][1, 0] = 2e-3 * np.sin(0.01 * k)
-        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
-        for hand, row in enumerate(bound.rows):
+        assert whole_tick(bound.state, samples, bound.row, PERIOD)
+        for hand, row in enumerate(bound.row):
             mujoco.mju_subQuat(turned, row["tool_quaternion"], orientation[hand])
             mujoco.mju_rotVecQuat(turned, turned.copy(), orientation[hand])
             wrench = row["wrench_on_tool"]
             work[hand] += wrench[:3] @ (row["tool_position"] - before[hand]) + wrench[3:] @ turned
             before[hand], orientation[hand] = row["tool_position"], row["tool_quaternion"]
-    assert np.any(bound.rows["contacts"] > 0)
-    assert bound.rows["coupling_work"] == pytest.approx(work, abs=1e-12)
+    assert np.any(bound.row["contacts"] > 0)
+    assert bound.row["coupling_work"] == pytest.approx(work, abs=1e-12)
     mujoco.mj_forward(scene.model, data)
     stored = data.energy.sum()  # at rest at the start, without weight
     expected = stored - work.sum()
-    assert bound.rows["environment_energy"] == pytest.approx([expected, expected], abs=1e-12)
+    assert bound.row["environment_energy"] == pytest.approx([expected, expected], abs=1e-12)
     assert expected < -1e-6
 
 
@@ -102,11 +101,11 @@ def test_a_device_may_receive_what_the_other_hand_puts_in() -> None:
     samples = unmoved()
     for k in range(2000):  # the left hand drags the right one along, against a pull
         samples["position"][:, 0] = -5e-5 * k, -5e-5 * max(k - 100, 0)
-        assert whole_tick_of_hands(bound.states, samples, bound.rows, PERIOD)
-    left, right = bound.states["energy"]["device_energy"]
+        assert whole_tick(bound.state, samples, bound.row, PERIOD)
+    left, right = bound.state["energy"]["device_energy"]
     assert left < -0.05
     assert right > 0.05
-    assert bound.states["observer"]["guarded_energy"].max() < 1e-3
+    assert bound.state["observer"]["guarded_energy"].max() < 1e-3
 
 
 @pytest.mark.parametrize("scene", SCENES)

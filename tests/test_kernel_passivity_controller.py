@@ -20,7 +20,7 @@ from hapticbridge.audit.replay import Resimulator
 from hapticbridge.bridge import Bridge
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
-from hapticbridge.guard import guard_parameters_for, limits_for
+from hapticbridge.guard import DEVICE_LIMITS, guard_parameters_for, limits_for
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT
 from hapticbridge.kernel.passivity_controller import observe_energy
 from hapticbridge.kernel.state import STATE_DTYPE
@@ -197,7 +197,7 @@ def slack_of(rows: NDArray[np.void], linear: float, angular: float) -> NDArray[n
 
 def test_a_device_with_too_little_damping_is_credited_with_half_of_it() -> None:
     info = SimulatedDevice().info
-    limits = limits_for(info, None)
+    limits = limits_for(info, DEVICE_LIMITS)
     enough = guard_parameters_for(info, limits, T, needed=(2.0, 2e-3))
     assert (enough.assumed_damping, enough.assumed_rotational_damping) == (2.0, 2e-3)
     short = guard_parameters_for(info, limits, T, needed=(2.1, 1e-3))

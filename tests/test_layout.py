@@ -111,6 +111,7 @@ def test_the_audit_never_imports_the_bridge() -> None:
         assert not {"bridge", "session", "options"} & imported_concepts(path), path.name
     for name in (
         "motion",
+        "spring",
         "wrench_limits",
         "energy",
     ):  # a second opinion has an arithmetic of its own

@@ -6,21 +6,24 @@ import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable
-from dataclasses import asdict, fields
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, fields, is_dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
-from hapticbridge.cli.run import Run
+from hapticbridge.arguments import label, members, rule_of, types_of
+from hapticbridge.bridge import Bridge
 from hapticbridge.clock import RealClock, SimulatedClock
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import AXES, DeviceInfo, Hand, Motion, SimulatedDevice
 from hapticbridge.errors import CouplingError, HapticBridgeError
 from hapticbridge.guard import Limits
 from hapticbridge.kernel.parameters import ENVIRONMENT, GuardParameters
-from hapticbridge.options import BridgeOptions, OptionChanges, RunSetup, Workspace
+from hapticbridge.options import BridgeOptions, RunSetup, Workspace
 from hapticbridge.scene import Scene, load_scene
+from hapticbridge.whatif.settings import CHANGEABLE, KEPT
 
 REAL = DeviceInfo(
     name="arm", axes=AXES, force_limit=10.0, mass=0.1, damping=2.0, rotational_damping=2e-3
@@ -36,14 +39,14 @@ def scene() -> Scene:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"rate": 0.5}, "rate is 0.5 Hz; it must be 1 to 1e+06"),
+        ({"rate": 0.5}, "rate is 0.5 Hz; it must be 1 to 1000000"),
         *(({"substeps": number}, "substeps is") for number in (0, 2.5, 101)),
         ({"substeps": 2, "method": "lossless"}, "so it must be 1"),
         ({"method": "magic"}, "no method is called 'magic'; methods: "),
-        ({"controller": "magic"}, "choices: 'damper', 'environment', 'off'"),
-        ({"clutch": -1}, "clutch button is -1; it must be 0 to 31"),
-        ({"dead_man": 99}, "dead-man button is 99"),
-        ({"mark": True}, "mark button is True"),
+        ({"controller": "magic"}, "must be one of 'damper', 'environment', 'off'"),
+        ({"clutch": -1}, "clutch is -1; it must be a whole number, 0 to 31"),
+        ({"dead_man": 99}, "dead man is 99"),
+        ({"mark": True}, "mark is True"),
         ({"clutch": 1, "dead_man": 1}, "both button 1; they exclude each other"),
     ],
 )
@@ -114,21 +117,19 @@ def test_the_force_scale_is_by_default_that_of_the_motion() -> None:
 
 
 def test_keywords_of_a_bridge_are_the_fields_of_its_options() -> None:
-    assert list(OptionChanges.__annotations__) == [field.name for field in fields(BridgeOptions)]
-
-
-def test_flags_of_the_command_have_the_names_of_the_options() -> None:
-    options = {field.name for field in (*fields(BridgeOptions), *fields(Workspace))}
-    flags = {field.name for field in fields(Run)}
-    # a limit's flag says what it limits; the status line and the pipeline follow the terminal
-    assert options - flags == {"workspace", "limits", "pipelined", "live"}
+    bridge = Bridge("point_mass", substeps=2, clock=SimulatedClock())
+    assert bridge.request.options == BridgeOptions(substeps=2)
+    with pytest.raises(
+        HapticBridgeError, match="a bridge has no option 'substep'; it has 'clutch'"
+    ):
+        Bridge("point_mass", substep=2)
 
 
 def test_a_coupling_without_rotational_gains_is_one_around_the_grip() -> None:
     assert Coupling(2400.0, 0.5) == Coupling(2400.0, 0.5, 2.4, 5e-4)
     assert Coupling(2400.0, 0.5, 0.0, 0.0).rotational_stiffness == 0.0
     for missing in (None, float("nan")):
-        with pytest.raises(CouplingError, match="must be a finite number"):
+        with pytest.raises(CouplingError, match="must be finite and >= 0"):
             Coupling(2400.0, 0.5, missing, 0.0)  # type: ignore[arg-type] # on purpose
 
 
@@ -157,3 +158,68 @@ def test_a_wrong_value_is_refused_in_a_sentence(made: type[Any], valid: dict[str
             refused += 1
             assert len(str(error)) < 480 and "\n" not in str(error)
     assert refused > 0.5 * len(WRONG) * len(inspect.signature(made).parameters)
+
+
+NUMBERS = {int: -1, float: math.nan, str: "", bool: "yes"}
+"""A value of another kind, or one that no rule admits, by the type of a field."""
+
+
+def bad_values() -> Iterator[tuple[type[Any], dict[str, Any], str, Any, str]]:
+    """Yields for each field of a public class with a rule a value that it refuses, and its unit."""
+    for made, valid in PUBLIC:
+        if not is_dataclass(made) or made.__name__ == "Motion":
+            continue
+        for each in fields(made):
+            if each.name == "axes":  # refused by a rule of their own
+                continue
+            kinds, rule = members(types_of(made)[each.name], is_stored=False), rule_of(each)
+            found = {kind: NUMBERS[kind] for kind in kinds if kind in NUMBERS}
+            if str in found and not rule.is_filled:  # any text is one
+                found[str] = 3
+            for value in found.values():
+                yield made, valid, each.name, value, rule.unit
+
+
+BAD = list(bad_values())
+
+
+@pytest.mark.parametrize(
+    ("made", "valid", "name", "value", "unit"), BAD, ids=lambda item: getattr(item, "__name__", "")
+)
+def test_a_bad_value_is_named_with_its_field_unit_and_what_is_valid(
+    made: Any, valid: dict[str, Any], name: str, value: Any, unit: str
+) -> None:
+    [each] = [each for each in fields(made) if each.name == name]
+    with pytest.raises(HapticBridgeError) as refused:
+        made(**valid | {name: value})
+    unit = f" {unit}" if unit and not isinstance(value, str) else ""
+    said = f"{label(each)} is {value!r}{unit}; it must be "
+    assert said in str(refused.value) and not str(refused.value).endswith("be ")
+    assert any(word in str(refused.value) for word in VALID)
+
+
+VALID = ("finite", "> 0", "to", "a whole number", "True or False", "a text", "one of")
+"""Words of which a sentence on what is valid has some."""
+
+
+def test_a_number_is_stored_as_a_plain_one() -> None:
+    made = Limits(force=np.float32(3), ramp=np.int64(1))  # type: ignore[arg-type] # on purpose
+    assert (type(made.force), type(made.ramp)) == (float, float)
+    assert type(BridgeOptions(substeps=np.int16(2)).substeps) is int  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["scale", "rate", "rotational_damping", "force_limit", "method"])
+def test_a_what_if_takes_its_names_from_the_fields(name: str) -> None:
+    kind, each = CHANGEABLE[name]
+    assert (rule_of(each).flag or each.name).replace("-", "_") == name
+    assert kind in (BridgeOptions, Workspace, Limits, Coupling)
+
+
+def test_a_what_if_changes_every_option_or_says_why_not() -> None:
+    every = {
+        (rule_of(each).flag or each.name).replace("-", "_")
+        for kind in (BridgeOptions, Workspace, Limits, Coupling)
+        for each in fields(kind)
+    }
+    assert every == {*CHANGEABLE, *KEPT, "workspace", "limits"}
+    assert all(KEPT.values())

@@ -36,7 +36,7 @@ NOT_REPEATED = {"live", "realtime"}
 NOT_RECORDED = {("Grasp", "device")}
 """Fields that a recording lacks: the open device, whose data sheet and name it has."""
 
-PINNED = {"coupling", "method", "contact", "contact_stiffness", "scene_rate"}
+PINNED = {"coupling", "method", "contact", "contact_stiffness", "substeps", "scene_rate"}
 """Fields that a what-if with any change sets to what the recorded run had."""
 
 TURNED = (0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6)
@@ -245,9 +245,8 @@ def test_a_real_devices_ramp_is_repeated_on_a_simulated_one(
     run = runs("a real device")
     [hand] = RecordedRun.from_hands([run.recording], tmp_path)
     assert hand.parameters.ramp_ticks == 500
-    assert changed_request([hand], [hand.settings]).options.limits == replace(
-        hand.setup.limits, ramp=0.5
-    )
+    asked = run.request.options.limits
+    assert changed_request([hand], [hand.settings]).options.limits == replace(asked, ramp=0.5)
 
 
 # A stored number that the request does not give

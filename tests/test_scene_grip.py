@@ -8,9 +8,10 @@ from pathlib import Path
 import mujoco
 import pytest
 from cli_cases import Called
-from outside_scenes import mjcf, refusal_of, scene_file
+from outside_scenes import mjcf, refusal, refusal_of, scene_file
 
 import hapticbridge as hb
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import grips
 from hapticbridge.whatif import what_if
 
@@ -81,3 +82,25 @@ def test_run_that_holds_a_point_of_a_body_is_simulated_again(tmp_path: Path, cal
     ticks = hb.read_recording(file).ticks
     assert ticks["tool_position"][0] == pytest.approx((0.34, 0, 0.62), abs=1e-5)
     assert any("in every bit" in note for note in what_if(file, {}).notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "is_joint"),
+    [
+        ("tcp", "tcp", False),
+        ("hand@0,0,0.1", "hand@0,0,0.1", False),
+        ("joint:hinge", "hinge", True),
+        ("joint:a:b", "a:b", True),
+        ("joint", "joint", False),
+        ("left:tip", "left:tip", False),
+    ],
+)
+def test_a_grip_is_a_site_or_body_or_a_joint(text: str, name: str, is_joint: bool) -> None:
+    grip = Grip.from_text(text)
+    assert (grip.name, grip.is_joint, str(grip)) == (name, is_joint, text)
+
+
+def test_a_site_whose_name_begins_as_a_joint_is_no_grip(tmp_path: Path) -> None:
+    path = scene_file(tmp_path, arm('<site name="joint:tip"/>'))
+    assert "joint:tip" not in [each.name for each in grips(mujoco.MjModel.from_xml_path(str(path)))]
+    assert "no hinge or slide 'tip' to hold" in refusal(path, "joint:tip")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import runpy
+import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -34,3 +36,35 @@ def test_a_file_to_write_is_refused_before_the_work_if_it_cannot_be(tmp_path: Pa
     for path in (tmp_path, tmp_path / "none" / "found.json"):
         with pytest.raises(argparse.ArgumentTypeError, match="no file in an existing folder"):
             TYPES["new_file"](str(path))
+
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in (SCRIPTS / "benches").glob("*.py")))
+def test_every_bench_says_what_it_measures_and_takes_json(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "path", [str(SCRIPTS), *sys.path])
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    monkeypatch.setattr(sys, "argv", ["bench", name, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(SCRIPTS / "bench"), run_name="__main__")
+    shown = capsys.readouterr().out
+    assert ended.value.code == 0
+    assert "--json FILE" in shown
+    assert len(shown.split("\n\n")[1]) > 40  # its docstring
+
+
+def test_ways_run_in_turn_and_the_first_pass_does_not_count() -> None:
+    measuring = runpy.run_path(str(SCRIPTS / "measuring.py"))
+    calls: list[str] = []
+
+    def called(name: str) -> int:
+        calls.append(name)
+        return len(calls)
+
+    ways = {name: partial(called, name) for name in "ab"}
+    assert measuring["in_turn"](ways, 2) == {"a": [3, 5], "b": [4, 6]}
+    assert calls == [*"ababab"]
+    assert measuring["interval"]([1.0, 1.2, 1.1]) == "1.100 x (1.000 to 1.200, 75 %)"

@@ -204,7 +204,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: CouplingGrid([1.0, 2.0], [1.0, 2.0, 3.0]), "do not broadcast"),
     (lambda: minimum_damping(WALL, T, delay=0.5), "whole number of samples"),  # type: ignore[call-overload]
     (lambda: minimum_damping(WALL, T, delay=True), "delay is True"),
-    (lambda: minimum_damping(WALL, T, delay=51), r"delay is 51; it must be .* >= 0 and <= 50"),
+    (lambda: minimum_damping(WALL, T, delay=51), r"delay is 51; it must be .*, 0 to 50"),
     (lambda: z_width(2, T, delay=10**30), "delay is"),
     (lambda: minimum_damping(WALL, T, discretization="euler"), "one of 'backward', 'tustin'"),  # type: ignore[call-overload]
     (lambda: minimum_mass(WALL, T, "rk4"), "one of 'explicit', 'implicit', 'semi_implicit'"),  # type: ignore[arg-type]

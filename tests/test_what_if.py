@@ -142,7 +142,7 @@ def test_commands_are_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     [run] = RecordedRun.from_hands([read_recording(path)], tmp_path / "scene")
     for method, kept in (("direct", False), ("weld", True)):
         again = Repetition([run], [run.settings.changed({"method": method})])
-        assert (again.keeps_resets, again.keeps_couplings) == (kept, False)
+        assert (again.keeps_resets, again.keeps_coupling({})) == (kept, False)
 
 
 def test_a_prescribed_motion_is_the_recorded_one(softer: WhatIf) -> None:

@@ -12,11 +12,18 @@ from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import OK
 from hapticbridge.kernel.force_level import keep_state, limited_wrench_after_step
-from hapticbridge.kernel.hands import before_hands, close_hands, whole_tick_of_hands
 from hapticbridge.kernel.ledger import meter_ports
 from hapticbridge.kernel.parameters import GuardParameters, RunParameters
 from hapticbridge.kernel.state import BoundHands
-from hapticbridge.kernel.tick import active_contacts, advance, keep_wrench, send_wrench
+from hapticbridge.kernel.tick import (
+    active_contacts,
+    advance,
+    before_step,
+    close_tick,
+    keep_wrench,
+    send_wrench,
+    whole_tick,
+)
 from hapticbridge.pose import dot
 from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.rendering import Method, method_named, prepare
@@ -155,19 +162,19 @@ def one_after_the_other(
 
     The wrench of the first hand is evaluated before the second one repeats the step.
     """
-    if before_hands(states, samples, rows, 0, elapsed) != OK:
+    if before_step(states, samples, rows, 0, elapsed) != OK:
         return False
     keep_state(states[1])
     advance(states[0:1])
     meter_ports(states[0])
     for i in range(states.size):
-        force, torque, moved, turned = limited_wrench_after_step(states[i], True)
+        force, torque, moved, turned = limited_wrench_after_step(states[i : i + 1], True)
         work = dot(force, moved) + dot(torque, turned)
         keep_wrench(states[i], work, force, torque, moved, turned)
     for i in range(states.size):
-        if send_wrench(states[i], rows[i : i + 1], active_contacts(states[0])) != OK:
+        if send_wrench(states[i], rows[i], active_contacts(states[0])) != OK:
             return False
-    return close_hands(states, rows) == OK
+    return close_tick(states, rows, False) == OK
 
 
 @compiled
@@ -183,7 +190,7 @@ def attack(
     A hand pushes for some ticks and follows the force for as many, at a share of the speed w/b.
 
     Args:
-        states, samples, rows: As for ``whole_tick_of_hands``.
+        states, samples, rows: As for ``whole_tick``.
         moves: Velocity of pushing in m/s and rad/s by tick, hand and axis, (n, 2, 6).
         habits: b in N s/m, b_r in N m s/rad, pace of following, by hand its ticks of a push, and 1
             for levels that are settled one after the other.
@@ -217,7 +224,7 @@ def attack(
                 q[2] = c * g - x * h + y * e + z * f
                 q[3] = c * h + x * g - y * f + z * e
         if habits[5] == 0.0:
-            is_done = whole_tick_of_hands(states, samples, rows, period)
+            is_done = whole_tick(states, samples, rows, period)
         else:
             is_done = one_after_the_other(states, samples, rows, period)
         if not is_done:
@@ -295,7 +302,7 @@ def attacked(seed: int, scene: str, ticks: int = TICKS, *, is_joint: bool = True
         moves[:, 1, 1:] = 0.0
     pace, lengths = rng.uniform(0.05, 0.6), rng.integers(5, 150, 2)
     habits = np.array([b, b_r, pace, *lengths, not is_joint], dtype=float)
-    most, created, done = attack(bound.states, unmoved(), bound.rows, moves, habits)
-    is_active = int(bound.states[0]["energy"]["first_active"]) >= 0
-    count = int(bound.states["level"]["repetitions"].sum())
+    most, created, done = attack(bound.state, unmoved(), bound.row, moves, habits)
+    is_active = int(bound.state[0]["energy"]["first_active"]) >= 0
+    count = int(bound.state["level"]["repetitions"].sum())
     return Outcome(most, created, is_active, done, count)

@@ -2,11 +2,11 @@
 
 Read ``verdict`` first: the result, and the function decide(), which alone names the verdict. The
 audit checks that the file is whole (``structure``), computes the energies again in plain NumPy
-(``energy``), checks the wrench against the coupling law (``motion``) and the guard's limits
-(``wrench_limits``), the time that the run kept (``timing``), that no part contradicts another
-(``agreement``), and simulates the scene again (``replay``). ``events`` holds the external actions
-of the run and the state that goes from block to block, ``batch`` audits folders. Heavy imports are
-deferred to the first call.
+(``energy``), checks the wrench against the coupling law (``motion``, ``spring``) and the guard's
+limits (``wrench_limits``), the time that the run kept (``timing``), that no part contradicts
+another (``agreement``), and simulates the scene again (``replay``). ``events`` holds the external
+actions of the run and the state that goes from block to block, ``batch`` audits folders. Heavy
+imports are deferred to the first call.
 """
 
 from __future__ import annotations

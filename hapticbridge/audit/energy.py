@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import AuditState, RunEvents
 from hapticbridge.audit.motion import Array, Motion, turn_between
+from hapticbridge.audit.spring import Spring, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation
 from hapticbridge.audit.wrench_limits import (
     AuditedBlock,
     axes_with_motor,
-    limits_on_tool,
-    spring_energy,
     whole_wrench,
 )
 from hapticbridge.kernel.parameters import RunParameters
@@ -81,10 +80,8 @@ def stored_in_springs(
     References:
         Brown & Colgate 1997, eq. (6); here summed over time instead of frequency by frequency.
     """
-    stored = np.zeros(len(gains))
-    for column, limit, e in zip((0, 2), limits_on_tool(parameters), stretched, strict=True):
-        stored += spring_energy(gains[:, column], np.linalg.norm(e, axis=1), limit)
-    return stored
+    linear, angular = springs(gains, parameters)
+    return linear.energy(stretched[0]) + angular.energy(stretched[1])
 
 
 def _springs_at_start(parameters: RunParameters, gains: Array, motion: Motion) -> Array:
@@ -108,16 +105,14 @@ def shown_work(block: AuditedBlock, events: RunEvents) -> Array:
     gains, wrench = events.gains(ticks["tick"]), ticks["wrench_on_tool"]
     twist_before = turn_between(motion.tool_before[:, 3:], ticks["handle_quaternion"])
     work = np.zeros(len(ticks))
-    for column, part, limit, before, after, step in (
-        (0, slice(0, 3), 0, motion.stretch + motion.tool_step, motion.stretch, motion.tool_step),
-        (2, slice(3, 6), 1, twist_before, motion.twist, motion.tool_turn),
+    linear, angular = springs(gains, parameters)
+    for spring, part, before, after, step in (
+        (linear, slice(0, 3), motion.stretch + motion.tool_step, motion.stretch, motion.tool_step),
+        (angular, slice(3, 6), twist_before, motion.twist, motion.tool_turn),
     ):
-        stiffness, level = gains[:, column], limits_on_tool(parameters)[limit]
-        length = np.linalg.norm(after, axis=1)
-        elastic = np.minimum(stiffness, level / np.maximum(length, 1e-300))[:, None] * after
-        work += spring_energy(stiffness, np.linalg.norm(before, axis=1), level)
-        work -= spring_energy(stiffness, length, level)
-        work += np.sum((wrench[:, part] - elastic) * step, axis=1)
+        work += spring.energy(before)
+        work -= spring.energy(after)
+        work += np.sum((wrench[:, part] - spring.force(after)) * step, axis=1)
     return work
 
 
@@ -223,10 +218,10 @@ class EnergyBalance:
             # lent to the scene: what it took and the hand has not given
             created = created - np.maximum(-(ticks["scene_tank"] + discarded), 0.0)
         linear, angular = _slack_gains(parameters, gains)
-        force, torque = limits_on_tool(parameters)
+        spring, torsion = springs(gains, parameters)
         evaluations = parameters.law_evaluations
-        slack = _slack(linear, motion.tool_step, wrench[:, :3], force, evaluations)
-        slack += _slack(angular, motion.tool_turn, wrench[:, 3:], torque, evaluations)
+        slack = _slack(linear, motion.tool_step, wrench[:, :3], spring, evaluations)
+        slack += _slack(angular, motion.tool_turn, wrench[:, 3:], torsion, evaluations)
         totals |= {"coupling_work": coupling_work, "slack": _summed(slack, before["slack"])}
         totals["discarded"] = discarded
         totals |= _device_energies(block, events, delay)
@@ -411,20 +406,20 @@ def _slack_gains(parameters: RunParameters, gains: Array) -> tuple[Array, Array]
     return share * linear, share * angular
 
 
-def _slack(gain: Array, motion: Array, wrench: Array, level: float, evaluations: int) -> Array:
-    """Returns ½ g ‖δx‖², (n,) in J, and 0 where the law passes its level between u + g δx and u.
+def _slack(gain: Array, motion: Array, wrench: Array, spring: Spring, evaluations: int) -> Array:
+    """Returns ½ g ‖δx‖², (n,) in J, and 0 where the law is not straight between u + g δx and u.
 
     Args:
         gain: g of each tick, (n,); with several evaluations per tick, half of that of one.
         motion: δx of the tool, (n, 3) in m or rad.
         wrench: Limited u on the tool, (n, 3) in N or N m.
-        level: Its level in N or N m.
+        spring: The spring of the law.
         evaluations: Evaluations of the law per tick.
     """
     square = np.sum(motion**2, axis=1)
     change = gain * np.sqrt(square) * (1.0 if evaluations == 1 else 1.0 / SLACK_SHARE)
-    is_below = np.sqrt(np.sum(wrench**2, axis=1)) + change <= level
-    return np.asarray(np.where(is_below, 0.5 * gain * square, 0.0))
+    is_straight = spring.is_straight(np.sqrt(np.sum(wrench**2, axis=1)), change)
+    return np.asarray(np.where(is_straight, 0.5 * gain * square, 0.0))
 
 
 def energy_balances(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.commands import bits_in, coupling_in, tuning_ticks
+from hapticbridge.commands import bits_in, concerns, coupling_in, tuning_ticks
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo
 from hapticbridge.errors import HapticBridgeError, RecordingError
@@ -62,7 +62,7 @@ class RunEvents:
             name: [] for name in ("resume", "reset", "coupling", "switch")
         }
         for event in recording.events:
-            if event.get("event") in by_name:
+            if event.get("event") in by_name and concerns(event, parameters):
                 by_name[str(event["event"])].append(event)
         ticks = {
             name: np.array([_tick(event) for event in events], float)

@@ -22,7 +22,6 @@ from hapticbridge.confinement import Confined, Unlimited, Worker
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.files import read_json
 from hapticbridge.kernel.codes import WARNINGS
-from hapticbridge.kernel.hands import simulate_hands
 from hapticbridge.kernel.mujoco_c import quiet, warning_of, without_timers
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.kernel.state import BoundHands, BoundKernel
@@ -166,11 +165,12 @@ class Resimulator:
         self._slow: SlowScene | None = None
         if parameters.scene_ticks:
             self._slow = SlowScene(self.binding, model, data, parameters)
-        self._commands = EventApplier(self.binding, data, method, parameters, start, self._slow)
+        hands = tuple(zip((self.hands or self.binding).hands, every, strict=True))
+        self._commands = EventApplier(hands, data, method, start, self._slow)
         check_start(recording, self.binding.state)
         if self.hands is not None:
             for hand, (other, _) in enumerate(others, 1):
-                check_start(other, self.hands.states[hand : hand + 1])
+                check_start(other, self.hands.state[hand : hand + 1])
 
     @property
     def slack(self) -> float:
@@ -202,21 +202,23 @@ class Resimulator:
         outside = ticks["flags"] & int(TickFlag.STALE_SAMPLE)
         elapsed = self._elapsed(ticks if self.hands is None else ticks[:, 0])
         rows = np.zeros(ticks.shape, TICK_DTYPE)
-        done = 0
+        own, done = self.hands or self.binding, 0
+        by_hand = len(ticks), own.state.size
+        each, found = samples.reshape(by_hand), rows.reshape(by_hand)
+        flags = outside.reshape(by_hand)
         while done < len(ticks) and not self.is_over:
             end = len(ticks)
             if self._changes:
                 end = min(self._due(self._changes[0]) - self.done, end)
-            state, row, part = self.binding.state, self.binding.row, slice(done, end)
-            inputs = samples[part], outside[part], elapsed[part]
-            if self.hands is not None:
-                own = self.hands.states, *inputs, self.hands.rows
-                count = simulate_hands(*own, rows[part])
-            elif self._slow is not None:
+            part = slice(done, end)
+            if self._slow is not None:
+                inputs = samples[part], outside[part], elapsed[part]
                 steps = np.ascontiguousarray(ticks["scene_step"][part])
                 count = self._slow.simulate(*inputs, steps, rows[part])
             else:
-                count = simulate_recorded(state, *inputs, row, rows[part])
+                count = simulate_recorded(
+                    own.state, each[part], flags[part], elapsed[part], own.row, found[part]
+                )
             self.is_over = count < end - done
             done += count
             if self._changes and done == end < len(ticks):

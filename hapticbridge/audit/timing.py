@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from hapticbridge.audit.events import RunEvents
 from hapticbridge.audit.motion import Array, torque_across, turn_between
-from hapticbridge.audit.wrench_limits import AuditedBlock, limits_on_tool, spring_energy
+from hapticbridge.audit.spring import springs
+from hapticbridge.audit.wrench_limits import AuditedBlock
 from hapticbridge.kernel.codes import Scheme
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import TickFlag, has_flag
@@ -107,7 +108,7 @@ class TimingTally:
         scale, force_scale = parameters.scale, parameters.force_scale
         linear, angular = parameters.device_damping, parameters.device_rotational_damping
         motion, total, owed = block.motion, np.zeros(len(ticks)), np.zeros(len(ticks))
-        levels = limits_on_tool(parameters)
+        both = springs(events.gains(ticks["tick"]), parameters)
         pulled = motion.pulled(parameters.law_evaluations)
         for kind, steps, b in (
             (0, motion.handle_step, (linear or 0.0) / (force_scale * scale)),
@@ -128,8 +129,7 @@ class TimingTally:
             cost = np.where(block.is_first, 0.0, cost)
             energy = _drained(cost + np.minimum(lent[:-1] + late, 0.0), self.uncovered[kind])
             total += energy
-            length = np.linalg.norm(pulled[kind], axis=1)
-            paid = spring_energy(gains[:, 0], length, levels[kind])
+            paid = both[kind].energy(pulled[kind])
             debt = _drained(np.where(gains[:, 0] > 0, late - paid, 0.0), self.owed[kind])
             owed += debt
             self.lent[kind], self.uncovered[kind] = lent[-1], energy[-1]

@@ -28,6 +28,7 @@ from hapticbridge.audit.motion import (
     turn_between,
     wrench_by_law,
 )
+from hapticbridge.audit.spring import limits_on_tool, shortened, springs
 from hapticbridge.audit.structure import TOLERANCE, Deviation, is_let_go, may_fade
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.record import UNITS, TickFlag, has_flag
@@ -35,21 +36,6 @@ from hapticbridge.record import UNITS, TickFlag, has_flag
 Flags = NDArray[np.bool_]
 
 _FORCE, _TORQUE = slice(0, 3), slice(3, 6)
-
-
-def limits_on_tool(parameters: RunParameters) -> tuple[float, float]:
-    """Returns force and torque on the tool at the device's limits, in N and N m."""
-    return (
-        parameters.force_limit / parameters.force_scale,
-        parameters.torque_limit * parameters.scale / parameters.force_scale,
-    )
-
-
-def spring_energy(stiffness: Array, length: Array, limit: float) -> Array:
-    """Returns ∫ min(K e, limit) de in J, for each K and length, (n,) each."""
-    at_limit = np.divide(limit, stiffness, out=np.full_like(length, np.inf), where=stiffness > 0)
-    elastic = np.minimum(length, at_limit)
-    return np.asarray(0.5 * stiffness * elastic**2 + limit * (length - elastic))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,13 +117,6 @@ def _newest(is_on: Flags) -> NDArray[np.int64]:
     return np.maximum.accumulate(np.where(is_on, np.arange(len(is_on)), -1))
 
 
-def _shortened(vector: Array, limit: Array | float) -> Array:
-    """Scales vectors (n, 3) down to a largest norm."""
-    norm = np.linalg.norm(vector, axis=1)
-    share = np.divide(limit, norm, out=np.ones_like(norm), where=norm > limit)
-    return np.asarray(vector * share[:, None])
-
-
 def _sample_intervals(ticks: NDArray[np.void], state: AuditState, period: float) -> Array:
     read_ns = np.concatenate([state.row["read_ns"], ticks["read_ns"]])
     interval = np.maximum(np.diff(read_ns) * 1e-9, period)
@@ -153,9 +132,10 @@ def wrench_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Deviat
     ticks, parameters = block.ticks, events.parameters
     yield from _handle_deviations(block, events)
     if parameters.has_law and parameters.law_evaluations == 1:
-        law = wrench_by_law(ticks, events.gains(ticks["tick"]), parameters, block.motion)
-        for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
-            law[:, part] = _shortened(law[:, part], limit)
+        gains = events.gains(ticks["tick"])
+        law = wrench_by_law(ticks, gains, parameters, block.motion)
+        for part, spring in zip((_FORCE, _TORQUE), springs(gains, parameters), strict=True):
+            law[:, part] = spring.limited(law[:, part])
         yield Deviation.between(
             "wrench_on_tool", ticks["wrench_on_tool"], law, "N or N m", "coupling law and poses"
         )
@@ -201,13 +181,12 @@ def _handle_deviations(block: AuditedBlock, events: RunEvents) -> Iterator[Devia
     slipped = pulled + ticks["handle_position"] - position
     back = quaternion_of((1.0 / parameters.law_evaluations - 1.0) * turned)
     slipped_turn = turn_between(tool[:, 3:], quaternion_product(back, ticks["handle_quaternion"]))
-    for column, limit, name, amount, lengths, unit in (
-        (0, 0, "handle_position", off, (pulled, slipped), "m"),
-        (2, 1, "handle_quaternion", angle, (pulled_turn, slipped_turn), "rad"),
+    for kind, name, amount, lengths, unit in (
+        (0, "handle_position", off, (pulled, slipped), "m"),
+        (1, "handle_quaternion", angle, (pulled_turn, slipped_turn), "rad"),
     ):
-        level = limits_on_tool(parameters)[limit]
         stored, kept = (
-            spring_energy(k[:, column], np.linalg.norm(e, axis=1), level)
+            springs(k, parameters)[kind].energy(e)
             for k, e in zip((before, gains), lengths, strict=True)
         )
         gained = np.where(has_slipped & (amount > TOLERANCE), kept - stored, amount)
@@ -223,8 +202,9 @@ def whole_wrench(ticks: NDArray[np.void], parameters: RunParameters) -> Array:
     """Returns the wrench that a device with six motors would be sent, (n, 6) in N and N m."""
     axes = np.array(parameters.axes).reshape(3, 3)
     on_tool = ticks["wrench_on_tool"].copy()
-    for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
-        on_tool[:, part] = _shortened(on_tool[:, part], limit)  # on the tool too with a law
+    if not parameters.has_law:  # a law limits it on the tool too
+        for part, limit in zip((_FORCE, _TORQUE), limits_on_tool(parameters), strict=True):
+            on_tool[:, part] = shortened(on_tool[:, part], limit)
     wrench = -parameters.force_scale * ticks["share"][:, None] * on_tool
     return np.concatenate(
         [wrench[:, _FORCE] @ axes, wrench[:, _TORQUE] / parameters.scale @ axes], axis=1

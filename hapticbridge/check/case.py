@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,7 @@ from hapticbridge.check.observe import Observation, Setting, observe
 from hapticbridge.check.source_map import Place, Places
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import DeviceInfo, Motion, SimulatedDevice, TrajectoryDevice, read_motion
+from hapticbridge.device.base import checked_number
 from hapticbridge.device.trajectory import lissajous
 from hapticbridge.errors import DeviceError, SceneError
 from hapticbridge.kernel.mujoco_c import quiet
@@ -66,6 +67,11 @@ def length(value: float) -> str:
 def weight(mass: float) -> str:
     """Formats a mass given in kg: ``1.2 kg``, ``35 g``."""
     return f"{number(mass)} kg" if mass >= 0.1 else f"{number(1e3 * mass)} g"
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Formats the values of an attribute: ``0.9 0.95 0.001``."""
+    return " ".join(f"{value:g}" for value in values)
 
 
 def others(count: int) -> str:
@@ -160,6 +166,17 @@ class CompiledScene:
         """Compiled scene with handle, at its running time step."""
         return self.scene.model
 
+    @property
+    def step(self) -> float:
+        """Time step h in s."""
+        return float(self.model.opt.timestep)
+
+    @property
+    def tool_bodies(self) -> NDArray[np.bool_]:
+        """True for each body of the grip's tree, (nbody,)."""
+        tree = self.model.body_treeid[self.model.site(self.scene.grip).bodyid[0]]
+        return np.asarray(self.model.body_treeid == tree, dtype=bool)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneUnderCheck(CompiledScene):
@@ -245,8 +262,7 @@ def open_case(
         DeviceError: The motion cannot be read, or the period, scale or workspace is out of range.
         RecordingError: The recording cannot be read.
     """
-    if not math.isfinite(workspace) or workspace <= 0:
-        raise DeviceError(f"workspace is {workspace!r} m; it must be finite and > 0")
+    checked_number("workspace", workspace, "m", is_positive=True)
     has_chosen_period, period = period is not None, DEFAULT_PERIOD if period is None else period
     info = SimulatedDevice().info
     coupling = coupling or default_coupling(info, period, scale, scale)

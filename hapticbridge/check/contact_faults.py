@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from hapticbridge.check.case import Fault, SceneUnderCheck, length, number, others
+from hapticbridge.check.case import Fault, SceneUnderCheck, length, number, numbers, others
 from hapticbridge.check.observe import clearances
-from hapticbridge.check.physics import body_inertia, constraint_stiffness, depth_under
 from hapticbridge.check.source_map import Place
 from hapticbridge.kernel.colliders import MAX_VERTICES
 from hapticbridge.scene.checks import MAXIMUM_START_PENETRATION
@@ -26,6 +25,7 @@ from hapticbridge.scene.contacts import (
     suggested_solref,
     tool_geoms,
 )
+from hapticbridge.scene.physics import body_inertia, constraint_stiffness, depth_under
 
 MIN_PUSH = 1.0
 """Smallest force in N that contacts are tested with: a light touch. A motion without contact does
@@ -59,7 +59,7 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
     active = {
         geom
         for setting, pairs in where.items()
-        if contact_numbers(setting.solref, setting.solimp, float(option.timestep)).grade == "active"
+        if contact_numbers(setting.solref, setting.solimp, case.step).grade == "active"
         for pair in pairs
         for geom in pair
     }
@@ -71,7 +71,7 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
         for concern in contact_concerns(
             setting.solref,
             setting.solimp,
-            float(option.timestep),
+            case.step,
             cone="elliptic" if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC else "pyramidal",
             condim=setting.condim,
             friction=setting.friction,
@@ -85,7 +85,7 @@ def contact_faults(case: SceneUnderCheck) -> Iterator[Fault]:
             yield Fault(
                 "pyramidal cone" if is_cone else "not passive",
                 case.places.option("cone") if is_cone else place,
-                f"the contact of {names} (solref {_numbers(setting.solref)}) {clause}",
+                f'the contact of {names} (solref "{numbers(setting.solref)}") {clause}',
                 change if is_cone else change + also,
             )
 
@@ -165,18 +165,18 @@ def _soft(
     active: set[int],
 ) -> Fault | None:
     """Returns a contact that is too soft; what to write suits ``active`` geoms' other contacts."""
-    step = float(case.model.opt.timestep)
+    step = case.step
     depths = {
         pair: depth_under(
             push, setting.solref, setting.solimp, inertia_of(case, pair, setting), step
         )
         for pair in pairs
     }
-    numbers = contact_numbers(setting.solref, setting.solimp, step)
-    if numbers.resolved <= REFERENCE_STEPS * (1 + ROUNDING):
+    resolved = contact_numbers(setting.solref, setting.solimp, step).resolved
+    if resolved <= REFERENCE_STEPS * (1 + ROUNDING):
         return None  # as stiff as the settings that were passive with light tools
     tight = [pair for pair in pairs if depths[pair] > rooms.get(pair, np.inf)]
-    if not tight and numbers.resolved <= SOFT_STEPS * (1 + ROUNDING):
+    if not tight and resolved <= SOFT_STEPS * (1 + ROUNDING):
         return None
     pair = max(tight or pairs, key=lambda each: depths[each])
     stiffness = constraint_stiffness(
@@ -187,7 +187,7 @@ def _soft(
     sentence = (
         f"the contact of {pair_names(case, [pair])}{others(len(pairs) - 1)} amounts to "
         f"{number(stiffness)} N/m ({default}solref "
-        f"{_numbers(setting.solref)}): {number(push)} N sink in by {length(depths[pair])}"
+        f'"{numbers(setting.solref)}"): {number(push)} N sink in by {length(depths[pair])}'
     )
     if pair in rooms:
         sentence += f", into a clearance of {length(rooms[pair])}"
@@ -214,7 +214,7 @@ def inertia_of(case: SceneUnderCheck, pair: tuple[int, int], setting: ContactSet
     if seen is not None and np.isfinite(seen.inertia):
         return seen.inertia
     is_tool = tool_geoms(model, case.scene.grip)
-    step, inverse = float(model.opt.timestep), 0.0
+    step, inverse = case.step, 0.0
     share = step * case.law.damping + step**2 * case.law.stiffness
     for geom in pair:
         inertia = body_inertia(model, case.scene.data, int(model.geom_bodyid[geom]))
@@ -270,10 +270,6 @@ def pair_names(case: SceneUnderCheck, pairs: list[tuple[int, int]]) -> str:
     """Returns the names of the first pair of geoms, and the number of further pairs."""
     first, second = (case.places.geom(geom).element for geom in pairs[0])
     return f"{first} with {second}{others(len(pairs) - 1)}"
-
-
-def _numbers(values: tuple[float, ...]) -> str:
-    return f'"{" ".join(f"{value:g}" for value in values)}"'
 
 
 # Faults of contacts at the start, and of contact margins

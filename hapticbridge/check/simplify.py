@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from hapticbridge.check.physics import IDENTITY, matrix_of, pose_in, quaternion_of, rotation_vector
 from hapticbridge.check.version import MotionTrace, SceneVariant, census, model_of
+from hapticbridge.scene.physics import IDENTITY, matrix_of, pose_in, quaternion_of, rotation_vector
 
 OTHER_MOTIONS, PICTURE = "in this motion", "with the picture"
 """Losses of a simplification that a hand cannot notice in one motion."""

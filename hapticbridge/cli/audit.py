@@ -9,11 +9,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table as TextTable
 
+from hapticbridge.arguments import option
 from hapticbridge.audit import AuditReport, audit, verdict_words
 from hapticbridge.audit.batch import (
     UNREADABLE,
@@ -148,7 +147,7 @@ class Audit:
         hapticbridge audit run.mcap --what-if stiffness=400,800,1600
     """
 
-    files: tyro.conf.Positional[tuple[Path, ...]]
+    files: tuple[Path, ...] = option(metavar="FILE", is_positional=True)
     """Recordings (.mcap), folders of them, or patterns such as 'runs/**/a*.mcap'."""
     strict: bool = False
     """Accept only passivity itself, not the slack that the device's damping leaves."""
@@ -157,7 +156,7 @@ class Audit:
     in_process: bool = False
     """Simulate in this process, for recordings of a known origin: without the child process whose
     memory and time are limited."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the reports as a JSON list."""
     plot: Path | None = None
     """Draw force, position and energies into this picture (.png, .svg or .pdf; one file only)."""
@@ -171,9 +170,7 @@ class Audit:
     """Address of a dask.distributed scheduler to audit several on (extra 'cluster'), in place of
     --jobs; its workers must see the files under the same names."""
 
-    what_if: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")
-    ] = ()
+    what_if: tuple[str, ...] = option((), metavar="NAME=VALUE", is_repeated=True)
     """Simulate the recorded hand again with this changed; several of them add up to one change.
     Several values of one NAME, as in stiffness=400,800, are compared side by side. NAME is
     stiffness, damping, rotational_stiffness, rotational_damping, method, rate, substeps,
@@ -398,9 +395,9 @@ class Repair:
         hapticbridge repair cut.mcap whole.mcap
     """
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    file: Path = option(metavar="FILE", is_positional=True)
     """The cut recording; it is not changed."""
-    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
+    output: Path = option(metavar="OUTPUT", is_positional=True)
     """The file to write; it must not exist."""
 
     def execute(self) -> int:

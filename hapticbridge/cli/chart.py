@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from hapticbridge.arguments import option
 from hapticbridge.cli.terminal import err, out, plain, print_json, progress
 from hapticbridge.errors import StudyError, choices
 from hapticbridge.lab.chart.chart import MIN_REPEATS, REPEATS, Extent, measure_chart, open_workload
@@ -44,7 +43,7 @@ class Chart:
         hapticbridge chart peg_in_hole --out charts
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: str = option(metavar="SCENE", is_positional=True)
     """A workload's or scene's name, or an MJCF file."""
     methods: tuple[str, ...] | None = None
     """Rendering methods; by default all of them."""
@@ -58,7 +57,7 @@ class Chart:
     """Three time steps and three rounds of timing: about a minute."""
     scene_rates: bool = False
     """Chart a scene that steps less often than the loop, beside a loop that is as slow."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print what the chart says as JSON."""
 
     def execute(self) -> int:
@@ -149,18 +148,18 @@ class Stability:
         hapticbridge stability coupling --out maps
     """
 
-    name: tyro.conf.Positional[str]
+    name: str = option(metavar="NAME", is_positional=True)
     """A map's name, or 'all': coupling, rate, device, tool_mass, contact, geometry, rotation,
     restitution."""
     out: Path = Path("stability")
     """Folder to write to."""
     points: int | None = None
     """About how many runs or points; by default the map's own number, for about a minute."""
-    form: Annotated[Literal["csv", "parquet"], tyro.conf.arg(name="format")] = "csv"
+    form: Literal["csv", "parquet"] = option("csv", flag="format")
     """Format of the table; parquet needs the extra 'tables'."""
     scheduler: str | None = None
     """Address of a dask.distributed scheduler to compute on (extra 'cluster')."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print what each map found as a JSON list."""
 
     def execute(self) -> int:

@@ -9,12 +9,12 @@ import textwrap
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-import tyro
 from rich.table import Table
 
+from hapticbridge.arguments import option, shared
 from hapticbridge.certificate import default_coupling
 from hapticbridge.check.case import (
     DEFAULT_PERIOD,
@@ -27,6 +27,7 @@ from hapticbridge.check.case import (
     weight,
 )
 from hapticbridge.check.cost import TICK_SHARE, Cost, Growth, draw_cost, measure_cost
+from hapticbridge.check.findings import find_faults
 from hapticbridge.check.inventory import MEETS_TOOL, Inventory, take_inventory
 from hapticbridge.check.lean import (
     MAY_GO,
@@ -37,16 +38,17 @@ from hapticbridge.check.lean import (
     find_lean,
 )
 from hapticbridge.check.lean_output import check_target, lean_facts, write_lean
-from hapticbridge.check.run_faults import find_faults
 from hapticbridge.check.simplify import OTHER_MOTIONS
 from hapticbridge.cli.terminal import compiling, err, out, plain, print_json, progress
 from hapticbridge.clock import period_of
 from hapticbridge.coupling import Coupling
 from hapticbridge.device import SimulatedDevice
 from hapticbridge.errors import SceneError
+from hapticbridge.hands import Grasp
 from hapticbridge.kernel.mujoco_c import quiet
+from hapticbridge.options import BridgeOptions, Workspace
 from hapticbridge.plotting import check_ending, write_picture
-from hapticbridge.rendering import RunCoupling, default_method
+from hapticbridge.rendering import RIGID, Contact, RunCoupling, default_method
 from hapticbridge.scene import plain_model, read_scene, settings_from
 from hapticbridge.units import format_si
 
@@ -298,7 +300,7 @@ class Check:
 
     FIRST_OPTIONS: ClassVar = (
         "scene",
-        "settings",
+        "set",
         "grip",
         "motion",
         "contact",
@@ -306,33 +308,28 @@ class Check:
         "lean",
         "budget",
         "write",
-        "as_json",
+        "json",
     )
 
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    scene: str = option(metavar="SCENE", is_positional=True)
     """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
-    settings: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")
-    ] = ()
+    settings: tuple[str, ...] = option((), flag="set", metavar="NAME=VALUE", is_repeated=True)
     """Set a parameter of the scene, as often as wanted: --set clearance=0.1e-3."""
-    grip: str = "grip"
-    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
-    body's frame. If the scene has none of that name, the most plausible ones are listed."""
+    grip: str = shared(Grasp, "grip", "grip")
     motion: Path | None = None
     """Motion of the handle (CSV or recording); by default NAME.csv beside the scene, or else the
     simulated hand's own: slow, 1 cm."""
-    rate: float | None = None
+    rate: float | None = shared(BridgeOptions, "rate", None)
     """Ticks per second; by default 1000, and then a scene with another time step is told so."""
-    stiffness: float | None = None
+    stiffness: float | None = shared(Coupling, "stiffness", None)
     """Coupling stiffness K in N/m; by default the stiffest that is safe on the simulated device."""
-    damping: float | None = None
+    damping: float | None = shared(Coupling, "damping", None)
     """Coupling damping B in N s/m at the hand."""
-    contact: Literal["rigid", "scene"] = "rigid"
+    contact: Contact = shared(BridgeOptions, "contact", RIGID)
     """Contacts of the run that the scene is checked for. 'rigid', the default of 'run': settings of
     contacts, limits and equality constraints do not matter. 'scene': those of the MJCF."""
-    scale: float = 1.0
-    """Handle motion per device motion."""
-    workspace: float = LARGEST_WORKSPACE
+    scale: float = shared(Workspace, "scale")
+    workspace: float = option(LARGEST_WORKSPACE, unit="m", least=0.0, is_open=True)
     """Edge in m of the cube that your device reaches; by default that of the largest table-top
     devices."""
     plot: Path | None = None
@@ -345,7 +342,7 @@ class Check:
     """Write the leanest scene to this file (.xml), read it back, judge it again; implies --lean."""
     overwrite: bool = False
     """Replace the scene of --write if the file exists."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print everything as JSON."""
 
     def execute(self) -> int:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
 from rich.table import Table
 
+from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import out, plain, print_json, progress
 from hapticbridge.device.discovery import RULES_FILE, blind_spots, plugged_devices, udev_rules
 from hapticbridge.device.driver import RULES_COMMAND, Driver, FoundDevice
 from hapticbridge.device.registry import all_drivers, driver_named
 from hapticbridge.device.watchdog import HANG
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.realtime.doctor import Diagnosis, diagnose
+from hapticbridge.options import BridgeOptions
+from hapticbridge.realtime.doctor import LONGEST, SHORTEST, Diagnosis, diagnose
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class Devices:
 
     udev_rules: bool = False
     """Print udev rules by which the user at this machine may open the devices, and nothing else."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the lists as JSON."""
 
     def execute(self) -> int:
@@ -184,11 +185,10 @@ class Doctor:
         hapticbridge doctor --rate 2000 --duration 60
     """
 
-    rate: float = 1000.0
-    """Ticks per second."""
-    duration: float = 20.0
+    rate: float = shared(BridgeOptions, "rate")
+    duration: float = option(20.0, unit="s", least=SHORTEST, most=LONGEST)
     """Seconds to measure; the loops that are compared take turns."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the diagnosis as JSON."""
 
     def execute(self) -> int:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.markdown import Markdown
 
+from hapticbridge.arguments import option
 from hapticbridge.cli.terminal import out
 from hapticbridge.errors import HapticBridgeError, choices, nearest
 
@@ -76,7 +76,7 @@ class Guide:
         hapticbridge guide first-run
     """
 
-    topic: tyro.conf.Positional[str | None] = None
+    topic: str | None = option(None, metavar="TOPIC", is_positional=True)
     """Topic of the page; without one, the topics are listed."""
 
     def execute(self) -> int:

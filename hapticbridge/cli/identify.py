@@ -6,12 +6,12 @@ import shlex
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from rich.table import Table
 
+from hapticbridge.arguments import option, shared
 from hapticbridge.certificate import default_coupling
 from hapticbridge.cli.terminal import notify, out, plain, print_json, progress, write_figure
 from hapticbridge.cli.zwidth import next_command
@@ -32,6 +32,7 @@ from hapticbridge.identify.identify import (
     measured_profile,
 )
 from hapticbridge.loop_setting import Lag, delay_ticks, whole_ticks
+from hapticbridge.options import BridgeOptions
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
@@ -210,20 +211,19 @@ class Identify:
         hapticbridge identify simulated:hand=none,damping=1.5,friction=0.1 --plot fit.png
     """
 
-    device: tyro.conf.Positional[str]
+    device: str = option(metavar="DEVICE", is_positional=True)
     """As 'run --device' takes it."""
     axes: tuple[str, ...] = ()
     """Axes to move (x y z rx ry rz); by default all that the device has."""
-    duration: float | None = None
+    duration: float | None = option(None, unit="s", least=2.0, most=600.0)
     """Seconds per axis; by default 12, more below 333 Hz."""
-    travel: float = TRAVEL[0]
+    travel: float = option(TRAVEL[0], unit="m", least=1e-4, most=1.0)
     """Travel to each side in m."""
-    turn: float = TRAVEL[1]
+    turn: float = option(TRAVEL[1], unit="rad", least=1e-3, most=3.0)
     """Turn to each side in rad."""
-    force_share: float = FORCE_SHARE
-    """Share of the device's force limit that may be used, 0 to 1."""
-    rate: float = 1000.0
-    """Ticks per second."""
+    force_share: float = option(FORCE_SHARE, least=1e-3, most=1.0)
+    """Share of the device's force limit that may be used."""
+    rate: float = shared(BridgeOptions, "rate")
     save: Path | None = None
     """Write the profile to this file; by default into the folder of your own profiles, for a real
     device only."""
@@ -231,7 +231,7 @@ class Identify:
     """Draw the fit into this picture (.png, .svg or .pdf)."""
     zwidth: Path | None = None
     """Draw the stiffness and damping that the device can show into this picture."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the result as JSON."""
 
     def execute(self) -> int:
@@ -240,7 +240,6 @@ class Identify:
         check_ending(self.zwidth)
         period = period_of(self.rate)
         duration = duration_at(period) if self.duration is None else self.duration
-        self._check(duration)
         if self.plot is not None and self.plot == self.zwidth:
             raise HapticBridgeError(f"--plot and --zwidth both name '{self.plot}'")
         device = open_device(self.device, notify=notify)
@@ -288,19 +287,6 @@ class Identify:
         elif self.zwidth is not None:
             notify(f"'{self.zwidth}' is not drawn: {why_none(result)}")
         return 0
-
-    def _check(self, duration: float) -> None:
-        for name, value, least, most, unit in (
-            ("duration", duration, 2.0, 600.0, "s"),
-            ("travel", self.travel, 1e-4, 1.0, "m"),
-            ("turn", self.turn, 1e-3, 3.0, "rad"),
-            ("force_share", self.force_share, 1e-3, 1.0, ""),
-        ):
-            if not least <= value <= most:
-                flag = name.replace("_", "-")
-                raise HapticBridgeError(
-                    f"--{flag} is {value!r} {unit}".rstrip() + f"; it must be {least:g} to {most:g}"
-                )
 
     def _axes(self, present: tuple[str, ...]) -> tuple[str, ...]:
         for axis in self.axes:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import importlib
-import math
 import os
 import signal
 import sys
@@ -132,6 +131,8 @@ def _execute(name: str, words: list[str]) -> int:
     kind = command_class(name)
     with interrupting_on_signals(ENDING_SIGNALS):
         command = _parsed(kind, name, words)
+        if command is None:
+            return DONE
         from hapticbridge.cli.terminal import warnings_in_a_sentence  # noqa: PLC0415 - rich
 
         with warnings_in_a_sentence():
@@ -172,91 +173,16 @@ def _without_glfw() -> Iterator[None]:
 
 
 def _parsed(command: type[Any], name: str, words: list[str]) -> Any:
-    """Returns the command with its options; ``--help`` prints and exits."""
-    import inspect  # noqa: PLC0415 - not for --version and --help
+    """Returns the command with its options, or None after printing its help."""
+    from hapticbridge.arguments import check_fields  # noqa: PLC0415 - not for --version
+    from hapticbridge.cli import flags  # noqa: PLC0415
 
-    import tyro  # noqa: PLC0415
-
-    description = _reflowed(inspect.getdoc(command) or "")
     if {"-h", "--help", "--help-all"} & set(words):
-        is_whole = "--help-all" in words
-        command, hidden = _with_first_options(command, is_whole=is_whole)
-        words = ["--help"]
-        if hidden:
-            description += f"\n\n{hidden} more options: hapticbridge {name} --help-all"
-    return tyro.cli(
-        command,
-        prog=f"hapticbridge {name}",
-        description=description,
-        args=words,
-        config=(
-            tyro.conf.OmitSubcommandPrefixes,
-            tyro.conf.FlagCreatePairsOff,
-            tyro.conf.DisallowNone,
-        ),
-    )
-
-
-def _with_first_options(command: type[Any], *, is_whole: bool) -> tuple[type[Any], int]:
-    """Returns a class for the command's help alone, and the number of options that it hides.
-
-    It shows the command's ``FIRST_OPTIONS``, or all options if it is whole or the command has few
-    and names none. A default of None or inf is not printed: the option's
-    description has it.
-    """
-    from dataclasses import fields, make_dataclass  # noqa: PLC0415 - for a command's help alone
-    from typing import Annotated, get_type_hints  # noqa: PLC0415
-
-    import tyro  # noqa: PLC0415
-
-    hints, descriptions = get_type_hints(command, include_extras=True), _descriptions(command)
-    first = hints if is_whole else getattr(command, "FIRST_OPTIONS", hints)
-    changed: list[tuple[str, Any, Any]] = []
-    for field in fields(command):
-        if field.name not in first:
-            marker: Any = tyro.conf.Suppress
-        else:
-            hint = "" if field.default in (None, -math.inf, math.inf) else None
-            marker = tyro.conf.arg(help=descriptions[field.name], help_behavior_hint=hint)
-        changed.append((field.name, Annotated[hints[field.name], marker], field))
-    count = sum(field.name not in first for field in fields(command))
-    return make_dataclass(command.__name__, changed, bases=(command,), frozen=True), count
-
-
-def _descriptions(command: type[Any]) -> dict[str, str]:
-    """Returns the text below each option of a command's class, without its line breaks."""
-    import ast  # noqa: PLC0415 - for a command's help alone
-    import inspect  # noqa: PLC0415
-    from itertools import pairwise  # noqa: PLC0415
-
-    (body,) = ast.parse(inspect.getsource(command)).body
-    assert isinstance(body, ast.ClassDef)
-    return {
-        option.target.id: " ".join(ast.literal_eval(text.value).split())
-        for option, text in pairwise(body.body)
-        if isinstance(option, ast.AnnAssign)
-        and isinstance(option.target, ast.Name)
-        and isinstance(text, ast.Expr)
-    }
-
-
-def _reflowed(text: str) -> str:
-    """Wraps the paragraphs below the summary at 80 columns; an example keeps its lines.
-
-    They are indented, because tyro joins lines that begin with a letter and wraps no description.
-    Before an indented line it adds a line break of its own.
-    """
-    import textwrap  # noqa: PLC0415 - for a command's help alone
-
-    summary, *paragraphs = text.split("\n\n")
-    for paragraph in paragraphs:
-        if "\n " in paragraph:
-            summary += f"\n\n{paragraph}"
-        else:
-            summary += "\n" + textwrap.indent(
-                textwrap.fill(paragraph, 78, break_on_hyphens=False), "  "
-            )
-    return summary
+        print(flags.help_page(command, name, is_whole="--help-all" in words), flush=True)
+        return None
+    made = flags.built(command, flags.values_of(command, name, words))
+    check_fields(made)
+    return made
 
 
 def _print_version() -> int:

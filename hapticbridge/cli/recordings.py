@@ -5,19 +5,18 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from hapticbridge.arguments import option, shared
 from hapticbridge.cli.terminal import err, notify, out, plain, print_json, progress
 from hapticbridge.compare import Comparison, Difference, compare
 from hapticbridge.dataset import DATASETS, write_dataset
 from hapticbridge.errors import RecordingError
 from hapticbridge.export import EVERYTHING, export, time_of
 from hapticbridge.files import atomic_write
-from hapticbridge.film import Shot, draw
+from hapticbridge.film import USUAL_SHOT, Shot, draw
 from hapticbridge.recording import read_recording
 from hapticbridge.units import format_si
 from hapticbridge.view import Address
@@ -37,11 +36,9 @@ class View:
         hapticbridge view run.mcap --save run.html
     """
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    file: Path = option(metavar="FILE", is_positional=True)
     """The recording (.mcap)."""
-    port: int = 8080
-    """Port on this machine, where only the printed address gets in; 0: any that is free. From
-    another machine: ssh -L 8080:localhost:8080 MACHINE, then open the printed address there."""
+    port: int = shared(Address, "port")
     save: Path | None = None
     """Write the scene in motion to this page (.html) and end; it needs no server and no network."""
     overwrite: bool = False
@@ -97,26 +94,11 @@ class Render:
         hapticbridge render run.mcap slow.mp4 --start 2 --stop 3 --speed 0.1
     """
 
-    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+    file: Path = option(metavar="FILE", is_positional=True)
     """The recording (.mcap)."""
-    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUTPUT")]
+    output: Path = option(metavar="OUTPUT", is_positional=True)
     """The picture (.png), or the film (.mp4, extra 'view')."""
-    at: float | None = None
-    """Time of a picture in s from the start of the run; by default that of the largest force."""
-    start: float = 0.0
-    """Start of a film in s of the run."""
-    stop: float | None = None
-    """End of a film in s of the run; by default the run's end."""
-    speed: float = 1.0
-    """Speed of a film: 0.1 shows a second of the run in ten."""
-    camera: str | None = None
-    """A camera of the scene, by name; by default the free one, as the scene's file sets it."""
-    width: int = 800
-    """Width in pixels, even."""
-    height: int = 600
-    """Height in pixels, even."""
-    fps: int = 30
-    """Frames per second of a film."""
+    shot: Shot = USUAL_SHOT
     overwrite: bool = False
     """Replace the picture or film if the file exists."""
 
@@ -127,8 +109,8 @@ class Render:
         """Draws; returns the exit code."""
         if self.output.exists() and not self.overwrite:
             raise RecordingError(f"'{self.output}' exists; choose another file or add --overwrite")
-        shot = Shot(**{field.name: getattr(self, field.name) for field in fields(Shot)})
-        if self.at is None and self.output.suffix.lower() == ".png":
+        shot = self.shot
+        if shot.at is None and self.output.suffix.lower() == ".png":
             from hapticbridge.report import telling_time  # noqa: PLC0415 - imports matplotlib
 
             shot = replace(shot, at=telling_time(read_recording(self.file, 0)))
@@ -152,34 +134,33 @@ class Export:
         hapticbridge export run.mcap --format csv --from 12.5 --to 20 --out grasp.csv
     """
 
-    files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")]
+    files: tuple[Path, ...] = option(metavar="FILE", is_positional=True)
     """The recording; several for 'lerobot' and 'robomimic'."""
-    form: Annotated[
-        Literal["parquet", "csv", "hdf5", "rerun", "foxglove", "lerobot", "robomimic"],
-        tyro.conf.arg(name="format"),
-    ]
+    form: Literal["parquet", "csv", "hdf5", "rerun", "foxglove", "lerobot", "robomimic"] = option(
+        flag="format"
+    )
     """The format. 'parquet' and 'lerobot' need the extra 'tables', 'hdf5' and 'robomimic' the extra
     'hdf5', 'rerun' the extra 'rerun'."""
-    start: Annotated[float, tyro.conf.arg(name="from", metavar="S")] = -math.inf
+    start: float = option(-math.inf, flag="from", metavar="S")
     """First time to write, in s of the run; by default its start."""
-    end: Annotated[float, tyro.conf.arg(name="to", metavar="S")] = math.inf
+    end: float = option(math.inf, flag="to", metavar="S")
     """Time in s of the run before which the last tick lies; by default its end."""
     out: Path | None = None
     """File to write; by default the recording's name with the format's ending. A folder that does
     not exist for 'lerobot' and 'robomimic', by default the format's name."""
     overwrite: bool = False
     """Replace the file if it exists."""
-    hand: Annotated[str | None, tyro.conf.arg(metavar="GRIP")] = None
+    hand: str | None = option(None, metavar="GRIP")
     """Grip of the hand to write, of a run of several; a table has one hand."""
     fps: int | None = None
     """Frames per second of a data set, by default 30."""
     camera: str | None = None
     """Camera of the scene whose pictures a data set holds, or 'free'; by default none."""
-    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H")] = None
+    size: tuple[int, int] | None = option(None, metavar="W H")
     """Width and height of the pictures in pixels, both even; by default 320 240."""
     task: str | None = None
     """Text of a data set on its task; by default the scene's name."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print what was written as JSON."""
 
     def execute(self) -> int:
@@ -260,11 +241,11 @@ class Compare:
         hapticbridge compare before.mcap after.mcap
     """
 
-    first: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="A")]
+    first: Path = option(metavar="A", is_positional=True)
     """A recording."""
-    second: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="B")]
+    second: Path = option(metavar="B", is_positional=True)
     """Another one."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the comparison as JSON."""
 
     def execute(self) -> int:

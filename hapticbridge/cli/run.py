@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from signal import Signals
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import tyro
 from rich.markup import escape
 
+from hapticbridge.arguments import option, shared
 from hapticbridge.bridge import Bridge
 from hapticbridge.certificate import (
     conditions_of,
@@ -23,7 +23,7 @@ from hapticbridge.certificate import (
     run_conditions,
 )
 from hapticbridge.check.case import DEFAULT_SECONDS
-from hapticbridge.check.model_faults import worst_faults
+from hapticbridge.check.findings import worst_faults
 from hapticbridge.check.observe import Setting
 from hapticbridge.check.own_motion import NO_HAND, own_substeps
 from hapticbridge.cli.terminal import compiling, err, notify, out, plain, print_json
@@ -33,22 +33,15 @@ from hapticbridge.device import AXES, Device, DeviceInfo, device_for
 from hapticbridge.device.base import checked_close
 from hapticbridge.device.mouse import MouseDevice
 from hapticbridge.errors import HapticBridgeError, RecordingError, SafetyTrip, choices
-from hapticbridge.guard import (
-    USUAL_ENERGY,
-    USUAL_HOLD_TORQUE,
-    USUAL_STRETCH,
-    Limits,
-    refuse_simulated_time,
-)
+from hapticbridge.guard import refuse_simulated_time
 from hapticbridge.hands import Grasp, GripAxis, check_grasps
 from hapticbridge.kernel.parameters import RunParameters
 from hapticbridge.loop_setting import device_period
 from hapticbridge.options import (
     AUTO,
-    SAME_FRAME,
+    DEFAULT_OPTIONS,
     BridgeOptions,
     RunSetup,
-    Workspace,
     steady_rotational_stiffness,
     steady_stiffness,
 )
@@ -266,7 +259,7 @@ def _weight_in_hand(setup: RunSetup, parameters: RunParameters) -> Iterator[str]
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
     """Put a scene behind a haptic device and feel it.
 
@@ -279,10 +272,10 @@ class Run:
 
     FIRST_OPTIONS: ClassVar = (
         "scene",
-        "settings",
+        "set",
         "grip",
         "device",
-        "force_limit",
+        "force-limit",
         "dead_man",
         "duration",
         "record",
@@ -292,38 +285,25 @@ class Run:
         "view",
     )
 
-    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    scene: str = option(metavar="SCENE", is_positional=True)
     """An MJCF file, or a scene's name (see 'hapticbridge scenes')."""
-    settings: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="NAME=VALUE")
-    ] = ()
+    settings: tuple[str, ...] = option((), flag="set", metavar="NAME=VALUE", is_repeated=True)
     """Set a parameter of the scene, as in --set clearance=0.1e-3. 'hapticbridge scenes NAME' lists
     the parameters with units and ranges."""
-    grip: str = "grip"
-    """Site that the hand holds; or BODY, at its centre of mass; or BODY@x,y,z, a point in m in the
-    body's frame. If the scene has none of that name, the most plausible ones are listed."""
+    grip: str = shared(Grasp, "grip", "grip")
     as_is: bool = False
     """Refuse a scene that must be changed to be felt: options that exclude the coupling (solver
     PGS, noslip_iterations, sleep), force limits of joints, a tool inside something or too heavy.
     By default it is changed, with a line for each change."""
-    grip_axis: Annotated[str | None, tyro.conf.arg(metavar="JOINT")] = None
-    """Hinge or slide of the scene that the device's grip axis moves, as the jaw of pliers. By
-    default the one that the scene names in its custom text 'grip_axis'; 'none' leaves it free."""
-    grip_scale: float | None = None
-    """Motion of that joint per motion of the grip, in rad/m or without unit; below 0 for a joint
-    that falls while the grip closes. By default the joint's range over the grip's travel."""
-    device: str = "simulated"
-    """'simulated' (in the scene's own hand), 'simulated:damping=5,hand_mass=1', 'trajectory:FILE'
-    (CSV or recording), 'mouse' (drag the handle in the view, which it shows by itself), or a device
-    from the list of 'hapticbridge devices'."""
-    hand: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="GRIP=DEVICE")
-    ] = ()
+    grip_axis: str | None = shared(GripAxis, "joint", None, metavar="JOINT")
+    grip_scale: float | None = shared(GripAxis, "scale")
+    device: str = shared(Grasp, "device")
+    hand: tuple[str, ...] = option((), metavar="GRIP=DEVICE", is_repeated=True)
     """Hold a grip with a device, in place of --grip and --device, once per hand: --hand
     wrench=falcon --hand bolt=spacemouse. Both are named as for those two; GRIP+JOINT names what the
     device's grip axis moves. Scale, axes, limits and gains apply to every hand, --clutch and
     --dead-man to every real device. The method is 'implicit' or 'compensated'."""
-    duration: float | None = None
+    duration: float | None = option(None, unit="s", least=0.0, is_open=True)
     """Duration in s; each missed deadline uses up one period of it. By default a recorded or
     scripted motion is run to its end, which missed deadlines delay; any other device runs until
     Ctrl-C, with --fast for 5 s."""
@@ -331,97 +311,20 @@ class Run:
     """File to record to (.mcap)."""
     overwrite: bool = False
     """Replace the recording of --record if the file exists."""
-    method: str | None = None
-    """Rendering method. 'lossless', the default: half of the coupling inside MuJoCo's step, half
-    carried over; second order away from contact. 'implicit', the default with substeps: all of the
-    coupling inside the step, which adds K T to the damping. 'compensated': 'implicit' with the
-    added K T subtracted from the coupling's damping. Or a method that exists to be compared, such
-    as 'explicit', 'weld' or 'direct' (a tool without mass); an unknown name lists them."""
-    contact: Literal["rigid", "scene"] | None = None
-    """Contacts. 'rigid', the default: strictly passive, sharp, with Coulomb friction in an elliptic
-    cone. 'scene': MuJoCo's contacts with the settings of the MJCF, as methods for comparison have
-    them."""
-    contact_stiffness: float | None = None
-    """Stiffness per contact in N/m of method 'direct'; by default that of the coupling."""
-    i_know: bool = False
-    """Accept a method that may kick on a real device; the first three never need it."""
-    rate: float = 1000.0
-    """Ticks per second."""
-    substeps: int | None = None
-    """MuJoCo steps per tick; with more than one the mean of their wrenches is sent. By default one,
-    or as many as keep the file's own time step if it is shorter and the scene alone would move
-    noticeably differently."""
-    scene_rate: Annotated[float | Literal["auto"], tyro.conf.arg(metavar="HZ")] = AUTO
-    """Steps of the scene per second. Below --rate the scene steps in a thread of its own, and the
-    tool is shown between its steps, passively. By default 'auto': every tick if the scene can keep
-    the rate, else as often as it can."""
-    realtime: bool = False
-    """Request real-time priority and locked memory for the loop, and print what the system refuses
-    (see 'hapticbridge doctor'). Always done with a real device."""
     fast: bool = False
     """Run in simulated time: as fast as possible, with equal results in every run."""
-    stiffness: float | None = None
-    """Coupling stiffness K in N/m; by default the stiffest that leaves 15 % of the device's
-    damping unused."""
-    damping: float | None = None
-    """Requested damping B of the coupling in N s/m. The law uses B - KT/2 with 'lossless', B - KT
-    with 'compensated', at least 0; B with all others. The device needs b >= KT/2 + B_law."""
-    rotational_stiffness: float | None = None
-    """Rotational coupling stiffness in N m/rad."""
-    rotational_damping: float | None = None
-    """Rotational coupling damping in N m s/rad at the hand."""
-    scale: float = 1.0
-    """Handle motion per device motion."""
-    force_scale: float | None = None
-    """Force on the device per force on the tool; by default equal to scale."""
-    axes: tuple[float, float, float, float, float, float, float, float, float] | None = None
-    """Rotation from the device's axes to the scene's: 9 numbers, row by row."""
-    absolute: bool = False
-    """Take the device's poses as poses in the scene instead of relative to its start."""
-    force_limit: float | None = None
-    """Largest force on the device in N; by default the device's own."""
-    torque_limit: float | None = None
-    """Largest torque on the device in N m; by default the device's own."""
-    hold_torque: float = USUAL_HOLD_TORQUE
-    """Torque in N m with which the tool keeps its orientation where the device cannot turn it."""
-    ramp: float | None = None
-    """Seconds over which the force rises at the start, and the handle begins to follow the device;
-    by default 0.5 on a real device."""
+    coupling: Mapping[str, float] = option(gains_of=Coupling)
+    options: BridgeOptions = DEFAULT_OPTIONS
     view: bool = False
     """Show the run in a browser, from a process of its own; needs the extra 'view'."""
-    port: int | None = None
+    port: int | None = option(None, least=0, most=65535)
     """Port of the view on this machine, by default 8080; 0 takes any free port. Only the printed
     address opens it. From another machine: ssh -L 8080:localhost:8080 MACHINE."""
-    controller: Literal["damper", "environment", "off"] | None = None
-    """Passivity controller, damping added against energy that came from nowhere. 'damper' acts when
-    the hand got more than it put in, 'environment' when the scene has created more than the
-    coupling's slack. By default 'environment', or 'damper' if the device condition fails."""
-    clutch: int | None = None
-    """Button of the device, from 0: while it is held the device moves without handle and force."""
-    dead_man: int | None = None
-    """Button of the device, from 0, that must be held for any force."""
-    tool_weight: bool = True
-    """By default the hand feels the tool's weight, unless the device cannot hold it. With
-    --no-tool-weight the bridge carries it."""
-    mark: int | None = None
-    """Button of the device, from 0: each press writes an event 'mark' into the recording.
-    'hapticbridge export --from S --to S' cuts a recording."""
-    stretch_limit: float = USUAL_STRETCH
-    """Largest distance between handle and tool in m; beyond it the run is stopped."""
-    reach_limit: float | None = None
-    """Largest distance in m of the device from the middle of its workspace; beyond it the device
-    moves without handle and force. By default the reach of its data sheet, else inf. A smaller
-    limit keeps force away from its mechanical stops."""
-    energy_limit: float = USUAL_ENERGY
-    """Largest energy in J that the hand may get beyond what it put in; a wrench that would pass it
-    is not sent and the run is stopped. inf for scenes whose motors are meant to push the hand."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the summary as JSON."""
 
     def execute(self) -> int:
         """Runs the bridge; returns the exit code."""
-        if self.duration is not None and not 0 < self.duration < math.inf:
-            raise HapticBridgeError(f"duration is {self.duration!r} s; it must be finite and > 0")
         if self.overwrite and self.record is None:
             raise HapticBridgeError(
                 "--overwrite goes with --record FILE; nothing would be recorded"
@@ -448,11 +351,9 @@ class Run:
                 with compiling(self.scene):
                     scene = compile_scene(source, self.grip, as_is=self.as_is)
                 self._warn_of_faults(source, scene)
-                chosen = (
-                    self
-                    if self.substeps is not None
-                    else replace(self, substeps=self._own_substeps(source, scene))
-                )
+                chosen = self
+                if self.options.substeps is None:
+                    chosen = self._with(substeps=self._own_substeps(source, scene))
             joint = self._own_grip_axis(scene)
             if not joint:
                 self._refuse_grip_scale()
@@ -462,13 +363,13 @@ class Run:
             if joint and self.grip_axis is None and device.info.grip_axis is None:
                 notify(f"'{device.info.name}' has no grip axis, so joint '{joint}' moves freely")
             elif joint:
-                grasp = self._grasp(self.grip, joint, device)
-                grasp = replace(grasp, clutch=self.clutch, dead_man=self.dead_man)
+                grasp = self._with_buttons(self._grasp(self.grip, joint, device))
                 found = scene.findings
                 scene = compile_scene(source, grasp.grips, as_is=self.as_is, warns=False)
                 scene.findings = found
-                one = replace(self, clutch=None, dead_man=None)  # they are those of the grasp
-                return one._feel(scene, [grasp], clock, stack, window, interrupts)
+                return self._without_buttons()._feel(
+                    scene, [grasp], clock, stack, window, interrupts
+                )
             return chosen._feel(scene, device, clock, stack, window, interrupts)
 
     @property
@@ -497,8 +398,18 @@ class Run:
     def _grasp(self, grip: str, joint: str, device: Device) -> Grasp:
         """Returns what a hand holds, with the joint of its grip axis if that is not empty."""
         axis = GripAxis(joint, self.grip_scale) if joint else None
-        limits = self._options(device.info).limits
-        return Grasp(grip, device, coupling=self._gains(), limits=limits, grip_axis=axis)
+        return Grasp(grip, device, coupling=self.coupling, grip_axis=axis)
+
+    def _with(self, **changes: Any) -> Run:
+        """Returns the run with changed options."""
+        return replace(self, options=replace(self.options, **changes))
+
+    def _with_buttons(self, grasp: Grasp) -> Grasp:
+        return replace(grasp, clutch=self.options.clutch, dead_man=self.options.dead_man)
+
+    def _without_buttons(self) -> Run:
+        """Returns the run of several hands, each of which has the buttons in its grasp."""
+        return self._with(clutch=None, dead_man=None)
 
     def _held(self) -> list[tuple[str, str, str]]:
         """Returns grip, joint of the grip axis (may be empty) and device of each --hand."""
@@ -566,12 +477,12 @@ class Run:
             opened = device_for(own, name, notify, joint)
             stack.callback(opened.close)
             grasps.append(self._grasp(grip, joint, opened))
-        one = replace(self, clutch=None, dead_man=None)  # they are those of the grasps
-        return one._feel(scene, self._with_buttons(grasps), clock, stack, window, interrupts)
+        one = self._without_buttons()
+        return one._feel(scene, self._with_their_buttons(grasps), clock, stack, window, interrupts)
 
-    def _with_buttons(self, grasps: Sequence[Grasp]) -> list[Grasp]:
+    def _with_their_buttons(self, grasps: Sequence[Grasp]) -> list[Grasp]:
         """Returns the grasps with the buttons of their devices; a simulated hand has none."""
-        if self.clutch is None and self.dead_man is None:
+        if self.options.clutch is None and self.options.dead_man is None:
             return list(grasps)
         is_real = [not isinstance(g.device, str) and g.device.info.is_real for g in grasps]
         if not any(is_real):
@@ -579,22 +490,17 @@ class Run:
                 "--clutch and --dead-man are buttons of a real device, and no hand has one"
             )
         return [
-            replace(grasp, clutch=self.clutch, dead_man=self.dead_man) if is_pressed else grasp
+            self._with_buttons(grasp) if is_pressed else grasp
             for grasp, is_pressed in zip(grasps, is_real, strict=True)
         ]
 
-    def _gains(self) -> dict[str, float]:
-        """Returns the gains of the coupling that the user named."""
-        gains = {field.name: getattr(self, field.name) for field in fields(Coupling)}
-        return {name: value for name, value in gains.items() if value is not None}
-
     def _own_substeps(self, source: SceneSource, scene: Scene) -> int:
         """Returns the substeps that the scene needs; says if it moves otherwise than its file."""
-        if self.method is not None:
+        if self.options.method is not None:
             return 1
         ticks = self._scene_ticks(scene)
-        period = max(ticks, 1) * period_of(self.rate)
-        setting = Setting(NO_HAND, period, contact=self.contact or "rigid")
+        period = max(ticks, 1) * period_of(self.options.rate)
+        setting = Setting(NO_HAND, period, contact=self.options.contact or "rigid")
         count, moved = own_substeps(source, scene, setting)
         if ticks:  # more steps would not be in time
             count = 1
@@ -610,9 +516,9 @@ class Run:
         return count
 
     def _scene_ticks(self, scene: Scene) -> int:
-        if self.scene_rate != AUTO or self.fast:
-            return BridgeOptions(rate=self.rate, scene_rate=self.scene_rate).scene_ticks
-        period = period_of(self.rate)
+        if self.options.scene_rate != AUTO or self.fast:
+            return self.options.scene_ticks
+        period = period_of(self.options.rate)
         return scene_ticks_for(busy_step_time(scene, default_method(), period), period)
 
     def _feel(
@@ -625,11 +531,9 @@ class Run:
         interrupts: Interrupts,
     ) -> int:
         """Runs the bridge on a device that is open, or one per hand; returns the exit code."""
-        coupling: dict[str, float] | None = None
-        if isinstance(device, Sequence):
-            options = self._options(None)
-        else:
-            options, coupling = self._options(device.info), self._gains()
+        is_shown = not self.as_json and (err.is_terminal or not (self.fast or self._is_viewed))
+        options = replace(self.options, live=is_shown)
+        coupling = None if isinstance(device, Sequence) else self.coupling
         bridge = Bridge(
             scene, device, coupling, options, clock=clock, recording=self.record, observer=window
         )
@@ -639,7 +543,7 @@ class Run:
                 window.on_hand = device.aim
         if not self.as_json:
             for setup in bridge.setups:
-                announce(setup, self._gains(), is_method_chosen=self.method is not None)
+                announce(setup, self.coupling, is_method_chosen=options.method is not None)
         with err.status("preparing …"):
             stack.enter_context(bridge)
         interrupts.hand_over(bridge.stop_on_signal)  # also while it closes: never cut short
@@ -679,42 +583,6 @@ class Run:
             "simulated time (--duration takes another)"
         )
         return DEFAULT_SECONDS
-
-    def _options(self, info: DeviceInfo | None) -> BridgeOptions:
-        """Returns the options of a run on a device; None for several, each with its own limits."""
-        return BridgeOptions(
-            rate=self.rate,
-            substeps=1 if self.substeps is None else self.substeps,
-            scene_rate=self.scene_rate,
-            method=self.method,
-            contact=self.contact,
-            contact_stiffness=self.contact_stiffness,
-            i_know=self.i_know,
-            workspace=Workspace(
-                scale=self.scale,
-                force_scale=self.force_scale,
-                axes=SAME_FRAME.axes if self.axes is None else self.axes,
-                absolute=self.absolute,
-            ),
-            limits=None
-            if info is None
-            else Limits(
-                force=info.force_limit if self.force_limit is None else self.force_limit,
-                torque=info.torque_limit if self.torque_limit is None else self.torque_limit,
-                ramp=self.ramp,
-                hold_torque=self.hold_torque,
-                stretch=self.stretch_limit,
-                energy=self.energy_limit,
-                reach=self.reach_limit,
-            ),
-            controller=self.controller,
-            clutch=self.clutch,
-            dead_man=self.dead_man,
-            mark=self.mark,
-            tool_weight=self.tool_weight,
-            live=not self.as_json and (err.is_terminal or not (self.fast or self._is_viewed)),
-            realtime=self.realtime or None,
-        )
 
     def _window(self) -> Window:
         from hapticbridge.view import Address, Window  # noqa: PLC0415 - for --view alone

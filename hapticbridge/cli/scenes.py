@@ -6,9 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.table import Table
 
+from hapticbridge.arguments import option
 from hapticbridge.cli.terminal import compiling, out, plain, print_written
 from hapticbridge.device import DEFAULT_HAND, scene_hand
 from hapticbridge.errors import SceneError
@@ -34,7 +34,7 @@ class Scenes:
         hapticbridge scenes peg_in_hole
     """
 
-    scene: tyro.conf.Positional[str | None] = None
+    scene: str | None = option(None, metavar="SCENE", is_positional=True)
     """An MJCF file, or a scene's name: show its parameters with unit, range and default."""
 
     def execute(self) -> int:
@@ -100,7 +100,7 @@ class NewScene:
         hapticbridge new-scene my_tool
     """
 
-    name: tyro.conf.Positional[str]
+    name: str = option(metavar="NAME", is_positional=True)
     """Name of the scene: small letters, digits and _, a letter first. The folder has it, too; it
     must not exist."""
 

@@ -6,12 +6,10 @@ import math
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
 from rich.table import Table
 
-from hapticbridge.arguments import Arguments
+from hapticbridge.arguments import Arguments, option, shared
 from hapticbridge.certificate import (
     DampingCondition,
     conditions_of,
@@ -30,6 +28,7 @@ from hapticbridge.loop_setting import (
     delay_ticks,
     whole_ticks,
 )
+from hapticbridge.options import DEFAULT_OPTIONS, BridgeOptions
 from hapticbridge.plotting import check_ending
 from hapticbridge.rendering import RunCoupling, default_method
 from hapticbridge.signals import interrupting_on_signals
@@ -39,7 +38,7 @@ from hapticbridge.theory.bounds import (
     largest_effective_damping,
     law_damping,
 )
-from hapticbridge.theory.transfer import MAX_DELAY, scalar
+from hapticbridge.theory.transfer import MAX_DELAY
 from hapticbridge.theory.z_width import ZWidth, z_width
 from hapticbridge.theory_plots import (
     Alternative,
@@ -53,14 +52,11 @@ from hapticbridge.units import format_si
 
 _ARGUMENTS = Arguments(HapticBridgeError)
 
-DEFAULT_RATE = 1000.0
-"""Hz; what 'hapticbridge run' takes by itself, so that it need not be told."""
-
 
 def next_command(stiffness: float, damping: float, rate: float) -> str:
     """Returns the command that runs a scene with this coupling."""
     command = f"hapticbridge run SCENE --stiffness {stiffness:.6g} --damping {damping:.6g}"
-    return command if rate == DEFAULT_RATE else f"{command} --rate {rate:.6g}"
+    return command if rate == DEFAULT_OPTIONS.rate else f"{command} --rate {rate:.6g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,28 +71,27 @@ class Zwidth:
         hapticbridge zwidth --measure simulated:hand=none --plot out.png
     """
 
-    damping: float | None = None
+    damping: float | None = shared(DeviceInfo, "damping")
     """Physical damping b of the device in N s/m; with --measure by default what is known of it."""
     measure: str | None = None
     """Try walls of rising stiffness on this device, as 'run --device' takes it, until its swing no
     longer dies down. Hold it as in use, or not at all; it is pushed with up to half its force."""
     axis: str | None = None
     """Axis that --measure moves: x, y or z; by default x."""
-    mass: float | None = None
+    mass: float | None = shared(DeviceInfo, "mass")
     """Mass of the device in kg; with it the limit without a hand is drawn too."""
-    friction: float | None = None
+    friction: float | None = shared(DeviceInfo, "friction")
     """Coulomb friction of the device in N."""
-    resolution: float | None = None
+    resolution: float | None = shared(DeviceInfo, "resolution")
     """Step of the device's position in m; by default exact."""
-    rate: float = DEFAULT_RATE
-    """Ticks per second."""
+    rate: float = shared(BridgeOptions, "rate")
     delay: float = 0.0
     """Time in s from position to force, beyond the hold; it counts as whole ticks."""
-    filter_time: float = 0.0
+    filter_time: float = option(0.0, unit="s", least=0.0)
     """Time constant in s of a first-order low-pass behind the coupling's damper."""
     plot: Path | None = None
     """Draw the region into this picture (.png, .svg or .pdf)."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print the lines, the limit and the corner as JSON."""
 
     def execute(self) -> int:
@@ -302,30 +297,27 @@ class Bound:
         hapticbridge bound --stiffness 2000 --damping 1 --device simulated:damping=3
     """
 
-    stiffness: float
+    stiffness: float = shared(Coupling, "stiffness")
     """Coupling stiffness K in N/m."""
-    damping: float = 0.0
+    damping: float = shared(Coupling, "damping", 0.0)
     """Requested damping B of the coupling in N s/m."""
-    rate: float = DEFAULT_RATE
-    """Ticks per second."""
-    filter_time: float | None = None
+    rate: float = shared(BridgeOptions, "rate")
+    filter_time: float | None = option(None, unit="s", least=0.0)
     """Time constant in s of the low-pass among the alternatives; by default one period."""
     device: str | None = None
     """Device, as 'run --device' takes it: do its damping, delay and rate suffice? They come from
     its driver or its profile ('hapticbridge identify' writes one). It is opened, and not moved."""
-    device_damping: float | None = None
+    device_damping: float | None = option(None, unit="N s/m", least=0.0, is_open=True)
     """Physical damping b in N s/m of a device without delay, in place of --device."""
     plot: Path | None = None
     """Draw the damping needed over frequency into this picture (.png, .svg or .pdf)."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
+    as_json: bool = option(False, flag="json")
     """Print it as JSON; null where no damping suffices."""
 
     def execute(self) -> int:
         """Computes and prints; returns the exit code."""
         check_ending(self.plot)
         info = self._info()
-        if self.device_damping is not None:
-            scalar("device damping", self.device_damping, "N s/m", positive=True)
         period = period_of(self.rate)
         coupling = Coupling(self.stiffness, self.damping, 0.0, 0.0)
         filter_time = period if self.filter_time is None else self.filter_time

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields
 from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.arguments import is_number, shown
+from hapticbridge.arguments import (
+    Rule,
+    check_fields,
+    checked_value,
+    option,
+    rule,
+    rule_of,
+    shown,
+)
 from hapticbridge.dataclass_json import from_json, to_json
-from hapticbridge.errors import DeviceError, choices
+from hapticbridge.errors import DeviceError, DeviceLost
 from hapticbridge.pose import Quaternion, canonical
 from hapticbridge.record import SAMPLE_DTYPE
 
@@ -29,6 +37,28 @@ def calling_on_error(close: Callable[[], None]) -> Iterator[None]:
         raise
 
 
+class Closable(Protocol):
+    """Link or guardian of a device."""
+
+    def close(self) -> None:
+        """Releases it."""
+
+
+@contextmanager
+def released(*parts: Closable | None) -> Iterator[None]:
+    """Closes the parts of a device after its last command, which a lost device does not take.
+
+    A lost device has no force, or its own watchdog ends it.
+    """
+    try:
+        with suppress(DeviceLost):
+            yield
+    finally:
+        for part in parts:
+            if part is not None:
+                part.close()
+
+
 # Data sheet of a haptic device
 
 
@@ -38,14 +68,8 @@ def checked_number(name: str, value: object, unit: str, *, is_positive: bool = F
     Raises:
         DeviceError: The value is not a number, not finite, or out of range.
     """
-    bound = "> 0" if is_positive else ">= 0"
-    message = f"{name} = {shown(value)}: must be a finite number {bound}" + (
-        f" {unit}" if unit else ""
-    )
-    number = float(value) if is_number(value) else math.nan
-    if not math.isfinite(number) or number < 0.0 or (is_positive and number == 0.0):
-        raise DeviceError(message)
-    return number
+    own = Rule(unit=unit, least=0.0, is_open=is_positive)
+    return float(checked_value(name, value, (float,), own, DeviceError))
 
 
 ROTATION_ERROR = 1e-3
@@ -97,23 +121,6 @@ def usual_delay(times: Iterable[float]) -> float:
     return ordered[math.ceil(ON_TIME * len(ordered)) - 1]
 
 
-DATA_SHEET_UNITS = {
-    "mass": "kg",
-    "damping": "N s/m",
-    "rotational_inertia": "kg m²",
-    "rotational_damping": "N m s/rad",
-    "friction": "N",
-    "resolution": "m",
-    "force_limit": "N",
-    "torque_limit": "N m",
-    "speed_limit": "m/s",
-    "rate": "Hz",
-    "delay": "s",
-    "duration": "s",
-    "reach": "m",
-}
-"""SI units of the numbers in a device's data sheet."""
-
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes of a device in its own frame: translation (x, y, z) and rotation (rx, ry, rz)."""
 
@@ -126,9 +133,6 @@ USUAL_FORCE_LIMIT, USUAL_TORQUE_LIMIT, USUAL_SPEED_LIMIT = 10.0, 0.5, 5.0
 those of a desktop device; only a fault exceeds the speed. For a device without motors the limits of
 force and torque apply only to the recording."""
 
-_NEVER_UNKNOWN = ("force_limit", "torque_limit", "speed_limit")
-_POSITIVE = ("mass", "rotational_inertia", "rate", "reach")
-
 
 def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[str, float]:
     """Returns the numbers of the data sheet among a device's options; None means not stated.
@@ -136,7 +140,11 @@ def stated_numbers(options: Mapping[str, object], names: Iterable[str]) -> dict[
     Raises:
         DeviceError: A number is out of range.
     """
-    return {name: _checked(name, options[name]) for name in names if options.get(name) is not None}
+    return {
+        name: float(checked_value(name, options[name], (float,), _NUMBERS[name], DeviceError))
+        for name in names
+        if options.get(name) is not None
+    }
 
 
 def stated_switch(options: Mapping[str, object], name: str) -> bool:
@@ -147,12 +155,18 @@ def stated_switch(options: Mapping[str, object], name: str) -> bool:
     """
     value = options.get(name, 1.0)
     if value not in (0, 1):
-        raise DeviceError(f"{name} = {shown(value)}: must be 1 (on) or 0 (off)")
+        raise DeviceError(f"{name} is {shown(value)}; it must be 1 (on) or 0 (off)")
     return bool(value)
 
 
-def _checked(name: str, value: object) -> float:
-    return checked_number(name, value, DATA_SHEET_UNITS[name], is_positive=name in _POSITIVE)
+def _in_order(name: str, value: object, valid: Sequence[str]) -> tuple[str, ...]:
+    """Returns axes as a tuple; refuses others than the valid ones, each once, in their order."""
+    own = tuple(value) if isinstance(value, tuple | list) else None
+    if own is None or own != tuple(axis for axis in valid if axis in own):
+        raise DeviceError(
+            f"{name} is {shown(value)}; it must be of {', '.join(valid)}, each once, in this order"
+        )
+    return own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,62 +208,38 @@ class DeviceInfo:
         DeviceError: A value is of the wrong type, not finite, or out of range.
     """
 
-    name: str
+    name: str = field(metadata=rule(is_filled=True))
     axes: tuple[str, ...]
-    mass: float | None = None
-    damping: float | None = None
-    rotational_inertia: float | None = None
-    rotational_damping: float | None = None
-    friction: float | None = None
-    resolution: float | None = None
-    force_limit: float
-    torque_limit: float = USUAL_TORQUE_LIMIT
-    speed_limit: float = USUAL_SPEED_LIMIT
-    rate: float | None = None
-    delay: float | None = None
+    mass: float | None = option(None, unit="kg", least=0.0, is_open=True)
+    damping: float | None = option(None, unit="N s/m", least=0.0)
+    rotational_inertia: float | None = option(None, unit="kg m²", least=0.0, is_open=True)
+    rotational_damping: float | None = option(None, unit="N m s/rad", least=0.0)
+    friction: float | None = option(None, unit="N", least=0.0)
+    resolution: float | None = option(None, unit="m", least=0.0)
+    force_limit: float = field(metadata=rule(unit="N", least=0.0))
+    torque_limit: float = option(USUAL_TORQUE_LIMIT, unit="N m", least=0.0)
+    speed_limit: float = option(USUAL_SPEED_LIMIT, unit="m/s", least=0.0)
+    rate: float | None = option(None, unit="Hz", least=0.0, is_open=True)
+    delay: float | None = option(None, unit="s", least=0.0)
     is_prescribed: bool = False
     is_real: bool = True
-    duration: float | None = None
+    duration: float | None = option(None, unit="s", least=0.0)
     serial: str = ""
-    reach: float | None = None
-    buttons: int | None = None
+    reach: float | None = option(None, unit="m", least=0.0, is_open=True)
+    buttons: int | None = option(None, least=0)
     sensed: tuple[str, ...] = ()
     grip_axis: DeviceInfo | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name:
-            raise DeviceError(f"device name = {shown(self.name)}: must be a text that is not empty")
-        if not isinstance(self.serial, str):
-            raise DeviceError(f"serial = {shown(self.serial)}: must be a text")
-        if not isinstance(self.axes, tuple | list) or not self.axes:
-            raise DeviceError(f"axes = {shown(self.axes)}: must be one or more of {choices(AXES)}")
-        if tuple(self.axes) != tuple(axis for axis in AXES if axis in self.axes):
-            raise DeviceError(
-                f"axes = {tuple(self.axes)!r}: must be of {', '.join(AXES)}, each once, in this "
-                "order"
-            )
-        object.__setattr__(self, "axes", tuple(self.axes))
-        if not isinstance(self.sensed, tuple | list) or tuple(self.sensed) != tuple(
-            axis for axis in AXES if axis in self.sensed and axis not in self.axes
-        ):
-            raise DeviceError(
-                f"sensed = {shown(self.sensed)}: must be of {', '.join(AXES)}, each once, in this "
-                "order, and none of axes"
-            )
-        object.__setattr__(self, "sensed", tuple(self.sensed))
-        axis = self.grip_axis
-        if axis is not None and (not isinstance(axis, DeviceInfo) or axis.axes != AXES[:1]):
-            raise DeviceError(f"grip_axis = {shown(axis)}: must be a DeviceInfo with the axis x")
-        for name in ("is_prescribed", "is_real"):
-            if not isinstance(getattr(self, name), bool):
-                raise DeviceError(f"{name} = {shown(getattr(self, name))}: must be true or false")
-        is_count = isinstance(self.buttons, int) and not isinstance(self.buttons, bool)
-        if self.buttons is not None and not (is_count and self.buttons >= 0):
-            raise DeviceError(f"buttons = {shown(self.buttons)}: must be a whole number >= 0")
-        for name in DATA_SHEET_UNITS:
-            value = getattr(self, name)
-            if value is not None or name in _NEVER_UNKNOWN:
-                object.__setattr__(self, name, _checked(name, value))
+        check_fields(self, DeviceError)
+        axes = _in_order("axes", self.axes, AXES)
+        if not axes:
+            raise DeviceError(f"axes is {shown(self.axes)}; it must be one or more of {AXES}")
+        sensed = _in_order("sensed", self.sensed, [axis for axis in AXES if axis not in axes])
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "sensed", sensed)
+        if self.grip_axis is not None and self.grip_axis.axes != AXES[:1]:
+            raise DeviceError(f"grip axis is {shown(self.grip_axis)}; it must have the axis x")
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -303,6 +293,12 @@ class DeviceInfo:
             DeviceError: The text is not a JSON object with these keys, or a value is invalid.
         """
         return from_json(cls, text, "device data", DeviceError)
+
+
+_NUMBERS = {each.name: rule_of(each) for each in fields(DeviceInfo) if rule_of(each).unit}
+
+DATA_SHEET_UNITS = {name: own.unit for name, own in _NUMBERS.items()}
+"""SI units of the numbers in a device's data sheet."""
 
 
 class Device(Protocol):

@@ -47,6 +47,7 @@ from hapticbridge.device.base import (
     calling_on_error,
     checked_number,
     checked_period,
+    released,
     stated_numbers,
     stated_switch,
     usual_delay,
@@ -473,15 +474,11 @@ class HaplyDevice:
         if not self._is_open:
             return
         self._is_open = self._is_started = False
-        try:
+        with released(self._link):  # without messages the device idles
             self._take()
             self._link.send(force_message(self._listed, (0.0, 0.0, 0.0)))
             for _ in range(self._under_way + 1):
                 self._link.wait(SILENCE)
-        except DeviceLost:
-            pass  # without messages the device idles
-        finally:
-            self._link.close()
 
     def _take(self) -> str | None:
         """Returns the newest of all waiting answers, after sending a pending force."""
@@ -622,7 +619,7 @@ def _place(service: object) -> tuple[str, int]:
     except ValueError:
         number = 0
     if not 0 < number < 65536:
-        raise DeviceError(f"service = '{service}': must be HOST:PORT, port 1 to 65535")
+        raise DeviceError(f"service is '{service}'; it must be HOST:PORT, port 1 to 65535")
     return str(host) or PLACE[0], number
 
 

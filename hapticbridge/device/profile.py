@@ -161,15 +161,17 @@ def _profile(raw: dict[str, object], path: Path) -> Profile:
     texts = {name: raw.pop(name, "") for name in _TEXTS}
     for name, text in texts.items():
         if not isinstance(text, str) or (name in ("name", "device") and not text):
-            raise DeviceError(f"{name} = {text!r}: must be a text, and name and device not empty")
+            raise DeviceError(
+                f"{name} is {text!r}; it must be a text, and name and device not empty"
+            )
     axes = raw.pop("axes", None)
     if axes is not None and (
         not isinstance(axes, list) or not axes or [a for a in AXES if a in axes] != axes
     ):
-        raise DeviceError(f"axes = {axes!r}: must be of {', '.join(AXES)}, in this order")
+        raise DeviceError(f"axes is {axes!r}; it must be of {', '.join(AXES)}, in this order")
     models = raw.pop("models", [])
     if not isinstance(models, list) or not all(isinstance(m, str) and m for m in models):
-        raise DeviceError(f"models = {models!r}: must be a list of texts that are not empty")
+        raise DeviceError(f"models is {models!r}; it must be a list of texts that are not empty")
     if unknown := raw.keys() - UNITS.keys():
         raise DeviceError(f"unknown tables {choices(unknown)}; valid tables: {choices(UNITS)}")
     return Profile(
@@ -187,7 +189,7 @@ def _quantity(name: str, table: object) -> Quantity:
             f"[{name}] must hold value and source, and optionally unit and interval, and no more"
         )
     if table.get("unit", UNITS[name]) != UNITS[name]:
-        raise DeviceError(f"[{name}] unit = {table['unit']!r}: must be {UNITS[name]!r}")
+        raise DeviceError(f"[{name}] unit is {table['unit']!r}; it must be {UNITS[name]!r}")
     source = table.get("source")
     if not isinstance(source, str) or not source:
         raise DeviceError(f"[{name}] needs a source: the origin of the number, as a text")
@@ -196,18 +198,18 @@ def _quantity(name: str, table: object) -> Quantity:
     if name == "workspace" and isinstance(raw, list):
         value = tuple(checked_number(name, part, "m", is_positive=True) for part in raw)
         if len(value) != 3:
-            raise DeviceError(f"[{name}] value = {raw!r}: must be three lengths in m")
+            raise DeviceError(f"[{name}] value is {raw!r}; it must be three lengths in m")
     elif raw != "unknown":
         value = checked_number(f"[{name}] value", raw, UNITS[name])
     if interval is None:
         return Quantity(value, source)
     if not isinstance(interval, list) or len(interval) != 2 or not isinstance(value, float):
         raise DeviceError(
-            f"[{name}] interval = {interval!r}: must be two numbers around a single value"
+            f"[{name}] interval is {interval!r}; it must be two numbers around a single value"
         )
     least, most = (float(end) if is_number(end) else math.nan for end in interval)
     if not least <= value <= most:
-        raise DeviceError(f"[{name}] interval = {interval!r}: must contain the value {value:g}")
+        raise DeviceError(f"[{name}] interval is {interval!r}; it must contain the value {value:g}")
     return Quantity(value, source, (least, most))
 
 

@@ -30,7 +30,7 @@ from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.simulated.dynamics import Hand
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice, read_motion
 from hapticbridge.errors import DeviceError, choices, nearest
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene import Scene
 
 # Table of the hardware drivers; a driver is imported when one of its devices is opened
@@ -188,7 +188,7 @@ def parsed(device: str, text: str, valid: Options, first: str = "") -> dict[str,
             values[name] = kind(value.strip())
         except ValueError:
             number = "a whole number" if kind is int else "a number"
-            raise DeviceError(f"{name} = '{value.strip()}': must be {number}") from None
+            raise DeviceError(f"{name} is '{value.strip()}'; it must be {number}") from None
     return values
 
 
@@ -302,8 +302,8 @@ def device_for(
     if "hand" not in parsed(name, rest, _SIMULATED_OPTIONS):
         hand = asdict(scene_hand(scene.model, scene.path))
         options |= {_HAND_PREFIX + field: value for field, value in hand.items()}
-    others = [each for each in scene.other_grips if each != f"{JOINT}{grip_axis}"]
-    grip = scene.grip.removeprefix(JOINT)
+    others = [each for each in scene.other_grips if each != str(Grip(grip_axis, "joint"))]
+    grip = Grip.from_text(scene.grip).name
     path = scene.path.with_name(f"{scene.name}_{grip}.csv" if others else f"{scene.name}.csv")
     if path.is_file():
         options["path"] = path
@@ -346,7 +346,7 @@ def _open_simulated(rest: str, options: Mapping[str, object]) -> Device:
         parameters["hand"] = None
     elif not isinstance(parameters["hand"], Hand | None):
         raise DeviceError(
-            f"hand = {parameters['hand']!r}: must be 'none'; {choices(_HAND_OPTIONS)} change it"
+            f"hand is {parameters['hand']!r}; it must be 'none'; {choices(_HAND_OPTIONS)} change it"
         )
     return SimulatedDevice(**parameters)
 

@@ -197,7 +197,9 @@ class SpaceMouseDevice:
         self._full = _TO_BRIDGE * np.repeat([speed, turn], 3)
         self._dead_band = checked_number("dead_band", dead_band, "of full deflection")
         if self._dead_band >= 1.0:
-            raise DeviceError(f"dead_band = {dead_band!r}: must be below 1, which is full scale")
+            raise DeviceError(
+                f"dead_band is {dead_band!r}; it must be below 1, which is full scale"
+            )
         self.info = DeviceInfo(
             name=name,
             axes=AXES,

@@ -1,8 +1,8 @@
 """Compiled arithmetic of a tick around MuJoCo's step.
 
-Read ``tick`` first: the work before and after MuJoCo's step. ``state`` lists the sub-records of the
-kernel's state, their writing modules, and binds them to a model and the ``parameters`` of a run.
-``hands`` is the tick of several hands that hold one scene.
+Read ``tick`` first: the work before and after MuJoCo's step, for any number of hands. ``state``
+lists the sub-records of the kernel's state, their writing modules, and binds them to a model and
+the ``parameters`` of a run.
 
 - Coupling: ``handle`` moves the handle, ``law`` evaluates the coupling law, ``force_level`` limits
   its wrench.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import mujoco
 
@@ -42,16 +42,37 @@ def added_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     return int(mujoco.mj_name2id(model, kind, name))
 
 
-JOINT = "joint:"
-"""Start of a grip that is a joint, as in ``joint:hinge``: a hand moves it along its one axis."""
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """Site, body, point of a body, or joint that a hand holds.
+
+    Attributes:
+        name: Name of the site, body or joint.
+        kind: ``site`` (or a body's), or ``joint``, a hinge or slide that moves along its one axis.
+    """
+
+    name: str
+    kind: Literal["site", "joint"] = "site"
+
+    @classmethod
+    def from_text(cls, text: str) -> Grip:
+        """Returns the grip of its text: ``SITE``, ``BODY``, ``BODY@x,y,z`` or ``joint:NAME``."""
+        kind, is_kind, name = text.partition(":")
+        return cls(name, "joint") if is_kind and kind == "joint" else cls(text)
+
+    def __str__(self) -> str:
+        return f"joint:{self.name}" if self.is_joint else self.name
+
+    @property
+    def is_joint(self) -> bool:
+        """True for a joint, which has no handle in the scene."""
+        return self.kind == "joint"
 
 
 def held_joint(model: mujoco.MjModel, grip: str) -> int:
     """Returns the id of the joint that a grip names, or -1 if it names a site."""
-    name = grip.removeprefix(JOINT)
-    if name == grip or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, grip) >= 0:
-        return -1
-    return int(model.joint(name).id)
+    held = Grip.from_text(grip)
+    return int(model.joint(held.name).id) if held.is_joint else -1
 
 
 def held_body(model: mujoco.MjModel, grip: str) -> int:
@@ -133,6 +154,7 @@ class SchemeProperties:
         holds_wrench: True if the wrench is applied as a force during the next tick. The law is then
             evaluated once per tick, else once per MuJoCo step.
         may_split: True if MuJoCo's position stage may run ahead of the sample.
+        allows_hands: True if several hands may hold one scene.
         one_substep: Reason for which a tick has one MuJoCo step; empty if it may have several.
     """
 
@@ -140,6 +162,7 @@ class SchemeProperties:
     has_tool_mass: bool = True
     holds_wrench: bool = False
     may_split: bool = True
+    allows_hands: bool = False
     one_substep: str = ""
 
     def law_evaluations(self, substeps: int) -> int:
@@ -148,7 +171,7 @@ class SchemeProperties:
 
 
 _PROPERTIES = {
-    Scheme.IMPLICIT: SchemeProperties(),
+    Scheme.IMPLICIT: SchemeProperties(allows_hands=True),
     Scheme.ZERO_ORDER_HOLD: SchemeProperties(holds_wrench=True),
     Scheme.WELD: SchemeProperties(has_law=False, may_split=False),
     Scheme.MASSLESS: SchemeProperties(

@@ -66,17 +66,20 @@ def drive_compared(s: State, orientation: Quaternion) -> None:
 
 
 @compiled
-def compared_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+def compared_wrench(
+    states: NDArray[np.void], is_last: bool
+) -> tuple[Vector, Vector, Vector, Vector]:
     """Returns force, torque, and the tool's motion and rotation vector since the last call.
 
     A scheme without a branch here has a wrench that is not finite, so its first tick is refused.
 
     Args:
-        s: The bound state after a step of MuJoCo.
+        states: The bound states after a step of MuJoCo.
         is_last: True for the last substep of the tick.
     """
+    s = states[0]
     if s.run.scheme == Scheme.ZERO_ORDER_HOLD:
-        return limited_wrench_after_step(s, is_last)
+        return limited_wrench_after_step(states, is_last)
     if s.run.scheme == Scheme.WELD:
         wrench = weld_wrench(s)  # before the kinematics are refreshed
         position, orientation, moved, turned = tool_after_step(s)

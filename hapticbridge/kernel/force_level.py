@@ -32,14 +32,21 @@ from hapticbridge.kernel.codes import FORCE_LIMITED, Part, State
 from hapticbridge.kernel.handle import (
     handle_of_step,
     note_tool,
-    tool_after_step,
     tool_motion,
 )
-from hapticbridge.kernel.law import applied_wrench, law_wrench, set_gains
+from hapticbridge.kernel.law import (
+    applied_wrench,
+    is_bent,
+    law_wrench,
+    limited,
+    set_gains,
+    share_of_gains,
+    springs,
+)
 from hapticbridge.kernel.ledger import has_loaded_body, meter_ports_again
 from hapticbridge.kernel.mujoco_c import floats, mj_kinematics, mj_step2
 from hapticbridge.kernel.rigid_contact import aim_again
-from hapticbridge.pose import Vector, norm, scaled
+from hapticbridge.pose import Quaternion, Vector, norm
 
 TOLERANCE = 1e-6
 """Largest error of the wrench within a saturated step, as a share of the level; no unit. The error
@@ -139,31 +146,21 @@ def spend_within_tank(s: State) -> None:
 
 
 @compiled
+def _is_bent(s: State, force: Vector, torque: Vector) -> bool:
+    linear, angular = springs(s)
+    return is_bent(linear, norm(force)) or is_bent(angular, norm(torque))
+
+
+@compiled
 def limited_wrench(s: State, force: Vector, torque: Vector) -> tuple[Vector, Vector]:
     """Returns P_F of a force and a torque on the tool, and notes if one was limited.
 
     Numbers that are not finite stay, because they stop the run.
     """
-    level = s.level
-    level.flags = 0
-    size, size_r = norm(force), norm(torque)
-    if level.level[0] < size < np.inf:
-        force = scaled(level.level[0] / size, force)
-        level.flags = FORCE_LIMITED
-    if level.level[1] < size_r < np.inf:
-        torque = scaled(level.level[1] / size_r, torque)
-        level.flags = FORCE_LIMITED
-    return force, torque
-
-
-@compiled
-def _share_at_level(level: float, size: float, share: float, compliance: float) -> float:
-    """Returns c with c ‖u‖ = F for ‖u‖ = A/(1 + c σ), given one solution; at most 1."""
-    u = size / share
-    a = u * (1.0 + share * compliance)
-    if a <= level * (1.0 + compliance):
-        return 1.0
-    return level / (a - level * compliance)
+    linear, angular = springs(s)
+    new, new_torque = limited(linear, force), limited(angular, torque)
+    s.level.flags = FORCE_LIMITED if _is_bent(s, force, torque) else 0
+    return new, new_torque
 
 
 @compiled
@@ -174,7 +171,7 @@ def _is_at_level(s: State, count: int) -> bool:
     """
     level = s.level
     force, torque = applied_wrench(s, 1.0)
-    sizes = (norm(force), norm(torque))
+    sizes, both = (norm(force), norm(torque)), springs(s)
     is_done = True
     for ch in range(2):
         c, size = level.share[ch], sizes[ch]
@@ -184,7 +181,7 @@ def _is_at_level(s: State, count: int) -> bool:
             change = level.tried[ch] * u_last - size
             if abs(change) > 1e-12 * level.level[ch]:
                 level.compliance[ch] = max((u - u_last) / change, 0.0)
-        new = _share_at_level(level.level[ch], size, c, level.compliance[ch])
+        new = share_of_gains(both[ch], size, c, level.compliance[ch])
         if count > REPETITIONS // 2:
             new = 0.5 * (c + new)
         if abs(new - c) * u > TOLERANCE * level.level[ch]:
@@ -221,22 +218,29 @@ def _start_again(s: State, count: int) -> None:
 
 
 @compiled
-def solve_level(s: State) -> bool:
-    """Repeats the step that just ended until its wrench is at the level or below.
+def _solve_levels(states: NDArray[np.void]) -> bool:
+    """Repeats the step that just ended until every hand's wrench is at its level or below.
+
+    A repetition changes the wrench of every hand. The first state is that of the scene.
 
     Returns:
         True if the step was repeated; kinematics must then be refreshed again.
     """
-    count = 0
-    for _ in range(REPETITIONS):
-        if _is_at_level(s, count) or not _can_try(s.level):
+    count, first = 0, states[0]
+    for _ in range(REPETITIONS * states.size):
+        is_done, can_try = True, True
+        for i in range(states.size):
+            is_done = _is_at_level(states[i], count) and is_done
+            can_try = _can_try(states[i].level) and can_try
+        if is_done or not can_try:
             break
-        _try_shares(s)
-        _start_again(s, count)
+        for i in range(states.size):
+            _try_shares(states[i])
+        _start_again(first, count)
         count += 1
-    s.level.repetitions += count
+    first.level.repetitions += count
     if count > 0:
-        meter_ports_again(s)
+        meter_ports_again(first)
     return count > 0
 
 
@@ -257,101 +261,71 @@ def _foresee_shares(s: State) -> None:
 
 
 @compiled
-def limited_wrench_after_step(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
-    """Evaluates the limited law after a step of MuJoCo, and notes the tool's new pose.
+def _law_after_step(
+    s: State, is_last: bool
+) -> tuple[Vector, Vector, tuple[Vector, Quaternion, Vector, Vector]]:
+    """Returns force and torque of the linear law, and the tool's pose and motion."""
+    motion = tool_motion(s)
+    position, orientation, moved, turned = motion
+    handle = handle_of_step(s, is_last)
+    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+    return force, torque, motion
+
+
+@compiled
+def _is_another_bent(states: NDArray[np.void], is_last: bool) -> bool:
+    """Returns True if the law of a hand beside the first is bent."""
+    for i in range(1, states.size):
+        force, torque, _ = _law_after_step(states[i], is_last)
+        if _is_bent(states[i], force, torque):
+            return True
+    return False
+
+
+@compiled
+def limited_wrench_after_step(
+    states: NDArray[np.void], is_last: bool
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Settles the levels of all hands after a step of MuJoCo, and evaluates the first one's law.
+
+    The bodies' poses are those of the step's end then, and the tool's new pose is noted.
 
     Args:
-        s: The bound state.
+        states: The bound states of all hands; the first one meters the scene.
         is_last: True for the last substep of the tick.
 
     Returns:
         Force, torque, and the tool's motion and rotation vector since the previous evaluation.
     """
-    level = s.level
-    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
+    s = states[0]
+    is_reduced = False
+    for i in range(states.size):
+        share = states[i].level.share
+        is_reduced = is_reduced or share[0] < 1.0 or share[1] < 1.0
     if is_reduced:  # the wrench of the step itself decides, without poses
-        solve_level(s)
-    position, orientation, moved, turned = tool_after_step(s)
-    handle = handle_of_step(s, is_last)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-    if is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1]:
-        if level.is_solved:
-            if not is_reduced and solve_level(s):
-                position, orientation, moved, turned = tool_after_step(s)
-                force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-            _foresee_shares(s)
+        _solve_levels(states)
+    mj_kinematics(s.mj.model, s.mj.data)
+    force, torque, motion = _law_after_step(s, is_last)
+    if is_reduced or _is_bent(s, force, torque) or _is_another_bent(states, is_last):
+        if s.level.is_solved:
+            if not is_reduced and _solve_levels(states):
+                mj_kinematics(s.mj.model, s.mj.data)
+                force, torque, motion = _law_after_step(s, is_last)
+            for i in range(states.size):
+                _foresee_shares(states[i])
         force, torque = limited_wrench(s, force, torque)
     else:
-        level.flags = 0
+        s.level.flags = 0
+    position, orientation, moved, turned = motion
     note_tool(s.pose, position, orientation)
     return force, torque, moved, turned
 
 
-# Several hands in one scene: a repetition of the step changes the wrench of every hand
-
-
 @compiled
-def _is_above(s: State) -> bool:
-    """Returns True if a hand's wrench is above its level, or its gains are reduced."""
-    level = s.level
-    position, orientation, moved, turned = tool_motion(s)
-    handle = handle_of_step(s, True)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
-    is_reduced = level.share[0] < 1.0 or level.share[1] < 1.0
-    return bool(is_reduced or norm(force) > level.level[0] or norm(torque) > level.level[1])
-
-
-@compiled
-def _solve_levels(states: NDArray[np.void]) -> bool:
-    """Does for all hands together what ``solve_level`` does for one.
-
-    The first state is that of the scene.
-    """
-    count = 0
-    for _ in range(REPETITIONS * states.size):
-        is_done = True
-        for i in range(states.size):
-            is_settled = _is_at_level(states[i], count)
-            if not _can_try(states[i].level):
-                return count > 0
-            is_done = is_done and is_settled
-        if is_done:
-            break
-        for i in range(states.size):
-            _try_shares(states[i])
-        _start_again(states[0], count)
-        count += 1
-    states[0].level.repetitions += count
-    if count > 0:
-        meter_ports_again(states[0])
-    return count > 0
-
-
-@compiled
-def settle_levels(states: NDArray[np.void]) -> None:
-    """Repeats the step that just ended until no hand's wrench is above its level.
-
-    The bodies' poses are those of the step's end then.
-    """
-    first = states[0]
-    mj_kinematics(first.mj.model, first.mj.data)
-    is_above = False
-    for i in range(states.size):
-        is_above = _is_above(states[i]) or is_above
-    if not is_above or not first.level.is_solved:
-        return
-    if _solve_levels(states):
-        mj_kinematics(first.mj.model, first.mj.data)
-    for i in range(states.size):
-        _foresee_shares(states[i])
-
-
-@compiled
-def settled_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
-    """Evaluates a hand's law after ``settle_levels``; else as ``limited_wrench_after_step``."""
-    position, orientation, moved, turned = tool_motion(s)
-    handle = handle_of_step(s, True)
-    force, torque = law_wrench(s, handle, (position, orientation), moved, turned)
+def settled_wrench(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Evaluates another hand's law, after the levels were settled with the first one's."""
+    force, torque, motion = _law_after_step(s, is_last)
     force, torque = limited_wrench(s, force, torque)
+    position, orientation, moved, turned = motion
     note_tool(s.pose, position, orientation)
     return force, torque, moved, turned

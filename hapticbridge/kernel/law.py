@@ -23,9 +23,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticbridge.coupling import Coupling
 from hapticbridge.jit import compiled
@@ -160,6 +161,144 @@ def set_tuning_goal(
     coupling["tuning_ticks"] = ticks
 
 
+# One spring of the coupling, of its forces or of its torques
+#
+# The wrench on the tool is g(‖u‖) u/‖u‖ with u = K e + (B'/T) δe, on the tool and on the device
+# alike. g is the curve of the spring, here min(‖u‖, F). Any curve whose slope is from 0 to 1 keeps
+# the device condition (``force_level``). Another law changes the functions of this section, and
+# their twin in ``audit.spring``.
+
+
+class Spring(NamedTuple):
+    """Spring of the coupling with a limited force, g(K e) = min(K e, F).
+
+    Attributes:
+        stiffness: K, its largest slope in N/m or N m/rad, at least 0.
+        level: F in N or N m.
+    """
+
+    stiffness: float
+    level: float
+
+
+@compiled
+def springs(s: State) -> tuple[Spring, Spring]:
+    """Returns the coupling's springs for translation and for rotation, with the present gains."""
+    k, level = s.coupling, s.level.level
+    return Spring(k.stiffness, level[0]), Spring(k.rotational_stiffness, level[1])
+
+
+@compiled
+def is_bent(spring: Spring, size: float) -> bool:
+    """Returns True if the curve changes a force of the linear law, g(‖u‖) < ‖u‖."""
+    return size > spring.level
+
+
+@compiled
+def is_straight(spring: Spring, size: float, change: float) -> bool:
+    """Returns True if the curve has its largest slope wherever the force changes by less."""
+    return size + change <= spring.level
+
+
+@compiled
+def limited(spring: Spring, u: Vector) -> Vector:
+    """Returns the force g(‖u‖) u/‖u‖ of the linear law's u; one that is not finite stays."""
+    size = norm(u)
+    return scaled(spring.level / size, u) if spring.level < size < np.inf else u
+
+
+@compiled
+def share_of_gains(spring: Spring, size: float, share: float, compliance: float) -> float:
+    """Returns c with c ‖u‖ = g(‖u‖) for ‖u‖ = A/(1 + c σ), at most 1.
+
+    Args:
+        spring: The spring.
+        size: Force c ‖u‖ of the last solution.
+        share: Its c, above 0.
+        compliance: σ, without unit.
+    """
+    a = size / share * (1.0 + share * compliance)
+    if a <= spring.level * (1.0 + compliance):
+        return 1.0
+    return spring.level / (a - spring.level * compliance)
+
+
+@compiled
+def length_at(spring: Spring, force: float) -> float:
+    """Returns the length at which a spring of a stiffness above 0 has a force up to its level."""
+    return force / spring.stiffness
+
+
+@compiled
+def energy_at_level(spring: Spring) -> float:
+    """Returns the energy of a spring that has just reached its level, F²/2K, or 0 without K."""
+    stiffness, level = spring
+    return 0.5 * level * level / stiffness if stiffness > 0.0 else 0.0
+
+
+@compiled
+def spring_energy(spring: Spring, length: float) -> float:
+    """Returns ∫ g(K e) de from 0 to a length."""
+    stiffness, level = spring
+    elastic = min(length, level / stiffness) if stiffness > 0.0 else 0.0
+    return 0.5 * stiffness * elastic * elastic + min(stiffness * length, level) * (length - elastic)
+
+
+@compiled
+def spring_length(spring: Spring, energy: float) -> float:
+    """Returns the length at which a spring holds an energy, 0 without stiffness."""
+    stiffness, level = spring
+    if stiffness <= 0.0:
+        return 0.0
+    elastic = energy_at_level(spring)
+    if energy <= elastic:
+        return math.sqrt(2.0 * energy / stiffness)
+    return level / stiffness + (energy - elastic) / level
+
+
+@compiled
+def held_energy(s: State, stretch: Vector, twist: Vector) -> float:
+    """Returns the energy that both springs hold at a stretch in m and a twist in rad."""
+    linear, angular = springs(s)
+    return spring_energy(linear, norm(stretch)) + spring_energy(angular, norm(twist))
+
+
+@compiled
+def slack_of_step(s: State) -> tuple[float, float]:
+    """Returns the slack in J of the tick's translation and of its rotation.
+
+        slack_k = ½ g ‖δx_k‖²,    ½ g_r ‖δφ_k‖²
+
+    g in N/m and g_r in N m/rad are those of ``slack_gains``. The tool's step takes the law from
+    u + g δx to u. Between them the potential is quadratic, and this much is left over, only if the
+    curve is straight there. At the force level nothing is left.
+    """
+    loop, k = s.loop, s.coupling
+    linear, angular = springs(s)
+    return (
+        _slack(s, linear, k.slack_stiffness, loop.motion, loop.wrench_on_tool),
+        _slack(
+            s, angular, k.slack_rotational_stiffness, loop.motion[3:6], loop.wrench_on_tool[3:6]
+        ),
+    )
+
+
+@compiled
+def _slack(
+    s: State,
+    spring: Spring,
+    gain: float,
+    motion: NDArray[np.float64],
+    wrench: NDArray[np.float64],
+) -> float:
+    moved, u = vector_of(motion), vector_of(wrench)
+    square = dot(moved, moved)
+    change = gain * math.sqrt(square)
+    if s.run.law_evaluations > 1:  # ``gain`` is this share of that of one evaluation
+        change *= 1.0 / SLACK_SHARE
+    return 0.5 * gain * square if is_straight(spring, math.sqrt(dot(u, u)), change) else 0.0
+
+
 @compiled
 def law_wrench(
     s: State,
@@ -244,13 +383,6 @@ def command_handle_velocity(s: State, orientation: Quaternion) -> None:
 
 
 @compiled
-def spring_energy(stiffness: float, length: float, limit: float) -> float:
-    """Returns ∫ min(K e, F) de, the energy of a spring whose force is limited to F."""
-    elastic = min(length, limit / stiffness) if stiffness > 0.0 else 0.0
-    return 0.5 * stiffness * elastic * elastic + min(stiffness * length, limit) * (length - elastic)
-
-
-@compiled
 def set_gains(s: State, share: float) -> None:
     """Gives the coupling's actuators a share of their gains.
 
@@ -304,15 +436,6 @@ def _applied(s: State, axis: int, share: float) -> float:
     in_position, in_velocity = part * h * stiffness, part * h * (h * stiffness + damping)
     force = floats(mj.actuator_force, actuator + 1)[actuator]
     return float(force - in_position * (end - h * change) - in_velocity * change)
-
-
-@compiled
-def spring_length(stiffness: float, energy: float, limit: float) -> float:
-    """Returns the length at which a spring of limited force holds an energy."""
-    elastic = 0.5 * limit * limit / stiffness if stiffness > 0.0 else 0.0
-    if energy <= elastic:
-        return math.sqrt(2.0 * energy / stiffness) if stiffness > 0.0 else 0.0
-    return limit / stiffness + (energy - elastic) / limit if stiffness > 0.0 else 0.0
 
 
 @compiled
@@ -392,12 +515,12 @@ def charge_lateness(s: State, interval: float) -> None:
 
 
 @compiled
-def _paid(stiffness: float, length: float, limit: float, owed: float) -> tuple[float, float]:
+def _paid(spring: Spring, length: float, owed: float) -> tuple[float, float]:
     """Returns the length at which a spring has paid what it owes, and what is left to pay."""
-    energy = spring_energy(stiffness, length, limit)
-    if stiffness <= 0.0 or owed <= 0.0:
+    energy = spring_energy(spring, length)
+    if spring.stiffness <= 0.0 or owed <= 0.0:
         return np.inf, 0.0
-    return spring_length(stiffness, max(energy - owed, 0.0), limit), max(owed - energy, 0.0)
+    return spring_length(spring, max(energy - owed, 0.0)), max(owed - energy, 0.0)
 
 
 @compiled
@@ -430,20 +553,21 @@ def slip(s: State, max_stretch: float, max_twist: float) -> bool:
         True if it slipped.
     """
     k = s.coupling
+    linear, angular = springs(s)
     stretch, twist = pulled(s)
     if k.owed[0] > 0.0 or k.owed[1] > 0.0:
-        length, k.owed[0] = _paid(k.stiffness, norm(stretch), s.level.level[0], k.owed[0])
-        angle, k.owed[1] = _paid(k.rotational_stiffness, norm(twist), s.level.level[1], k.owed[1])
+        length, k.owed[0] = _paid(linear, norm(stretch), k.owed[0])
+        angle, k.owed[1] = _paid(angular, norm(twist), k.owed[1])
         max_stretch, max_twist = min(max_stretch, length), min(max_twist, angle)
     new, new_twist = within(stretch, max_stretch), within(twist, max_twist)
     if k.lacks_motors:
-        new = _held(s, new, 0, k.hold[0] / k.stiffness)
-        if k.rotational_stiffness > 0.0:
-            new_twist = _held(s, new_twist, 3, k.hold[1] / k.rotational_stiffness)
+        new = _held(s, new, 0, length_at(linear, k.hold[0]))
+        if angular.stiffness > 0.0:
+            new_twist = _held(s, new_twist, 3, length_at(angular, k.hold[1]))
     if s.guard.share == 0.0:
-        new = within(new, k.idle[0] / k.stiffness)
-        if k.rotational_stiffness > 0.0:
-            new_twist = within(new_twist, k.idle[1] / k.rotational_stiffness)
+        new = within(new, length_at(linear, k.idle[0]))
+        if angular.stiffness > 0.0:
+            new_twist = within(new_twist, length_at(angular, k.idle[1]))
     if new == stretch and new_twist == twist:
         return False
     slip_handle(s.pose, subtract(new, stretch), subtract(new_twist, twist))
@@ -459,9 +583,8 @@ def retune(s: State) -> tuple[float, float]:
     """
     k, goal, left = s.coupling, s.coupling.tuning_goal, s.coupling.tuning_ticks
     stretch, twist = pulled(s)
-    energy = spring_energy(k.stiffness, norm(stretch), s.level.level[0])
-    energy_r = spring_energy(k.rotational_stiffness, norm(twist), s.level.level[1])
-    stiffness, rotational = k.stiffness, k.rotational_stiffness
+    linear, angular = springs(s)
+    energy, energy_r = spring_energy(linear, norm(stretch)), spring_energy(angular, norm(twist))
     share = 1.0 / left
     k.stiffness += share * (goal.stiffness - k.stiffness)
     k.damping += share * (goal.damping - k.damping)
@@ -486,8 +609,9 @@ def retune(s: State) -> tuple[float, float]:
         set_gains(s, 0.5 if s.lossless.is_midpoint else 1.0)
 
     length = angle = np.inf
-    if k.stiffness > stiffness:
-        length = spring_length(k.stiffness, energy, s.level.level[0])
-    if k.rotational_stiffness > rotational:
-        angle = spring_length(k.rotational_stiffness, energy_r, s.level.level[1])
+    tuned, tuned_r = springs(s)
+    if tuned.stiffness > linear.stiffness:
+        length = spring_length(tuned, energy)
+    if tuned_r.stiffness > angular.stiffness:
+        angle = spring_length(tuned_r, energy_r)
     return length, angle

@@ -570,48 +570,10 @@ def meter_device(s: State, moved: Vector, turned: Vector, interval: float) -> No
 
 
 @compiled
-def close_balance(s: State) -> bool:
-    """Closes the tick's balance, and compares it with (14), with the slack, and at the device.
-
-        slack_k = Σ ½ g ‖δx_k‖² + ½ g_r ‖δφ_k‖²
-
-    g in N/m and g_r in N m/rad are those of ``law.slack_gains``: K + B'/T and K_r + B'_r/T with
-    one evaluation of the law per tick. A tick at the force level has no slack (``_slack``).
-
-    Returns:
-        True if the balance is finite.
-    """
-    add_slack(s)
-    return judge_balance(s)
-
-
-@compiled
-def add_slack(s: State) -> None:
-    """Adds the slack of the tick, of one coupling."""
-    loop, k = s.loop, s.coupling
-    s.energy.slack += _slack(s, 0, k.slack_stiffness, loop.motion, loop.wrench_on_tool)
-    s.energy.slack += _slack(
-        s, 1, k.slack_rotational_stiffness, loop.motion[3:6], loop.wrench_on_tool[3:6]
-    )
-
-
-@compiled
-def _slack(
-    s: State, kind: int, gain: float, motion: NDArray[np.float64], wrench: NDArray[np.float64]
-) -> float:
-    """Returns the slack in J of translation (0) or rotation (1), 0 at the force level.
-
-    The tool's step takes the law from u + g δx to u. Between them the potential is quadratic, and
-    ½ g ‖δx‖² is left over, only if both are below the level. Where it is linear nothing is left.
-    """
-    moved, u = vector_of(motion), vector_of(wrench)
-    square = dot(moved, moved)
-    change = gain * math.sqrt(square)
-    if s.run.law_evaluations > 1:  # ``gain`` is this share of that of one evaluation
-        change *= 1.0 / SLACK_SHARE
-    if math.sqrt(dot(u, u)) + change > s.level.level[kind]:
-        return 0.0
-    return float(0.5 * gain * square)
+def add_slack(energy: Part, slack: tuple[float, float]) -> None:
+    """Adds the slack in J of the tick, of the two springs of a coupling (``law.slack_of_step``)."""
+    energy.slack += slack[0]
+    energy.slack += slack[1]
 
 
 @compiled

@@ -428,18 +428,19 @@ def note_slip(s: State) -> None:
 
 
 @compiled
-def lossless_wrench(s: State) -> tuple[Vector, Vector, Vector, Vector]:
+def lossless_wrench(states: NDArray[np.void]) -> tuple[Vector, Vector, Vector, Vector]:
     """Evaluates the lossless coupling after a step of MuJoCo, and notes the tool's new pose.
 
     Returns:
         Force, torque, and the tool's motion and rotation vector in the step.
     """
+    s = states[0]
     lossless = s.lossless
     lossless.is_near = scan_contacts(s)
     lossless.was_midpoint = lossless.is_midpoint
     lossless.ticks += lossless.was_midpoint
     if not lossless.is_midpoint:
-        force, torque, moved, turned = limited_wrench_after_step(s, True)
+        force, torque, moved, turned = limited_wrench_after_step(states, True)
         if s.level.share[0] < 1.0 or s.level.share[1] < 1.0 or s.level.flags:
             lossless.is_near = True
         return force, torque, moved, turned

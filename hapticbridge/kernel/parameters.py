@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hapticbridge.arguments import Arguments, is_number, shown
+from hapticbridge.arguments import Rule, check_fields, checked_value, option, rule, shown
 from hapticbridge.coupling import Coupling
 from hapticbridge.dataclass_json import from_json, to_json
 from hapticbridge.errors import HapticBridgeError
-from hapticbridge.kernel.codes import Scheme, SchemeProperties
+from hapticbridge.kernel.codes import Grip, Scheme, SchemeProperties
 from hapticbridge.pose import IDENTITY_POSE
 
 OFF, DAMPER, ENVIRONMENT = 0, 1, 3
@@ -26,26 +27,13 @@ MAX_BUTTONS = 32
 ALL_MOTORS = 63
 """Mask of six axes with a motor."""
 
-_POSITIVE = (
-    "reach",
-    "hold_force",
-    "hold_torque",
-    "idle_force",
-    "idle_torque",
-    "swing_energy",
-    "runaway_speed",
-    "delay_margin",
-)
-_TRIPS = ("speed", "turn_speed", "stretch", "angle", "energy")
-_NOT_NEGATIVE = (
-    "full_speed",
-    "assumed_damping",
-    "assumed_rotational_damping",
-    "max_damping",
-    "max_rotational_damping",
-    "energy_credit_limit",
-    "stated_delay",
-)
+
+def _threshold(unit: str) -> Any:
+    return option(math.inf, unit=unit, least=0.0, is_open=True, is_finite=False)
+
+
+def _mask(default: int = 0) -> Any:
+    return option(default, least=0, most=2**MAX_BUTTONS - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,66 +82,39 @@ class GuardParameters:
         HapticBridgeError: A value is out of range.
     """
 
-    controller: int = OFF
-    assumed_damping: float = 0.0
-    assumed_rotational_damping: float = 0.0
-    max_damping: float = 0.0
-    max_rotational_damping: float = 0.0
-    energy_credit_limit: float = 0.0
-    stale_ticks: int = 0
-    fade_ticks: int = 1
+    controller: int = option(OFF, least=0, most=3)
+    assumed_damping: float = option(0.0, unit="N s/m", least=0.0)
+    assumed_rotational_damping: float = option(0.0, unit="N m s/rad", least=0.0)
+    max_damping: float = option(0.0, unit="N s/m", least=0.0)
+    max_rotational_damping: float = option(0.0, unit="N m s/rad", least=0.0)
+    energy_credit_limit: float = option(0.0, unit="J", least=0.0)
+    stale_ticks: int = _mask()
+    fade_ticks: int = option(1, least=1, most=2**MAX_BUTTONS - 1)
     has_hand: bool = False
-    clutch: int = 0
-    dead_man: int = 0
-    speed: float = math.inf
-    turn_speed: float = math.inf
-    stretch: float = math.inf
-    angle: float = math.inf
-    energy: float = math.inf
-    reach: float = math.inf
-    full_speed: float = 0.0
-    motors: int = ALL_MOTORS
-    hold_force: float = math.inf
-    hold_torque: float = math.inf
-    idle_force: float = math.inf
-    idle_torque: float = math.inf
-    swing_energy: float = math.inf
-    runaway_speed: float = math.inf
-    twist_damping: float = math.inf
-    stated_delay: float = 0.0
-    delay_margin: float = math.inf
+    clutch: int = _mask()
+    dead_man: int = _mask()
+    speed: float = _threshold("m/s")
+    turn_speed: float = _threshold("rad/s")
+    stretch: float = _threshold("m")
+    angle: float = _threshold("rad")
+    energy: float = _threshold("J")
+    reach: float = _threshold("m")
+    full_speed: float = option(0.0, unit="m/s", least=0.0)
+    motors: int = _mask(ALL_MOTORS)
+    hold_force: float = _threshold("N")
+    hold_torque: float = _threshold("N m")
+    idle_force: float = _threshold("N")
+    idle_torque: float = _threshold("N m")
+    swing_energy: float = _threshold("J")
+    runaway_speed: float = _threshold("m/s")
+    twist_damping: float = option(math.inf, unit="N m s/rad", least=0.0, is_finite=False)
+    stated_delay: float = option(0.0, unit="s", least=0.0)
+    delay_margin: float = _threshold("s")
 
     def __post_init__(self) -> None:
+        check_fields(self, of="guard: ")
         if self.controller not in (OFF, DAMPER, ENVIRONMENT):
             raise HapticBridgeError(f"controller is {self.controller!r}; it must be 0, 1 or 3")
-        for name in _NOT_NEGATIVE:
-            value = getattr(self, name)
-            if not is_number(value) or not 0 <= value < math.inf:
-                raise HapticBridgeError(
-                    f"guard: {_words(name)} is {value!r}; it must be finite and >= 0"
-                )
-        if not is_number(self.twist_damping) or not self.twist_damping >= 0:
-            raise HapticBridgeError(
-                f"guard: twist damping is {self.twist_damping!r}; it must be >= 0"
-            )
-        for name in (*_POSITIVE, *_TRIPS):
-            value = getattr(self, name)
-            if not is_number(value) or not value > 0:
-                raise HapticBridgeError(f"guard: {_words(name)} is {value!r}; it must be > 0")
-        smallest = {
-            "stale_ticks": 0,
-            "fade_ticks": 1,
-            "has_hand": 0,
-            "clutch": 0,
-            "dead_man": 0,
-            "motors": 0,
-        }
-        for name, minimum in smallest.items():
-            value = getattr(self, name)
-            if not isinstance(value, int) or not minimum <= value < 2**MAX_BUTTONS:
-                raise HapticBridgeError(
-                    f"guard: {_words(name)} is {value!r}; it must be >= {minimum}"
-                )
 
     def to_json(self) -> str:
         """Returns the text for a recording's metadata."""
@@ -181,13 +142,17 @@ MAX_SUBSTEPS = 100
 """Largest number of MuJoCo steps per tick. More do not fit into the period of a haptic loop."""
 
 
+SUBSTEPS = rule(least=1, most=MAX_SUBSTEPS)
+"""Valid numbers of MuJoCo steps per tick, as the metadata of a field."""
+
+
 def checked_substeps(substeps: int, error: type[HapticBridgeError] = HapticBridgeError) -> int:
     """Returns a number of MuJoCo steps per tick, 1 to ``MAX_SUBSTEPS``.
 
     Raises:
         HapticBridgeError: It is out of range; the class is ``error``.
     """
-    return Arguments(error).whole("substeps", substeps, least=1, most=MAX_SUBSTEPS)
+    return int(checked_value("substeps", substeps, (int,), SUBSTEPS["rule"], error))
 
 
 def refuse_substeps(scheme: int, substeps: int) -> None:
@@ -238,6 +203,10 @@ of a long time then pays for no more than the hand stores in the coupling within
 larger value frees a jammed tool sooner, and lets it be pushed out harder."""
 
 
+def _positive(unit: str) -> dict[str, Rule]:
+    return rule(unit=unit, least=0.0, is_open=True)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunParameters:
     """All numbers besides scene and device motion that the results of a run depend on.
@@ -278,21 +247,21 @@ class RunParameters:
     """
 
     grip: str
-    period: float
-    substeps: int
+    period: float = field(metadata=_positive("s"))
+    substeps: int = field(metadata=SUBSTEPS)
     coupling: Coupling
-    scale: float = 1.0
-    force_scale: float = 1.0
+    scale: float = field(default=1.0, metadata=_positive(""))
+    force_scale: float = field(default=1.0, metadata=_positive(""))
     axes: tuple[float, ...] = SAME_AXES
-    force_limit: float
-    torque_limit: float
-    ramp_ticks: int
+    force_limit: float = field(metadata=_positive("N"))
+    torque_limit: float = field(metadata=_positive("N m"))
+    ramp_ticks: int = field(metadata=rule(least=0))
     device_origin: tuple[float, ...]
     handle_origin: tuple[float, ...]
     device_start: tuple[float, ...]
     scheme: int = Scheme.IMPLICIT
     effective: Coupling | None = None
-    contact_stiffness: float = 0.0
+    contact_stiffness: float = option(0.0, unit="N/m", least=0.0)
     device_damping: float | None = None
     device_rotational_damping: float | None = None
     guarding: GuardParameters = UNGUARDED
@@ -301,30 +270,18 @@ class RunParameters:
     is_beside: bool = False
 
     def __post_init__(self) -> None:
-        checked_substeps(self.substeps)
-        positive = ("period", "scale", "force_scale", "force_limit", "torque_limit")
-        for name in positive:
-            value = getattr(self, name)
-            if not math.isfinite(value) or value <= 0:
-                raise HapticBridgeError(f"{name} is {value!r}; it must be finite and > 0")
+        check_fields(self)
         if self.scheme not in list(Scheme):
             raise HapticBridgeError(
                 f"scheme is {self.scheme!r}; it must be 0 to {max(Scheme).value}"
             )
-        stiffness = self.contact_stiffness
-        if (
-            not math.isfinite(stiffness)
-            or stiffness < 0
-            or (stiffness > 0) == self.properties.has_tool_mass
-        ):
+        if (self.contact_stiffness > 0) == self.properties.has_tool_mass:
             raise HapticBridgeError(
-                f"contact stiffness is {stiffness!r} N/m; it must be finite and > 0 for a tool "
-                "without mass, and has no meaning for another"
+                f"contact stiffness is {self.contact_stiffness!r} N/m; it must be > 0 for a tool "
+                "without mass, and 0 for another"
             )
         refuse_substeps(self.scheme, self.substeps)
         refuse_scene_ticks(self.scheme, self.scene_ticks)
-        if self.ramp_ticks < 0:
-            raise HapticBridgeError(f"the ramp is {self.ramp_ticks} ticks; it must be >= 0")
         for name in ("device_origin", "handle_origin", "device_start"):
             pose = getattr(self, name)
             if len(pose) != 7 or not all(math.isfinite(value) for value in pose):
@@ -339,6 +296,11 @@ class RunParameters:
             and np.linalg.det(rotation.reshape(3, 3)) > 0
         ):
             raise _no_rotation(self.axes)
+
+    @property
+    def is_joint(self) -> bool:
+        """True if the hand holds a joint, which has no handle in the scene."""
+        return Grip.from_text(self.grip).is_joint
 
     @property
     def tank_cap(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import CONTROLLER_ACTIVE, Part, State
-from hapticbridge.kernel.law import pulled, spring_energy
+from hapticbridge.kernel.law import held_energy, pulled
 from hapticbridge.kernel.parameters import DAMPER, ENVIRONMENT, GuardParameters
 from hapticbridge.pose import Vector, norm, scaled
 
@@ -88,11 +88,8 @@ def bind_observer(observer: Part, guarding: GuardParameters) -> None:
 @compiled
 def credit_springs(s: State) -> None:
     """Adds the present energy of the coupling's springs to what may reach the hand."""
-    k, level = s.coupling, s.level.level
     stretch, twist = pulled(s)
-    held = spring_energy(k.stiffness, norm(stretch), level[0])
-    held += spring_energy(k.rotational_stiffness, norm(twist), level[1])
-    s.observer.springs += held
+    s.observer.springs += held_energy(s, stretch, twist)
 
 
 def observe_reset(s: State, stored_before: float) -> None:
@@ -103,7 +100,8 @@ def observe_reset(s: State, stored_before: float) -> None:
         stored_before: Storage before the reset in J.
     """
     energy, observer = s["energy"], s["observer"]
-    start, ratio = float(energy["start_energy"]), s["run"]["force_scale"] / s["run"]["scale"]
+    start = float(energy["start_energy"] + energy["others_work"])
+    ratio = s["run"]["force_scale"] / s["run"]["scale"]
     after = float(energy["kinetic"] + energy["potential"])
     lost_before, lost_after = min(stored_before - start, 0.0), min(after - start, 0.0)
     observer["net_device_energy"] += ratio * (lost_before - lost_after)

@@ -47,7 +47,17 @@ from hapticbridge.jit import compiled
 from hapticbridge.kernel.codes import Part, State
 from hapticbridge.kernel.force_level import limited_wrench
 from hapticbridge.kernel.handle import grip_pose, note_tool
-from hapticbridge.kernel.law import law_wrench, spring_energy, spring_length, within
+from hapticbridge.kernel.law import (
+    energy_at_level,
+    held_energy,
+    law_wrench,
+    length_at,
+    limited,
+    spring_energy,
+    spring_length,
+    springs,
+    within,
+)
 from hapticbridge.kernel.ledger import take_scene_energies
 from hapticbridge.kernel.mujoco_c import floats, ints, pointer_at
 from hapticbridge.kernel.parameters import RunParameters
@@ -170,11 +180,10 @@ def start_shown(state: NDArray[np.void]) -> None:
 @compiled
 def _credit(s: State) -> float:
     """Returns the energy in J of the coupling's springs at their levels, at the present gains."""
-    k, level = s.coupling, s.level.level
-    credit = 0.5 * level[0] * level[0] / k.stiffness
-    if k.rotational_stiffness > 0.0:
-        angle = min(level[1] / k.rotational_stiffness, np.pi)
-        credit += 0.5 * k.rotational_stiffness * angle * angle
+    linear, angular = springs(s)
+    credit = energy_at_level(linear)
+    if angular.stiffness > 0.0:
+        credit += spring_energy(angular, min(length_at(angular, angular.level), np.pi))
     return float(credit)
 
 
@@ -189,13 +198,13 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
     the tank allow.
     """
     s = state[0]
-    pose, scene_sample, k, level = s.pose, sample[0], s.coupling, s.level.level
+    pose, scene_sample = s.pose, sample[0]
+    linear, angular = springs(s)
     s.shown.age, s.shown.waits = 0, 1
     tool, orientation = vector_of(s.shown.newest), quaternion_of(s.shown.newest[3:7])
     stretch = subtract(vector_of(pose.handle_position), tool)
     twist = rotation_between(orientation, quaternion_of(pose.handle_quaternion))
-    energy = spring_energy(k.stiffness, norm(stretch), level[0])
-    energy_r = spring_energy(k.rotational_stiffness, norm(twist), level[1])
+    energy, energy_r = spring_energy(linear, norm(stretch)), spring_energy(angular, norm(twist))
     allowed = max(_credit(s) + s.shown.tank, 0.0)
     if energy + energy_r <= allowed:
         store_vector(scene_sample.position, vector_of(pose.handle_position))
@@ -203,9 +212,9 @@ def hand_over(state: NDArray[np.void], sample: NDArray[np.void]) -> None:
         return
     share = allowed / (energy + energy_r)
     if energy > 0.0:
-        stretch = within(stretch, spring_length(k.stiffness, share * energy, level[0]))
+        stretch = within(stretch, spring_length(linear, share * energy))
     if energy_r > 0.0:
-        twist = within(twist, spring_length(k.rotational_stiffness, share * energy_r, level[1]))
+        twist = within(twist, spring_length(angular, share * energy_r))
     store_vector(scene_sample.position, add(tool, stretch))
     store_quaternion(
         scene_sample.quaternion, canonical(product(quaternion_exp(twist), orientation))
@@ -327,11 +336,9 @@ def _outside(shown: Part, position: Vector, orientation: Quaternion, time: float
 @compiled
 def _stored(s: State, position: Vector, orientation: Quaternion) -> float:
     """Returns V, the energy in J that the coupling's springs hold with the tool at a pose."""
-    k, level = s.coupling, s.level.level
     stretch = subtract(vector_of(s.pose.handle_position), position)
     twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
-    energy = spring_energy(k.stiffness, norm(stretch), level[0])
-    return float(energy + spring_energy(k.rotational_stiffness, norm(twist), level[1]))
+    return held_energy(s, stretch, twist)
 
 
 @compiled
@@ -353,11 +360,11 @@ def _shown_at(
 def _released_energy(s: State, before: float, share: float, step: Vector, turn: Vector) -> float:
     """Returns P, the energy in J that the coupling gives if the tool moves by a share."""
     position, orientation, force, torque, moved, turned = _shown_at(s, share, step, turn)
-    k, level = s.coupling, s.level.level
+    linear, angular = springs(s)
     stretch = subtract(vector_of(s.pose.handle_position), position)
     twist = rotation_between(orientation, quaternion_of(s.pose.handle_quaternion))
-    elastic = within(scaled(k.stiffness, stretch), level[0])
-    elastic_r = within(scaled(k.rotational_stiffness, twist), level[1])
+    elastic = limited(linear, scaled(linear.stiffness, stretch))
+    elastic_r = limited(angular, scaled(angular.stiffness, twist))
     damped = dot(subtract(force, elastic), moved) + dot(subtract(torque, elastic_r), turned)
     return float(before - _stored(s, position, orientation) + damped)
 

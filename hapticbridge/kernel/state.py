@@ -228,6 +228,11 @@ class BoundKernel:
         self._start(parameters)
 
     @property
+    def hands(self) -> tuple[BoundKernel, ...]:
+        """The kernel of the only hand, as ``BoundHands`` has those of several."""
+        return (self,)
+
+    @property
     def _record(self) -> State:
         """The state as one record, whose sub-records are views."""
         return self.state[0]
@@ -438,11 +443,11 @@ class BoundKernel:
 
 
 class BoundHands:
-    """States of several hands, bound to one model and its data (``kernel.hands``).
+    """States of several hands, bound to one model and its data (``kernel.tick``).
 
     Attributes:
-        states: One element of ``STATE_DTYPE`` per hand; the first one meters the scene.
-        rows: One record of ``TICK_DTYPE`` per hand.
+        state: One element of ``STATE_DTYPE`` per hand; the first one meters the scene.
+        row: One record of ``TICK_DTYPE`` per hand.
         hands: The bound kernel of each hand.
     """
 
@@ -456,21 +461,21 @@ class BoundHands:
             SceneError: As for ``BoundKernel``.
         """
         for each in parameters:
-            if each.scheme != Scheme.IMPLICIT or each.substeps != 1 or each.scene_ticks:
+            if not each.properties.allows_hands or each.substeps != 1 or each.scene_ticks:
                 raise HapticBridgeError(
-                    "several hands need method 'implicit' or 'compensated', one substep, and a "
+                    "several hands need a method that MuJoCo solves whole, one substep, and a "
                     "scene that steps in every tick"
                 )
             if (each.period, each.is_rigid) != (parameters[0].period, parameters[0].is_rigid):
                 raise HapticBridgeError("all hands of a scene need one period and one contact")
-        self.states = np.zeros(len(parameters), STATE_DTYPE)
-        self.rows = np.zeros(len(parameters), TICK_DTYPE)
+        self.state = np.zeros(len(parameters), STATE_DTYPE)
+        self.row = np.zeros(len(parameters), TICK_DTYPE)
         self.hands = tuple(
             BoundKernel(
                 model,
                 data,
                 each,
-                place=Place(i, self.states[i : i + 1], self.rows[i : i + 1]),
+                place=Place(i, self.state[i : i + 1], self.row[i : i + 1]),
             )
             for i, each in enumerate(parameters)
         )

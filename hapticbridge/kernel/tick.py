@@ -9,6 +9,16 @@
     6. finish_tick: close_tick, publish   6.   close_tick
 
 2 to 4 are repeated for each substep. Both inline the same functions and agree to the bit.
+
+Each hand has a state of its own (``state.STATE_DTYPE``): device, handle, coupling, force level,
+guard and account. All states are bound to one model and its data; the first one meters the scene,
+and has its rigid contacts and their tank. With n hands
+
+    E_k = S_k − S_{k−1} − Σ_i (f_i·δx_i + τ_i·δφ_i) − W_actuators − W_external
+
+and the slack is the sum of the hands' slacks. MuJoCo solves all couplings in one step, so two hands
+may hold one body. For each device, the other hands are ports of the scene: energy that another hand
+put in may reach it. Several hands need a scheme that allows them (``Scheme.properties``).
 """
 
 from __future__ import annotations
@@ -26,6 +36,7 @@ from hapticbridge.kernel.codes import (
     CONTACT,
     GAVE_ENERGY,
     HALF_DONE,
+    HAND_CODES,
     LARGEST_CONTROL,
     OK,
     RING_FULL,
@@ -40,6 +51,7 @@ from hapticbridge.kernel.force_level import (
     keep_state,
     limited_wrench,
     limited_wrench_after_step,
+    settled_wrench,
     spend_within_tank,
 )
 from hapticbridge.kernel.handle import (
@@ -60,12 +72,15 @@ from hapticbridge.kernel.law import (
     command_handle_velocity,
     felt,
     retune,
+    slack_of_step,
     slip,
 )
 from hapticbridge.kernel.ledger import (
     add_coupling_work,
-    close_balance,
+    add_slack,
+    add_up_hands,
     end_mocap_moves,
+    judge_balance,
     meter_device,
     meter_ports,
     note_moved_mocap_bodies,
@@ -180,7 +195,7 @@ def _device_motion(pose: Part, position: Vector, quaternion: Quaternion) -> tupl
 
 
 @compiled
-def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elapsed: float) -> int:
+def take_sample(s: State, sample: State, row: State, elapsed: float) -> int:
     """Checks a sample, observes the energy of the previous tick, and moves the handle.
 
     A joint is moved by the device's x axis alone.
@@ -189,10 +204,10 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
         ``OK``, or the reason to refuse the sample; nothing was changed then.
     """
     pose = s.pose
-    position = vector_of(sample[0].position)
-    if not _is_pose(position, quaternion_of(sample[0].quaternion)):
+    position = vector_of(sample.position)
+    if not _is_pose(position, quaternion_of(sample.quaternion)):
         return BAD_SAMPLE
-    quaternion = canonical(quaternion_of(sample[0].quaternion))
+    quaternion = canonical(quaternion_of(sample.quaternion))
     if s.mj.held_qpos != 0:
         position, quaternion = (position[0], 0.0, 0.0), UPRIGHT
     moved, turned = _device_motion(pose, position, quaternion)
@@ -206,7 +221,7 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
     watch_device(s, moved, turned, interval)
     move_device(pose, position, quaternion)
 
-    buttons = (sample[0].buttons & DEVICE_BUTTONS) | s.guard.commanded
+    buttons = (sample.buttons & DEVICE_BUTTONS) | s.guard.commanded
     share = s.guard.share  # of the wrench that was held until now
     if share == 1.0:
         handle, orientation = handle_pose(s.run, pose, position, quaternion)
@@ -234,14 +249,14 @@ def take_sample(s: State, sample: NDArray[np.void], row: NDArray[np.void], elaps
     if has_slipped or (share < 1.0 and (moved != _AT_REST or turned != _AT_REST)):
         anchor_handle(pose)
         note_anchored(s.guard)
-    row[0].buttons = buttons
+    row.buttons = buttons
     _record_sample(s, row)
     return OK
 
 
 @compiled
-def _record_sample(s: State, row: NDArray[np.void]) -> None:
-    r, pose = row[0], s.pose
+def _record_sample(s: State, r: State) -> None:
+    pose = s.pose
     r.tick = s.loop.tick
     store_vector(r.device_position, vector_of(pose.device_position))
     store_quaternion(r.device_quaternion, quaternion_of(pose.device_quaternion))
@@ -257,36 +272,39 @@ def before_step(
     substep: int,
     elapsed: float,
 ) -> int:
-    """Moves the handle by a device sample, and gives MuJoCo the controls of its next step.
+    """Moves every handle by its device's sample, and gives MuJoCo the controls of its next step.
 
     Args:
-        state: The bound state.
-        sample: One device sample.
-        row: The bound record.
+        state: The bound states, one per hand, in order.
+        sample: One device sample per hand.
+        row: The bound records.
         substep: Number of the substep in this tick; the sample is read in substep 0.
         elapsed: Time since the previous sample in s. Values below T are raised to T; a short
             interval would overstate the energy that the damper dissipates, b ‖δp‖²/t.
 
     Returns:
         ``OK``; ``HALF_DONE`` if only the second half of MuJoCo's step is left to do; ``BAD_SAMPLE``
-        or a result of ``tick_guard.refusal``, and then nothing was changed.
+        or a result of ``tick_guard.refusal`` for the first hand that is refused, plus
+        ``HAND_CODES`` times its number. The run must end then: the hands before it have moved.
     """
     s = state[0]
     if substep == 0:
-        code = take_sample(s, sample, row, elapsed)
-        if code != OK:
-            return code
+        for i in range(state.size):
+            code = take_sample(state[i], sample[i], row[i], elapsed)
+            if code != OK:
+                return code + HAND_CODES * i
     scheme = s.run.scheme
     if scheme == Scheme.SHOWN:
         return OK
-    orientation = place_handle(s, substep)
-    if scheme == Scheme.IMPLICIT:
-        command_handle_velocity(s, orientation)
-    elif scheme == Scheme.MIDPOINT:
-        apply_carried(s)
-        command_handle_velocity(s, orientation)
-    else:
-        drive_compared(s, orientation)
+    for i in range(state.size):
+        orientation = place_handle(state[i], substep)
+        if scheme == Scheme.IMPLICIT:
+            command_handle_velocity(state[i], orientation)
+        elif scheme == Scheme.MIDPOINT:
+            apply_carried(s)
+            command_handle_velocity(s, orientation)
+        else:
+            drive_compared(state[i], orientation)
     if s.level.is_solved:
         keep_state(s)
     if s.loop.has_positions:
@@ -394,15 +412,20 @@ def between_halves(state: NDArray[np.void]) -> None:
 
 
 @compiled
-def _evaluate(s: State, is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
-    """Returns force and torque on the tool, and its motion and turn, after a step of MuJoCo."""
+def _evaluate(states: NDArray[np.void], is_last: bool) -> tuple[Vector, Vector, Vector, Vector]:
+    """Returns the first hand's force and torque, and its tool's motion and turn, after a step.
+
+    The levels of all hands are settled then, because one that is reached changes the step of the
+    others.
+    """
+    s = states[0]
     if s.run.scheme == Scheme.IMPLICIT:
-        return limited_wrench_after_step(s, is_last)
+        return limited_wrench_after_step(states, is_last)
     if s.run.scheme == Scheme.MIDPOINT:
-        return lossless_wrench(s)
+        return lossless_wrench(states)
     if s.run.scheme == Scheme.SHOWN:
         return shown_wrench(s)
-    return compared_wrench(s, is_last)
+    return compared_wrench(states, is_last)
 
 
 @compiled
@@ -432,15 +455,15 @@ def active_contacts(s: State) -> int:
 
 @compiled
 def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) -> int:
-    """Computes the wrench of the step that just ended; after the last substep also the device's.
+    """Computes the wrenches of the step that just ended; after the last substep also the devices'.
 
     With several evaluations of the law per tick, the wrench is their mean. The handle moves
     uniformly within a tick, so the mean does the same work on it as the single wrenches.
 
     Returns:
         ``OK``; ``BAD_RESULT`` or the result of a warning of MuJoCo (``mujoco_c.warning_at``);
-        ``GAVE_ENERGY`` if the wrench would pass the energy limit in the next tick. Unless it is
-        ``OK``, the wrench on the device is zero.
+        ``GAVE_ENERGY`` if the wrench would pass the energy limit in the next tick; with the hand
+        as ``before_step`` has it. Unless it is ``OK``, the wrench on every device is zero.
     """
     s = state[0]
     loop, scheme, count = s.loop, s.run.scheme, s.run.law_evaluations
@@ -455,7 +478,7 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
         return OK
     if s.shown.is_beside:
         note_contacts(s)
-    force, torque, moved, turned = _evaluate(s, is_last)
+    force, torque, moved, turned = _evaluate(state, is_last)
     end_mocap_moves(s)
     if s.contact.is_rigid:
         finish_contacts(s)
@@ -468,11 +491,20 @@ def answer_step(state: NDArray[np.void], row: NDArray[np.void], substep: int) ->
             force, torque = add(vector_of(w), force), add(vector_of(w[3:6]), torque)
             moved, turned = add(vector_of(m), moved), add(vector_of(m[3:6]), turned)
     keep_wrench(s, work, force, torque, moved, turned)
+    for i in range(1, state.size):
+        force, torque, moved, turned = settled_wrench(state[i], is_last)
+        work = dot(force, moved) + dot(torque, turned)
+        keep_wrench(state[i], work, force, torque, moved, turned)
     if not is_last:
         add_coupling_work(s.energy, loop.law_work)
         take_mean_bias_in_substep(s)
         return OK
-    return send_wrench(s, row, active_contacts(s))
+    contacts, code = active_contacts(s), OK
+    for i in range(state.size):
+        sent = send_wrench(state[i], row[i], contacts)
+        if code == OK and sent != OK:
+            code = sent + HAND_CODES * i
+    return code if code == OK else refuse_tick(state, code)
 
 
 @compiled
@@ -489,7 +521,7 @@ def keep_wrench(
 
 
 @compiled
-def send_wrench(s: State, row: NDArray[np.void], contacts: int) -> int:
+def send_wrench(s: State, row: State, contacts: int) -> int:
     """Computes the wrench on the device of that on the tool, and the tick's flags.
 
     Args:
@@ -498,25 +530,23 @@ def send_wrench(s: State, row: NDArray[np.void], contacts: int) -> int:
         contacts: Count of contacts with a force in the scene.
 
     Returns:
-        As ``answer_step``.
+        As ``answer_step`` for one hand; unless it is ``OK``, the tick must be refused.
     """
     loop = s.loop
     force, torque = vector_of(loop.wrench_on_tool), vector_of(loop.wrench_on_tool[3:6])
     square = dot(force, force) + dot(torque, torque)
     code = _failure(s, square)
     if code != OK:
-        refuse_tick(s)
         return code
     _render(s, force, torque)
     if foreseen_excess(s) > s.guard.max_energy:
-        refuse_tick(s)
         return GAVE_ENERGY
     loop.active_contacts = contacts
     loop.flags = lossless_flag(s.lossless) | s.guard.flags | s.observer.flags | s.level.flags
     loop.flags |= s.watch.flags
     if loop.active_contacts > 0:
         loop.flags |= CONTACT
-    row[0].solver_iterations = _solver_iterations(s)
+    row.solver_iterations = _solver_iterations(s)
     return OK
 
 
@@ -548,15 +578,15 @@ def _render(s: State, force: Vector, torque: Vector) -> None:
 
 @compiled
 def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bool) -> int:
-    """Closes the tick's balance and completes its record, after the wrench was sent.
+    """Closes the balance of all hands and completes their records, after the wrenches were sent.
 
     Args:
-        state: The bound state after ``answer_step``.
-        row: The bound record.
+        state: The bound states after ``answer_step``.
+        row: The bound records.
         has_positions: True if MuJoCo's position stage has run since the step.
 
     Returns:
-        ``OK`` or ``BAD_RESULT``; with the latter zero force must be sent.
+        ``OK`` or ``BAD_RESULT``; with the latter zero force must be sent to every device.
     """
     s = state[0]
     loop = s.loop
@@ -566,22 +596,30 @@ def close_tick(state: NDArray[np.void], row: NDArray[np.void], has_positions: bo
         refresh_energies(s)
     if s.run.scheme == Scheme.MIDPOINT and finish_lossless(s):
         loop.has_positions = 0  # it was computed with the springs of the other form
-    add_coupling_work(s.energy, loop.law_work)
-    if s.run.scheme == Scheme.IMPLICIT:
-        take_back(s, s.mj.qvel, 0.0)
-    if not close_balance(s):
-        return refuse_tick(s)
+    for i in range(state.size):
+        add_coupling_work(state[i].energy, state[i].loop.law_work)
+        add_slack(state[i].energy, slack_of_step(state[i]))
+    add_up_hands(state)
+    if s.run.scheme == Scheme.IMPLICIT and take_back(s, s.mj.qvel, 0.0):
+        add_up_hands(state)
+    is_finite = True
+    for i in range(state.size):
+        is_finite = judge_balance(state[i]) and is_finite
+    if not is_finite:
+        return refuse_tick(state, BAD_RESULT)
     fill_tank(s)
     if has_positions and not is_sound(s):
         loop.has_positions = 0
-    end_tick(s, row)
+    for i in range(state.size):
+        end_tick(state[i], row[i])
+        row[i].contact_tank = row[0].contact_tank
     if loop.has_positions and turns_actuators_alone(s):
         take_velocities(s)
     return OK
 
 
 @compiled
-def end_tick(s: State, row: NDArray[np.void]) -> None:
+def end_tick(s: State, row: State) -> None:
     """Notes the peaks, completes the record, and counts the tick."""
     loop = s.loop
     loop.peak_force = max(loop.peak_force, norm(vector_of(loop.wrench_on_device)))
@@ -599,12 +637,14 @@ def set_external_flags(loop: Part, flags: int) -> None:
 
 
 @compiled
-def refuse_tick(s: State) -> int:
-    """Sets the wrench on the device to zero and flags a trip; returns ``BAD_RESULT``."""
-    s.loop.flags = TRIP
-    for i in range(6):
-        s.loop.wrench_on_device[i] = 0.0
-    return BAD_RESULT
+def refuse_tick(states: NDArray[np.void], code: int) -> int:
+    """Sets the wrench on every device to zero and flags a trip; returns the code."""
+    for hand in range(states.size):
+        loop = states[hand].loop
+        loop.flags = TRIP
+        for i in range(6):
+            loop.wrench_on_device[i] = 0.0
+    return code
 
 
 @compiled
@@ -620,9 +660,9 @@ def _solver_iterations(s: State) -> int:
 
 
 @compiled
-def _record(s: State, row: NDArray[np.void]) -> None:
+def _record(s: State, r: State) -> None:
     """Copies the results of the tick into its record; see ``record.TICK_DTYPE``."""
-    r, loop, energy = row[0], s.loop, s.energy
+    loop, energy = s.loop, s.energy
     r.flags = loop.flags
     r.contacts = loop.active_contacts
     store_vector(r.tool_position, vector_of(s.pose.tool_position))
@@ -725,7 +765,9 @@ def finish_tick(
     code = close_tick(state, row, has_positions)
     if code != OK:
         return code
-    note_delay(state[0], deadline_ns, read_ns, write_ns)
+    for i in range(state.size):
+        note_delay(state[i], deadline_ns, read_ns, write_ns)
+        row[i].flags |= state[i].loop.external_flags
     taken = publish(row, ring, cursors, deadline_ns, wake_ns, read_ns, write_ns, flags)
     return OK if taken else RING_FULL
 
@@ -844,22 +886,24 @@ def simulate_recorded(
     """Runs the ticks of a recorded run, with the influences from outside the scene.
 
     Args:
-        state: The bound state.
-        samples: Device samples, one per tick.
-        external_flags: ``STALE_SAMPLE`` as recorded, one per tick.
+        state: The bound states.
+        samples: Device samples by tick and hand, (n, m).
+        external_flags: ``STALE_SAMPLE`` as recorded, (n, m).
         elapsed: Time between two samples in s, one per tick.
-        row: The bound record.
-        rows: Receives the records; as long as ``samples``.
+        row: The bound records.
+        rows: Receives the records, (n, m).
 
     Returns:
         Count of completed ticks, as for ``simulate``.
     """
-    for k in range(samples.size):
-        state[0].loop.external_flags = external_flags[k]
-        if not whole_tick(state, samples[k : k + 1], row, elapsed[k]):
+    for k in range(samples.shape[0]):
+        for i in range(state.size):
+            set_external_flags(state[i].loop, external_flags[k, i])
+        if not whole_tick(state, samples[k], row, elapsed[k]):
             return k
-        rows[k] = row[0]
-    return int(samples.size)
+        for i in range(state.size):
+            rows[k, i] = row[i]
+    return int(samples.shape[0])
 
 
 @compiled_for_threads

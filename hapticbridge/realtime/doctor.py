@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import Arguments
 from hapticbridge.clock import RealClock, period_of
 from hapticbridge.confinement import means
 from hapticbridge.device.discovery import blind_spots, plugged_devices
@@ -469,10 +469,7 @@ def diagnose(
     Raises:
         HapticBridgeError: Rate or duration is out of range.
     """
-    if not (math.isfinite(duration) and SHORTEST <= duration <= LONGEST):
-        raise HapticBridgeError(
-            f"duration is {duration!r} s; it must be {SHORTEST:g} to {LONGEST:g}"
-        )
+    Arguments(HapticBridgeError).number("duration", duration, "s", least=SHORTEST, most=LONGEST)
     period_ns = round(period_of(rate) * 1e9)
     bridge, bare, baseline = Wakeups("bridge"), Wakeups("bare sleep"), Wakeups(BASELINE)
     machine = system or System()

@@ -17,6 +17,7 @@ from hapticbridge.audit.events import AuditedRun
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.audit.replay import Resimulator
 from hapticbridge.certificate import DampingCondition, run_conditions
+from hapticbridge.commands import UNITS
 from hapticbridge.confinement import Worker, in_bounds
 from hapticbridge.errors import HapticBridgeError, RecordingError
 from hapticbridge.guard import may_be_pumped
@@ -115,7 +116,7 @@ def _method_cause(method: Method, where: str = "") -> Cause:
 
 def _failing_words(failing: list[DampingCondition]) -> str:
     return "; ".join(
-        f"{c.axis}: the device's damping is {c.available:g} {_UNITS[c.axis]}, the coupling needs "
+        f"{c.axis}: the device's damping is {c.available:g} {UNITS[c.axis][1]}, the coupling needs "
         f"{c.needed:.4g}"
         for c in failing
     )
@@ -123,9 +124,6 @@ def _failing_words(failing: list[DampingCondition]) -> str:
 
 def _remedies(failing: list[DampingCondition]) -> str:
     return "; and ".join(condition.remedy for condition in failing)
-
-
-_UNITS = {"translation": "N s/m", "rotation": "N m s/rad"}
 
 
 def _delay_cause(evidence: Evidence, failing: list[DampingCondition]) -> Cause | None:

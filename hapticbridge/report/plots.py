@@ -12,7 +12,6 @@ from hapticbridge.audit import AuditReport
 from hapticbridge.audit.motion import turn_between
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
-from hapticbridge.kernel.codes import JOINT
 from hapticbridge.plotting import new_figure, write_picture
 from hapticbridge.record import TickFlag, due_times, force_on_hand, has_flag
 from hapticbridge.recording import Recording
@@ -126,7 +125,7 @@ def _draw_hand(
     position_axes.plot([], [], color="grey", **HANDLE, label="handle")
     hand = force_on_hand(ticks, parameters.axes)
     is_held = not is_motion_prescribed(meta)
-    is_joint = parameters.grip.startswith(JOINT)
+    is_joint = parameters.is_joint
     unit = 1.0 if is_joint else 1e3
     for i, (axis, colour) in enumerate(zip(AXES[:1] if is_joint else AXES, COLOURS, strict=False)):
         tool_force = decimated(time, ticks["wrench_on_tool"][:, i])

@@ -5,7 +5,8 @@ frame. A body alone is held at its centre of mass, and a body without a name goe
 a body, a site is added whose name is the grip as written, so a recording and a what-if find it by
 that name. If a site and a body share a name, the site is the grip.
 
-``joint:NAME`` is a hinge or slide, which a hand moves along its one axis, as a grip axis does.
+``joint:NAME`` is a hinge or slide, which a hand moves along its one axis, as a grip axis does. No
+site is held by a name that begins so.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticbridge.errors import SceneError, choices
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.scene.compile import START_KEYFRAME, compiled
 from hapticbridge.scene.source import SourceFile
 
@@ -38,7 +39,7 @@ _HELD_MASS = 0.005, 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Grip:
+class Candidate:
     """Something in a scene that a hand could hold.
 
     Attributes:
@@ -64,7 +65,7 @@ class Grip:
         return f"'{self.name}' ({kind}, {self.mass:.3g} kg, {self.freedom} of 6 free)"
 
 
-def grips(model: mujoco.MjModel) -> tuple[Grip, ...]:
+def grips(model: mujoco.MjModel) -> tuple[Candidate, ...]:
     """Returns all that a hand could hold, the most plausible first.
 
     These are the named sites and the bodies that joints can move; mocap bodies are none of them.
@@ -100,7 +101,7 @@ def grips(model: mujoco.MjModel) -> tuple[Grip, ...]:
             + 0.5 * (kind == "site")
             + 0.5 * float(depths[body_id] / depths.max())
         )
-        found.append(Grip(name, kind, names[body_id], mass, freedom, points))
+        found.append(Candidate(name, kind, names[body_id], mass, freedom, points))
     return tuple(sorted(found, key=lambda grip: -grip.points))
 
 
@@ -109,7 +110,8 @@ def _points(
 ) -> Iterator[tuple[str, str, int, NDArray[np.float64]]]:
     """Yields kind, name, body and place in the world of each site and body."""
     for site_id in range(model.nsite):
-        if name := model.site(site_id).name:
+        name = model.site(site_id).name
+        if name and not Grip.from_text(name).is_joint:
             yield "site", name, int(model.site_bodyid[site_id]), data.site_xpos[site_id]
     for body_id in range(1, model.nbody):
         if model.body_weldid[body_id] != 0:
@@ -129,8 +131,9 @@ def add_grip(spec: mujoco.MjSpec, grip: str, sources: tuple[SourceFile, ...]) ->
             point is not three finite numbers.
     """
     bodies = {body.name: body for body in spec.bodies if body.name}
-    if grip.startswith(JOINT) and all(site.name != grip for site in spec.sites):
-        _check_joint(spec, grip.removeprefix(JOINT))
+    held = Grip.from_text(grip)
+    if held.is_joint:
+        _check_joint(spec, held.name)
         return []
     if grip and any(site.name == grip for site in spec.sites):
         if grip not in bodies:

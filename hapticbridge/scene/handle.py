@@ -22,9 +22,9 @@ from hapticbridge.errors import SceneError
 from hapticbridge.kernel.codes import (
     COUPLING_ACTUATORS,
     HANDLE,
-    JOINT,
     PREFIX,
     WELD_NAME,
+    Grip,
     added_actuators,
     held_body,
     name_of_hand,
@@ -211,15 +211,15 @@ def attach_handles(spec: mujoco.MjSpec, grips: Sequence[str]) -> None:
             f"the scene has the name '{taken[0]}', and names that start with '{PREFIX}' are those "
             "that the bridge adds; rename it"
         )
-    sites = {site.name for site in spec.sites}
     for hand, grip in enumerate(grips):
-        if grip.startswith(JOINT) and grip not in sites:
+        held = Grip.from_text(grip)
+        if held.is_joint:
             if hand == 0:
                 raise SceneError(
                     f"'{grip}' can only be held beside a site or a body; name that grip first"
                 )
             actuator = _bare_actuator(spec, name_of_hand(COUPLING_ACTUATORS[0], hand), 0)
-            actuator.trntype, actuator.target = mujoco.mjtTrn.mjTRN_JOINT, grip.removeprefix(JOINT)
+            actuator.trntype, actuator.target = mujoco.mjtTrn.mjTRN_JOINT, held.name
             actuator.refsite = actuator.slidersite = ""
             continue
         _attach_handle(spec, name_of_hand(HANDLE, hand))

@@ -139,7 +139,7 @@ def load_scene(
             keeps this written form, so the audit compiles the scene that ran.
         grip: Site that the hand holds, ``BODY`` for a body at its centre of mass, or
             ``BODY@x,y,z`` for a point in m in its frame (``scene.grip``). Several hands hold
-            several grips, in order; each has a handle and a coupling of its own (``kernel.hands``),
+            several grips, in order; each has a handle and a coupling of its own (``kernel.tick``),
             and two may hold one tool. None holds those that the scene names in its custom text
             ``grips``, else the site ``grip``.
         as_is: If true, a scene is refused that must be changed to be felt (options that exclude the

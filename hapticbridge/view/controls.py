@@ -200,7 +200,7 @@ class Controls:
         server: Server of the page.
         allowance: Coupling limits of the device.
         ask: Forwards a command.
-        has_several_hands: True for a run of several hands, which can only be stopped.
+        has_several_hands: True for a run of several hands, which the page can only stop.
 
     Attributes:
         answer: Text element with the bridge's answer to the last request.
@@ -255,9 +255,9 @@ class Controls:
             except CommandError as error:
                 self._refuse(str(error))
 
-    def _switch(self, **state: bool) -> None:
+    def _switch(self, *, force: bool | None = None, clutch: bool | None = None) -> None:
         with self._turn:
-            self._ask(Switch(**state))
+            self._ask(Switch(force, clutch))
 
     def note(self, event: Mapping[str, Any]) -> None:
         """Handles an event; the controls then show the state of the run, not the request."""

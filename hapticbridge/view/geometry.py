@@ -14,8 +14,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from hapticbridge.check.physics import matrix_of, mesh_of
 from hapticbridge.errors import RecordingError
+from hapticbridge.scene.physics import matrix_of, mesh_of
 from hapticbridge.summary import is_always_implicit
 
 Array = NDArray[np.float64]

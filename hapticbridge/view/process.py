@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from hapticbridge.errors import HapticBridgeError
 from hapticbridge.film_process import MIN_REFERENCE, is_held, tell_apart
-from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import force_on_hand
 from hapticbridge.recorded_scene import compile_recorded
 from hapticbridge.recording import RecordingFile, Ring
@@ -78,7 +77,7 @@ class LiveRun:
         self._hands = self.parameters, *map(parameters_of, metas)
         self.model = compile_recorded(run).model
         tell_apart(self.model, *(own.grip for own in self._hands))
-        grips = [own.grip for own in self._hands if not own.grip.startswith(JOINT)]
+        grips = [own.grip for own in self._hands if not own.is_joint]
         self.scenery = Scenery.from_model(self.model, *grips)
         self._ring, self._snapshot = ring, Snapshot.attach(snapshot, self.model)
         self._data, self._tendons = mujoco.MjData(self.model), Tendons(self.model)
@@ -115,7 +114,7 @@ class LiveRun:
     def _others(self, rows: NDArray[np.void]) -> Iterator[Held]:
         """Yields the further hands of a tick; a joint has no handle in the scene."""
         for hand, own in enumerate(self._hands[1:], 1):
-            if not own.grip.startswith(JOINT):
+            if not own.is_joint:
                 row = rows[hand : hand + 1]
                 yield Held.from_record(row, force_on_hand(row, own.axes)[0] * self._are_held[hand])
 

@@ -20,7 +20,7 @@ from queue import Empty, SimpleQueue
 from typing import IO, cast
 from urllib.parse import parse_qs, urlsplit
 
-from hapticbridge.arguments import Arguments
+from hapticbridge.arguments import check_fields, option
 from hapticbridge.commands import INTERVAL, LONGEST_LINE, Command, command_of
 from hapticbridge.device.mouse import Pose, pose_of_line
 from hapticbridge.errors import CommandError, HapticBridgeError
@@ -63,18 +63,19 @@ class Address:
     ``ssh -L 8080:localhost:8080 MACHINE`` leads to the page.
 
     Attributes:
-        port: 1 to 65535, or 0 for any that is free.
+        port: Port on this machine, where only the printed address gets in; 0 takes any free port.
+            From another machine: ssh -L 8080:localhost:8080 MACHINE, then open the printed address.
         token: Secret of the page; random unless it is given.
 
     Raises:
         HapticBridgeError: The port is out of range.
     """
 
-    port: int = 8080
+    port: int = option(8080, least=0, most=65535)
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
 
     def __post_init__(self) -> None:
-        Arguments(HapticBridgeError).whole("port", self.port, least=0, most=65535)
+        check_fields(self)
 
     def url(self, port: int) -> str:
         """Returns the address to open in a browser, for the port that was found free."""

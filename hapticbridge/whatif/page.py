@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticbridge.arguments import unit_of
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import printable
+from hapticbridge.guard import Limits
 from hapticbridge.hand_energy import INSTANT
-from hapticbridge.kernel.codes import JOINT
+from hapticbridge.kernel.codes import Grip
 from hapticbridge.plotting import inline_svg, new_figure, write_picture
 from hapticbridge.record import due_times
 from hapticbridge.rendering import RunCoupling
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
 
 
 # Table of a what-if's runs
-
-_PEAK_UNITS = {"force": "N", "torque": "N m", "stretch": "m"}
 
 Row = tuple[str, tuple[str, ...]]
 
@@ -56,7 +56,7 @@ def rows(found: WhatIf) -> Iterator[Row]:
                 )
     yield "verdict", tuple(f"{r.report.words}, tripped" if r.trip else r.report.words for r in runs)
     for name in runs[0].peaks:
-        unit = _PEAK_UNITS[name.split()[0]]
+        unit = unit_of(Limits, name.split()[0])
         yield f"peak {name}", tuple(format_si(run.peaks[name], unit) for run in runs)
     shown = [shown_energies(run.report.energies, run.report.start_potential) for run in runs]
     for name in shown[0]:
@@ -134,7 +134,7 @@ def figure_of(found: WhatIf, bins: int = PICTURE_BINS) -> Figure:
 def _draw_hand(found: WhatIf, hand: int, panels: NDArray[np.object_], bins: int) -> None:
     before = found.runs[0].recordings[hand]
     is_held = not is_motion_prescribed(before.meta)
-    is_joint = before.meta.get("grip", "").startswith(JOINT)
+    is_joint = Grip.from_text(before.meta.get("grip", "")).is_joint
     wrench = "wrench_on_device" if is_held else "wrench_on_tool"
     unit = 1.0 if is_joint else 1e3
     origin = before.ticks["handle_position"][0]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from hapticbridge.errors import RecordingError
 from hapticbridge.guard import USUAL_RAMP
 from hapticbridge.hands import GripAxis
 from hapticbridge.kernel.parameters import RunParameters
-from hapticbridge.options import RunSetup
+from hapticbridge.options import BridgeOptions, RunSetup
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import unpack_scene
 from hapticbridge.recording import Recording
@@ -111,28 +111,30 @@ def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) 
     Raises:
         HapticBridgeError: The changed request is refused.
     """
-    request, new, hand = hands[0].request, settings[0], 0
-    changes: dict[str, Any] = {"realtime": False, "live": False}
+    request, hand = hands[0].request, 0
     is_changed = any(own != run.settings for own, run in zip(settings, hands, strict=True))
-    if is_changed or hands[0].setup.scene_ticks:
-        changes["scene_rate"] = new.scene_rate
+    options, new = request.options, settings[0].options
     if is_changed:
-        names = "rate", "substeps", "contact_stiffness", "controller"
-        changes |= {name: getattr(new, name) for name in names}
-        changes |= {"method": new.method.name, "contact": new.method.contact}
+        options = replace(new, workspace=options.workspace, limits=options.limits)
+    elif hands[0].setup.scene_ticks:
+        options = replace(options, scene_rate=new.scene_rate)
     grasps = []
     for grasp in request.grasps:
-        run, own, chosen = hands[hand], settings[hand], changes
-        if len(hands) > 1:  # each has a workspace and limits of its own
-            chosen = {}
-        if own.scales != run.settings.scales:
-            chosen["workspace"] = own.scaled(run.setup.workspace)
-        if run.info.is_real and run.setup.limits.ramp is None:
-            chosen["limits"] = replace(run.setup.limits, ramp=USUAL_RAMP)
+        run, own = hands[hand], settings[hand]
+        held = grasp if len(hands) > 1 else options  # several have workspace and limits each
+        chosen = {
+            name: _changed(getattr(held, name) or getattr(options, name), before, after)
+            for name, before, after in _parts(run.settings.options, own.options)
+        }
+        if run.info.is_real and run.setup.limits.ramp is None and own.options.limits.ramp is None:
+            limits = chosen.get("limits", held.limits or options.limits)
+            chosen["limits"] = replace(limits, ramp=USUAL_RAMP)
         if is_changed:
             grasp = replace(grasp, coupling=own.coupling)  # noqa: PLW2901
         if len(hands) > 1:
             grasp = replace(grasp, **chosen)  # noqa: PLW2901
+        else:
+            options = replace(options, **chosen)
         if is_changed and grasp.grip_axis is not None:
             axis = _changed_axis(grasp.grip_axis, hands[hand + 1], settings[hand + 1])
             grasp = replace(grasp, grip_axis=axis)  # noqa: PLW2901
@@ -140,10 +142,23 @@ def changed_request(hands: Sequence[RecordedRun], settings: Sequence[Settings]) 
         hand += len(grasp.grips)
     return replace(
         request,
-        parameters=new.scene,
+        parameters=settings[0].scene,
         grasps=tuple(grasps),
-        options=replace(request.options, **changes),
+        options=replace(options, realtime=False, live=False),
     )
+
+
+def _parts(before: BridgeOptions, after: BridgeOptions) -> Iterator[tuple[str, Any, Any]]:
+    """Yields name, old and new value of the workspace and the limits, where they changed."""
+    for name in ("workspace", "limits"):
+        if getattr(before, name) != getattr(after, name):
+            yield name, getattr(before, name), getattr(after, name)
+
+
+def _changed(asked: Any, before: Any, after: Any) -> Any:
+    """Returns what was asked for, with the fields that differ between two resolved ones."""
+    pairs = [(each.name, getattr(after, each.name)) for each in fields(after)]
+    return replace(asked, **{name: new for name, new in pairs if new != getattr(before, name)})
 
 
 def _changed_axis(axis: GripAxis, run: RecordedRun, own: Settings) -> GripAxis:
@@ -152,9 +167,10 @@ def _changed_axis(axis: GripAxis, run: RecordedRun, own: Settings) -> GripAxis:
     Raises:
         RecordingError: It is to have a force scale of its own.
     """
-    if own.force_scale != own.scale:
+    scale, force_scale = own.options.workspace.scales
+    if force_scale != scale:
         raise RecordingError(
             f"force_scale of the grip axis at '{run.parameters.grip}' is its scale; change scale"
         )
-    scale = math.copysign(own.scale, run.setup.workspace.rotation[0])
+    scale = math.copysign(scale, run.setup.workspace.rotation[0])
     return replace(axis, coupling=own.coupling, scale=scale)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from hapticbridge.bridge import Bridge
 from hapticbridge.clock import Clock, SimulatedClock
 from hapticbridge.commands import CHANGES as COMMANDED
-from hapticbridge.commands import coupling_in, tuning_ticks
+from hapticbridge.commands import concerns, coupling_in, tuning_ticks
 from hapticbridge.device import AXES, Device, DeviceInfo, Hand, Motion
 from hapticbridge.device.simulated.device import GrippingDevice, SimulatedDevice
 from hapticbridge.device.trajectory import ReplayDevice, TrajectoryDevice
@@ -321,6 +321,7 @@ class Repetition:
 
     def __init__(self, hands: Sequence[RecordedRun], settings: Sequence[Settings]) -> None:
         self._hands, self.settings = tuple(hands), settings[0]
+        self._settings = tuple(settings)
         self._run = self._hands[0]
         self.request = changed_request(hands, settings)
         self._has_several_hands = len(self._hands) > 1
@@ -417,17 +418,24 @@ class Repetition:
         """Returns the action that repeats a recorded event under these settings, or None."""
         name = event.get("event")
         if name == "coupling":
-            return self._coupling(event) if self.keeps_couplings else None
+            return self._coupling(event) if self.keeps_coupling(event) else None
         if name == "reset" and not self.keeps_resets:
             return None
         return event if name in ("input", *COMMANDED) else None
 
-    @property
-    def keeps_couplings(self) -> bool:
-        """True if recorded changes of the coupling are repeated; a new coupling replaces them."""
-        old, new = self._run.settings.coupling, self.settings.coupling
+    def keeps_coupling(self, event: Event) -> bool:
+        """Returns True if a recorded change of a coupling is repeated; a new coupling replaces it.
+
+        Args:
+            event: The event ``coupling``.
+        """
+        hand = self._hand_of(event)
+        old, new = self._hands[hand].settings.coupling, self._settings[hand].coupling
         is_kept = (old.stiffness, old.damping) == (new.stiffness, new.damping)
-        return is_kept and self.settings.method.has_law
+        return is_kept and self._settings[hand].method.has_law
+
+    def _hand_of(self, event: Event) -> int:
+        return next(i for i, each in enumerate(self._hands) if concerns(event, each.parameters))
 
     @property
     def keeps_resets(self) -> bool:
@@ -436,10 +444,12 @@ class Repetition:
 
     def _coupling(self, event: Event) -> Event:
         """Returns the change to an equal effective coupling under these settings."""
-        old, new, period = self._run.settings, self.settings, 1.0 / self.settings.rate
-        if replace(new, scene=old.scene, controller=old.controller) == old:
+        hand = self._hand_of(event)
+        old, new = self._hands[hand].settings, self._settings[hand]
+        period = 1.0 / self.settings.options.rate
+        if new.loop == old.loop:
             return event
-        law = coupling_in(event, self._run.parameters)
+        law = coupling_in(event, self._hands[hand].parameters)
         requested = old.method.requested_coupling(law, old.timestep)
         kept = {name: getattr(new.coupling, name) for name in GAINS[2:]}
         law = new.method.law_coupling(replace(requested, **kept), new.timestep)

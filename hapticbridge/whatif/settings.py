@@ -1,35 +1,49 @@
-"""Settings of a run that may be changed, by name."""
+"""Settings of a run that may be changed, by name: the fields of its options, and the scene's."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, dataclass, fields, replace
+from typing import Any
 
+from hapticbridge.arguments import rule_of, shown, types_of, value_from
 from hapticbridge.coupling import Coupling
 from hapticbridge.errors import RecordingError, choices
-from hapticbridge.guard import CONTROLLERS
-from hapticbridge.kernel.codes import JOINT
-from hapticbridge.options import RunSetup, Workspace
-from hapticbridge.rendering import CONTACTS, Method, method_named, method_names
+from hapticbridge.guard import Limits
+from hapticbridge.kernel.codes import Grip
+from hapticbridge.options import BridgeOptions, RunSetup, Workspace
+from hapticbridge.rendering import Method, method_named
 from hapticbridge.request import RunRequest
 
-UNITS = {
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "rotational_stiffness": "N m/rad",
-    "rotational_damping": "N m s/rad",
-    "method": "",
-    "contact": "",
-    "rate": "Hz",
-    "substeps": "",
-    "scene_rate": "Hz",
-    "scale": "",
-    "force_scale": "",
-    "contact_stiffness": "N/m",
-    "controller": "",
+KEPT = {
+    "axes": "the recorded motion is that of these axes",
+    "absolute": "the recorded motion is relative or not",
+    "clutch": "its presses are recorded",
+    "dead_man": "its presses are recorded",
+    "mark": "its presses are recorded",
+    "tool_weight": "the recorded scene carries it or not",
+    "i_know": "no hand is at the device",
+    "realtime": "the time is not real",
+    "pipelined": "the numbers are the same",
+    "live": "a repetition is not shown",
 }
-"""Settings that may be changed besides the scene's parameters, with units."""
+"""Options that a what-if does not change, each with the reason."""
+
+
+def _changeable() -> dict[str, tuple[Any, Field[Any]]]:
+    """Returns class and field of each setting that may be changed, by the name of its flag."""
+    found: dict[str, tuple[Any, Field[Any]]] = {}
+    kinds: tuple[Any, ...] = (Coupling, BridgeOptions, Workspace, Limits)
+    for kind in kinds:
+        for each in fields(kind):
+            name = (rule_of(each).flag or each.name).replace("-", "_")
+            if name not in KEPT and types_of(kind)[each.name] not in kinds:
+                found[name] = kind, each
+    return found
+
+
+CHANGEABLE = _changeable()
+"""Settings that may be changed besides the scene's parameters: class and field."""
 
 GAINS = tuple(field.name for field in fields(Coupling))
 """Names of K and B of translation, then of rotation."""
@@ -42,78 +56,69 @@ Value = float | int | str
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """Settings of a run besides scene, device and limits.
+    """Settings of a run besides scene and device, of one hand.
 
     Attributes:
         coupling: Requested K and B.
-        method: Rendering method.
-        rate: Ticks per second.
-        substeps: MuJoCo steps per tick, or between two results of a slower scene.
-        scene_rate: Results of the scene per second in Hz; ``rate`` steps it in every tick.
-        scale: Handle motion per device motion.
-        force_scale: Force on the device per force on the tool.
-        contact_stiffness: K_c in N/m of method ``direct``; None takes the coupling's.
+        options: Options, with what the run chose where they left it open, and with the hand's own
+            workspace and limits.
         scene: Values of the scene's parameters, by name.
-        controller: Passivity controller by name; None takes the bridge's choice for the device.
     """
 
     coupling: Coupling
-    method: Method
-    rate: float
-    substeps: int
-    scene_rate: float
-    scale: float
-    force_scale: float
-    contact_stiffness: float | None
+    options: BridgeOptions
     scene: Mapping[str, float]
-    controller: str | None = None
 
     @classmethod
     def of(cls, request: RunRequest, setup: RunSetup) -> Settings:
         """Returns the settings of one hand of a request."""
-        scale, force_scale = setup.workspace.scales
-        return cls(
-            coupling=setup.coupling,
-            method=setup.method,
-            rate=request.options.rate,
+        options = replace(
+            request.options,
+            method=setup.method.name,
+            contact=setup.method.contact,
             substeps=setup.substeps,
             scene_rate=request.options.rate / max(setup.scene_ticks, 1),
-            scale=scale,
-            force_scale=force_scale,
             contact_stiffness=setup.contact_stiffness or None,
-            scene=request.parameters,
-            controller=request.options.controller,
+            workspace=setup.workspace,
+            limits=setup.limits,
         )
+        return cls(coupling=setup.coupling, options=options, scene=request.parameters)
 
     @property
-    def scales(self) -> tuple[float, float]:
-        """Scales of motion and of force."""
-        return self.scale, self.force_scale
-
-    def scaled(self, workspace: Workspace) -> Workspace:
-        """Returns a workspace with these scales."""
-        own = None if self.force_scale == self.scale else self.force_scale
-        return replace(workspace, scale=self.scale, force_scale=own)
+    def method(self) -> Method:
+        """Rendering method."""
+        return self.options.rendering_method
 
     @property
     def timestep(self) -> float:
         """MuJoCo's h in s."""
-        return max(round(self.rate / self.scene_rate), 1) / (self.rate * self.substeps)
+        ticks = max(self.options.scene_ticks, 1)
+        return ticks / (self.options.rate * (self.options.substeps or 1))
+
+    @property
+    def loop(self) -> tuple[object, ...]:
+        """Settings on which the effective coupling depends."""
+        return self.coupling, self.method, self.options.rate, self.timestep
+
+    @property
+    def steps_per_second(self) -> float:
+        """MuJoCo's steps per second of a scene that steps in every tick."""
+        return self.options.rate * (self.options.substeps or 1)
 
     def value(self, name: str) -> Value | None:
         """Returns the value of a setting or scene parameter."""
-        if name in GAINS:
-            return float(getattr(self.coupling, name))
-        if name == "method":
-            return self.method.name
-        if name == "contact":
-            return self.method.contact
-        if name == "controller":
-            return self.controller or "as the device needs"
-        if name in UNITS:
-            value: Value | None = getattr(self, name)
-            return value
-        return self.scene[name]
+        if name not in CHANGEABLE:
+            return self.scene[name]
+        if name == "force_scale":
+            return self.options.workspace.scales[1]
+        value: Value | None = getattr(self._holder(name), CHANGEABLE[name][1].name)
+        return "as the device needs" if name == "controller" and value is None else value
+
+    def _holder(self, name: str) -> object:
+        """Returns the object with the field of a setting."""
+        kind = CHANGEABLE[name][0]
+        parts = self.coupling, self.options, self.options.workspace, self.options.limits
+        return next(part for part in parts if isinstance(part, kind))
 
     def changed(self, changes: Mapping[str, Value]) -> Settings:
         """Returns the settings with changes applied.
@@ -123,41 +128,40 @@ class Settings:
         contact stiffness is dropped if the new method has none.
 
         Raises:
-            RecordingError: A name is unknown, or its value is not valid.
-            CouplingError: A gain is out of range.
+            RecordingError: A name is unknown, or its value is of another type.
+            HapticBridgeError: A value is out of range.
         """
-        known = {*UNITS, *self.scene}
+        known = {*CHANGEABLE, *self.scene}
         if unknown := [name for name in changes if name not in known]:
             raise RecordingError(
-                f"'{unknown[0]:.60}' cannot be changed; choices: {choices(UNITS)}; of the scene: "
-                f"{choices(self.scene)}"
+                f"'{unknown[0]:.60}' cannot be changed; choices: {choices(CHANGEABLE)}; of the "
+                f"scene: {choices(self.scene)}"
             )
-        values = {name: _convert(name, value) for name, value in changes.items()}
-        method = method_named(str(values.get("method", self.method.name)))
-        contact_name = values.get("contact")
-        if contact_name is None and (method.can_be_rigid or not self.method.is_rigid):
-            contact_name = self.method.contact
-        method = method.with_contact(None if contact_name is None else str(contact_name))
-        gains = {name: float(values[name]) for name in GAINS if name in values}
-        rate = float(values.get("rate", self.rate))
-        is_slow = self.scene_rate < self.rate
-        scale = float(values.get("scale", self.scale))
-        is_equal = self.scale == self.force_scale
-        contact = values.get("contact_stiffness", self.contact_stiffness)
-        controller = values.get("controller", self.controller)
-        if method.has_coupling and "contact_stiffness" not in values:
-            contact = None
+        options, workspace = self.options, self.options.workspace
+        if workspace.scale == workspace.force_scale:
+            workspace = replace(workspace, force_scale=None)
+        own: dict[Any, dict[str, Any]] = {kind: {} for kind, _ in CHANGEABLE.values()}
+        for name in CHANGEABLE.keys() & changes.keys():
+            kind, field = CHANGEABLE[name]
+            own[kind][field.name] = _converted(name, changes[name], kind, field)
+        new = own[BridgeOptions]
+        method = method_named(str(new.get("method", options.method)))
+        if "contact" not in new and self.method.is_rigid and not method.can_be_rigid:
+            new["contact"] = None
+        if options.scene_ticks == 0:
+            new.setdefault("scene_rate", new.get("rate", options.rate))
+        if method.has_coupling:
+            new.setdefault("contact_stiffness", None)
+        new["workspace"] = replace(workspace, **own[Workspace])
+        new["limits"] = replace(options.limits, **own[Limits])
+        scene = {
+            name: _number(name, changes[name]) if name in changes else was
+            for name, was in self.scene.items()
+        }
         return Settings(
-            coupling=replace(self.coupling, **gains),
-            method=method,
-            rate=rate,
-            substeps=int(values.get("substeps", self.substeps)),
-            scene_rate=float(values.get("scene_rate", self.scene_rate if is_slow else rate)),
-            scale=scale,
-            force_scale=float(values.get("force_scale", scale if is_equal else self.force_scale)),
-            contact_stiffness=None if contact is None else float(contact),
-            scene={name: float(values.get(name, was)) for name, was in self.scene.items()},
-            controller=None if controller is None else str(controller),
+            coupling=replace(self.coupling, **own[Coupling]),
+            options=replace(options, **new),
+            scene=scene,
         )
 
 
@@ -177,7 +181,7 @@ def changed_of_hands(
     if len(hands) == 1:
         [(grip, old)] = hands.items()
         new = old.changed(changes)
-        rows = [(name, UNITS.get(name, ""), old.value(name), new.value(name)) for name in changes]
+        rows = [(name, _unit(name), old.value(name), new.value(name)) for name in changes]
         return {grip: new}, tuple(rows)
     chosen: dict[str, dict[str, Value]] = {grip: {} for grip in hands}
     for name, value in sorted(changes.items(), key=lambda each: ":" in each[0]):
@@ -188,14 +192,14 @@ def changed_of_hands(
                 f"and a name of {choices(OF_HAND)}, or the name alone for all"
             )
         for each in [grip] if is_named else hands:
-            if is_named or name not in OF_HAND or not each.startswith(JOINT):
+            if is_named or name not in OF_HAND or not Grip.from_text(each).is_joint:
                 chosen[each][setting] = value
     news = {grip: old.changed(chosen[grip]) for grip, old in hands.items()}
     rows = []
     for number, (grip, own) in enumerate(chosen.items()):
         old, new = hands[grip], news[grip]
         for name in own:
-            unit = "" if grip.startswith(JOINT) else UNITS.get(name, "")
+            unit = "" if Grip.from_text(grip).is_joint else _unit(name)
             if name in OF_HAND:
                 rows.append((f"{name} at '{grip}'", unit, old.value(name), new.value(name)))
             elif number == 0:
@@ -218,7 +222,7 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
         if not (name and sign and text):
             raise RecordingError(
                 f"cannot change '{word:.80}'; write a name and a value, such as stiffness=3000; "
-                f"names: {choices(UNITS)}, and the scene's parameters"
+                f"names: {choices(CHANGEABLE)}, and the scene's parameters"
             )
         values.setdefault(name, []).extend(part.strip() for part in text.split(","))
     several = [name for name, each in values.items() if len(each) > 1]
@@ -233,33 +237,26 @@ def changes_from(words: Iterable[str]) -> list[dict[str, Value]]:
     ]
 
 
-def _convert(name: str, value: Value) -> Value:
-    """Converts a value to the type of its setting; the bridge checks its range."""
-    named: dict[str, Collection[object]] = {
-        "method": method_names(),
-        "contact": CONTACTS,
-        "controller": CONTROLLERS,
-    }
-    if name in named:
-        if value not in named[name]:
-            raise RecordingError(
-                f"{name} is {value!r:.60}; choose one of {choices(map(str, named[name]))}"
-            )
+def _unit(name: str) -> str:
+    return rule_of(CHANGEABLE[name][1]).unit if name in CHANGEABLE else ""
+
+
+def _converted(name: str, value: Value, kind: Any, field: Field[Any]) -> Any:
+    """Returns a value of a setting's type; its class checks the range."""
+    if not isinstance(value, str):
         return value
     try:
-        number = float(value)
+        return value_from(types_of(kind)[field.name], value, rule_of(field))
+    except ValueError as valid:
+        raise RecordingError(f"{name} is {shown(value)}; it must be {valid}") from None
+
+
+def _number(name: str, value: Value) -> float:
+    """Returns the value of a scene's parameter, whose range the scene checks."""
+    try:
+        return float(value)
     except (TypeError, ValueError):
-        number = math.nan
-    unit = f" in {UNITS[name]}" if UNITS.get(name) else ""
-    if not math.isfinite(number):
-        raise RecordingError(f"{name} is {value!r:.60}; it must be a finite number{unit}")
-    if name in ("scale", "force_scale") and number <= 0:
-        raise RecordingError(f"{name} is {number!r}; it must be > 0")
-    if name == "substeps":
-        if not number.is_integer():
-            raise RecordingError(f"substeps is {value!r:.60}; it must be a whole number")
-        return int(number)
-    return number
+        raise RecordingError(f"{name} is {shown(value)}; it must be a number") from None
 
 
 Change = tuple[str, str, Value | None, Value | None]

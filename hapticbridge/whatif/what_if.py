@@ -24,7 +24,6 @@ from hapticbridge.device.registry import FINGERS_HAND
 from hapticbridge.device.simulated.device import scene_hand
 from hapticbridge.errors import RecordingError
 from hapticbridge.files import finite_or_null
-from hapticbridge.kernel.codes import JOINT
 from hapticbridge.record import TickFlag
 from hapticbridge.recorded_scene import bounds_for, compile_recorded, is_as_recorded
 from hapticbridge.recording import Recording
@@ -153,7 +152,7 @@ def what_if(
 
     Args:
         path: The recording, undamaged and unchanged; it carries its scene.
-        changes: New values by name: ``settings.UNITS``, or the scene's own parameters. Without
+        changes: New values by name: ``settings.CHANGEABLE``, or the scene's own parameters. Without
             changes the prescribed run equals the recorded one in every bit.
         strict: As for ``audit``.
         in_process: As for ``audit``.
@@ -308,7 +307,7 @@ class _Experiment:
 
     def _prescribed(self, settings: Sequence[Settings]) -> WhatIfRun:
         run = self.run
-        if settings[0].rate == run.settings.rate:
+        if settings[0].options.rate == run.settings.options.rate:
             clock = RecordedClock(run.ticks, run.period)
             devices: list[Device] = [RecordedMotion(hand, clock) for hand in self.hands]
             return self._simulated(PRESCRIBED, lambda _: devices, clock, settings)
@@ -318,10 +317,9 @@ class _Experiment:
     def _closed(self, settings: Sequence[Settings]) -> WhatIfRun:
         def devices(scene: Scene) -> list[Device]:
             hand = scene_hand(scene.model, scene.path)
-            is_joint = [run.parameters.grip.startswith(JOINT) for run in self.hands]
             return [
-                IdentifiedDevice(run, FINGERS_HAND if is_finger else hand)
-                for run, is_finger in zip(self.hands, is_joint, strict=True)
+                IdentifiedDevice(run, FINGERS_HAND if run.parameters.is_joint else hand)
+                for run in self.hands
             ]
 
         return self._simulated(CLOSED, devices, SimulatedClock(), settings)
@@ -349,10 +347,9 @@ class _Experiment:
             period, trip = repetition.into(path, devices_in(scene), clock)
             return period, trip, repetition.warned
 
-        method, is_slow = new.method, new.scene_rate < new.rate
+        method, is_slow = new.method, new.options.scene_ticks > 0
         load_bridge_code(method.name, method.contact, is_slow, self.has_several_hands)
-        old = run.settings
-        steps = new.rate * new.substeps / (old.rate * old.substeps)
+        steps = new.steps_per_second / run.settings.steps_per_second
         period, trip, warned = self._in_bounds(work, max(1.0, steps))
         if any(own != hand.settings for own, hand in zip(settings, self.hands, strict=True)):
             self.concerns |= dict.fromkeys(map(str, warned))
@@ -401,15 +398,13 @@ class _Experiment:
 
 def _missing_parts(run: RecordedRun, repetition: Repetition) -> Iterator[str]:
     counts = Counter(event.get("event") for event in run.recording.events)
-    if counts["coupling"] and not repetition.keeps_couplings:
-        yield (
-            f"the coupling was changed {counts['coupling']} times in the recorded run; here it is "
-            "constant"
-        )
+    changes = (event for event in run.recording.events if event.get("event") == "coupling")
+    if lost := sum(not repetition.keeps_coupling(event) for event in changes):
+        yield f"the coupling was changed {lost} times in the recorded run; here it is constant"
     if counts["reset"] and not repetition.keeps_resets:
         yield f"{counts['reset']} resets in the recorded run, none here: there is nothing to reset"
     flags = run.recording.ticks["flags"]
-    is_resampled = repetition.settings.rate != run.settings.rate
+    is_resampled = repetition.settings.options.rate != run.settings.options.rate
     if missed := int(np.count_nonzero(flags & int(TickFlag.OVERRUN))):
         here = "none in these runs" if is_resampled else "none in the closed loop"
         yield (

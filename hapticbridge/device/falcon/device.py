@@ -26,6 +26,7 @@ from hapticbridge.device.base import (
     DeviceInfo,
     calling_on_error,
     checked_period,
+    released,
     stated_numbers,
     usual_delay,
 )
@@ -275,13 +276,9 @@ class FalconDevice:
         if not self._is_open:
             return
         self._is_open = self._is_started = False
-        try:
+        with released(self._link):
             for _ in range(2):  # the first reply may answer a request of the loop
                 ask(self._link, self._stream, 0, SILENCE)
-        except DeviceLost:
-            pass  # an unplugged device has no force
-        finally:
-            self._link.close()
 
 
 # Discovery of a Falcon

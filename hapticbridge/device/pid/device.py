@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from hapticbridge.device.base import (
     DeviceInfo,
     checked_number,
     checked_period,
+    released,
 )
 from hapticbridge.device.driver import Driver, Notify
 from hapticbridge.device.pid.reports import (
@@ -43,7 +43,7 @@ from hapticbridge.device.transport.hid_descriptor import (
     required,
 )
 from hapticbridge.device.watchdog import ForceOffGuardian, guard_device_node
-from hapticbridge.errors import DeviceError, DeviceLost
+from hapticbridge.errors import DeviceError
 from hapticbridge.record import SAMPLE_DTYPE, TickFlag
 
 # Constant-force effects of a stick
@@ -266,7 +266,9 @@ def scale_of(
     )
     reverse = options.get("reverse", "")
     if reverse not in ("", "x", "y", "xy"):
-        raise DeviceError(f"reverse = {reverse!r}: must be 'x', 'y' or 'xy', the axes to reverse")
+        raise DeviceError(
+            f"reverse is {reverse!r}; it must be 'x', 'y' or 'xy', the axes to reverse"
+        )
     signs = np.array([-1.0 if axis in str(reverse) else 1.0 for axis in _AXES])
     return Scale(newtons, travel, signs), changes
 
@@ -546,13 +548,8 @@ class PidDevice:
         if not self._is_open:
             return
         self._is_open = False
-        try:
-            with contextlib.suppress(DeviceLost):  # a lost device ends its effects by itself
-                self._effects.close()
-        finally:
-            self._link.close()
-            if self.last_word is not None:
-                self.last_word.close()
+        with released(self._link, self.last_word):
+            self._effects.close()
 
     def leave_last_word(self, path: str) -> None:
         """Starts a guardian process that ends the force, if two processes can hold the node."""

@@ -17,6 +17,7 @@ from hapticbridge.device.base import (
     USUAL_TORQUE_LIMIT,
     DeviceInfo,
     checked_period,
+    released,
 )
 from hapticbridge.device.driver import Driver, Notify, UsbId
 from hapticbridge.device.rawhid.protocol import (
@@ -354,14 +355,8 @@ class RawHidDevice:
         if not self._is_open:
             return
         self._is_open = False
-        try:
+        with released(self._link, self.last_word):
             self._send(force_frame(self._next(), NO_WRENCH, 1, is_enabled=False))
-        except DeviceLost:
-            pass  # the device's own watchdog ends the force
-        finally:
-            self._link.close()
-            if self.last_word is not None:
-                self.last_word.close()
 
     @property
     def velocity(self) -> NDArray[np.float64]:

@@ -96,7 +96,7 @@ def _check_hands(
     hand: Hand | WorstHand | None, rotational_hand: WorstHand | None, friction: float
 ) -> None:
     if hand is not None and not isinstance(hand, Hand | WorstHand):
-        raise DeviceError(f"hand = {shown(hand)}: must be a Hand, a WorstHand or None")
+        raise DeviceError(f"hand is {shown(hand)}; it must be a Hand, a WorstHand or None")
     is_line = isinstance(hand, WorstHand)
     if rotational_hand is not None and not is_line:
         raise DeviceError("a rotational worst hand requires a worst hand in translation too")
@@ -111,7 +111,7 @@ def _target(
     if not isinstance(hand, Hand) or path is None:
         return np.empty((0, 8)), None
     if not isinstance(path, str | os.PathLike | Motion):
-        raise DeviceError(f"path = {shown(path)}: must be a file or a Motion")
+        raise DeviceError(f"path is {shown(path)}; it must be a file or a Motion")
     motion = path if isinstance(path, Motion) else read_motion(path)
     return np.array(motion.relative().table, order="C"), motion.duration
 
@@ -184,9 +184,9 @@ class SimulatedDevice:
         speed_limit: float = USUAL_SPEED_LIMIT,
     ) -> None:
         if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= MAX_DELAY:
-            raise DeviceError(f"delay = {delay!r}: must be 0 to {MAX_DELAY} whole samples")
+            raise DeviceError(f"delay is {delay!r}; it must be 0 to {MAX_DELAY} whole samples")
         if dof not in (3, 6):
-            raise DeviceError(f"dof = {shown(dof)}: must be 3 or 6 degrees of freedom")
+            raise DeviceError(f"dof is {shown(dof)}; it must be 3 or 6 degrees of freedom")
         mass = checked_number("mass", mass, "kg", is_positive=True)
         inertia = "kg m²"
         rotational_inertia = checked_number(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -10,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticbridge.device.base import checked_number
+from hapticbridge.arguments import check_fields, option
 from hapticbridge.device.trajectory import lissajous, pose_at
 from hapticbridge.errors import DeviceError
 from hapticbridge.jit import compiled
@@ -50,27 +49,15 @@ class Hand:
         DeviceError: A value is not finite or negative.
     """
 
-    mass: float = 0.55
-    damping: float = 6.5
-    stiffness: float = 135.0
-    rotational_inertia: float = 1e-3
-    rotational_damping: float = 0.02
-    rotational_stiffness: float = 1.0
+    mass: float = option(0.55, unit="kg", least=0.0)
+    damping: float = option(6.5, unit="N s/m", least=0.0)
+    stiffness: float = option(135.0, unit="N/m", least=0.0)
+    rotational_inertia: float = option(1e-3, unit="kg m²", least=0.0)
+    rotational_damping: float = option(0.02, unit="N m s/rad", least=0.0)
+    rotational_stiffness: float = option(1.0, unit="N m/rad", least=0.0)
 
     def __post_init__(self) -> None:
-        units = {
-            "mass": "kg",
-            "damping": "N s/m",
-            "stiffness": "N/m",
-            "rotational_inertia": "kg m²",
-            "rotational_damping": "N m s/rad",
-            "rotational_stiffness": "N m/rad",
-        }
-        for field in dataclasses.fields(self):
-            value = checked_number(
-                f"hand {field.name}", getattr(self, field.name), units[field.name]
-            )
-            object.__setattr__(self, field.name, value)
+        check_fields(self, DeviceError, "hand ")
 
 
 DEFAULT_HAND = Hand()

@@ -23,7 +23,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,6 +35,7 @@ from hapticbridge.device.base import (
     calling_on_error,
     checked_number,
     checked_period,
+    released,
     stated_numbers,
     stated_switch,
 )
@@ -232,15 +232,10 @@ class WheelDevice:
         if not self._is_open:
             return
         self._is_open = self._is_started = False
-        try:
-            with suppress(DeviceLost):  # the kernel has removed the effects of a lost device
-                self._push(0)
-                self._node.set(self._effect, 0)
-                self._node.erase(self._effect)
-        finally:
-            self._node.close()
-            if self.last_word is not None:
-                self.last_word.close()
+        with released(self._node, self.last_word):
+            self._push(0)
+            self._node.set(self._effect, 0)
+            self._node.erase(self._effect)
 
     def leave_last_word(self) -> None:
         """Starts a guardian process that ends the torque if the program hangs."""
@@ -301,7 +296,7 @@ def open_wheel(
     numbers = stated_numbers(options, MEASURED)
     axis = options.get("axis", "rz")
     if axis not in AXES[3:]:
-        raise DeviceError(f"axis = {axis!r}: must be one of {choices(AXES[3:])}")
+        raise DeviceError(f"axis is {axis!r}; it must be one of {choices(AXES[3:])}")
     is_reversed = "reverse" in options and stated_switch(options, "reverse")
     system = Linux() if kernel is None else kernel
     plugged = select_device(DRIVER, find(system), options.get("serial"))
@@ -314,7 +309,7 @@ def open_wheel(
         )
     turn = checked_number("range", degrees, "degrees", is_positive=True)
     if turn > WIDEST_RANGE:
-        raise DeviceError(f"range = {turn:g}: must be at most {WIDEST_RANGE:g} degrees")
+        raise DeviceError(f"range is {turn:g}; it must be at most {WIDEST_RANGE:g} degrees")
     interval = interval_of(plugged.path)
     rate = 1.0 / interval if interval else USUAL_RATE
     rate = checked_number("rate", options.get("rate", rate), "Hz", is_positive=True)

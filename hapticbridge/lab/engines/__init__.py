@@ -1,7 +1,7 @@
 """Other physics engines on the same work, behind one small interface.
 
 Each engine lists its ``settings`` with their values and the page of its manual that advises each. A
-chart writes them into its table, its JSON and its page, ``scripts/bench_engines`` prints them. The
+chart writes them into its table, its JSON and its page, ``scripts/bench engines`` prints them. The
 manuals' addresses, and what the tuned numbers do to a settled peg, are in the engines' modules,
 beside the constants. Two settings depart from a manual, and their notes state it. PhysX's
 tolerances are those of a clearance and not of an object. Bullet's direct solver is marked

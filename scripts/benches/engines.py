@@ -1,5 +1,4 @@
-#!/usr/bin/env -S sh -c 'exec "$(dirname "$(readlink -f "$0")")/python" "$0" "$@"'
-"""Compare contact of the bridge with that of other physics engines, on a peg in its hole.
+"""Contact of the bridge and of other physics engines, on a peg in its hole.
 
 Ours is measured with rigid contact and with the contacts of the scene, the others as their own
 documentation advises (the settings are printed), or with ``--defaults`` at their own defaults.
@@ -32,7 +31,6 @@ their own in the cache folder, and measures there: none of them is a dependency 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -41,13 +39,15 @@ import venv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from argument_types import new_file, positive, whole
+from argument_types import positive, whole
+from measuring import in_turn
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -55,8 +55,6 @@ from scipy.spatial.transform import Rotation
 
 from hapticbridge import load_scene
 from hapticbridge.device import Motion
-from hapticbridge.errors import HapticBridgeError
-from hapticbridge.files import finite_or_null
 from hapticbridge.kernel.tick import simulate
 from hapticbridge.lab.chart.chart import (
     Extent,
@@ -244,17 +242,15 @@ class Pegs:
 
     def step_times(self, names: Sequence[str], rounds: int) -> dict[str, NDArray[np.float64]]:
         """Returns the median time in s of a step by name: leaning on an edge, and free."""
-        found: dict[str, NDArray[np.float64]] = {name: np.zeros((rounds, 2)) for name in names}
-        order = np.random.default_rng(7)
-        subjects = [(name, kind) for name in names for kind in range(2)]
-        for index in range(-1, rounds):  # the first warms up
-            for place in order.permutation(len(subjects)):
-                name, kind = subjects[place]
-                clock = self.own_time if name in OWN else self.engine_time
-                spent = clock(name, kind == 0)
-                if index >= 0:
-                    found[name][index, kind] = spent
-        return {name: np.median(each, axis=0) for name, each in found.items()}
+        ways = {
+            (name, kind): partial(
+                self.own_time if name in OWN else self.engine_time, name, not kind
+            )
+            for name in names
+            for kind in range(2)
+        }
+        times = in_turn(ways, rounds)
+        return {name: np.median([times[name, 0], times[name, 1]], axis=1) for name in names}
 
     def jammed(self, name: str, hands: int) -> dict[str, object]:
         """Jams the peg in one engine; returns verdicts, energies in J and penetrations in µm."""
@@ -326,7 +322,7 @@ def jam_row(name: str, found: Mapping[str, object]) -> list[str]:
 
 def measure_elsewhere(arguments: Sequence[str]) -> None:
     """Replaces this process by the script in an environment that has the engines."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hapticbridge"
     python = cache / "engines" / "bin" / "python"
     if not python.exists():
@@ -334,7 +330,7 @@ def measure_elsewhere(arguments: Sequence[str]) -> None:
     print(f"installing into {cache / 'engines'} …", file=sys.stderr, flush=True)
     install = [str(python), "-m", "pip", "install", "--quiet", "-c", str(root / "constraints.txt")]
     subprocess.run([*install, "-e", f"{root}[peers]"], check=True)
-    os.execv(python, [str(python), __file__, *arguments])
+    os.execv(python, [str(python), sys.argv[0], *arguments])
 
 
 def peg_rows(names: Sequence[str], steps_ms: Sequence[float], rounds: int, hands: int) -> Results:
@@ -419,66 +415,49 @@ def show_pegs(console: Console, results: Sequence[Mapping[str, Any]], runs: int)
         console.print(jam)
 
 
-def parsed() -> argparse.Namespace:
-    """Returns the arguments; ends with a sentence if one is out of range."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds the choice of engines, tasks and steps."""
     parser.add_argument("--rounds", type=whole, default=5, help="rounds of timing")
     parser.add_argument("--hands", type=whole, default=3, help="of the jam, the first recorded")
-    parser.add_argument("--engines", nargs="*", help="only these, and ours; by default all")
-    parser.add_argument("--without", nargs="*", default=(), help="all but these")
+    for name, words in (("engines", "only these, and ours"), ("without", "all but these")):
+        parser.add_argument(f"--{name}", nargs="*", choices=ENGINES, metavar="ENGINE", help=words)
     parser.add_argument("--defaults", action="store_true", help="engines at their own defaults")
     parser.add_argument("--steps", type=positive, nargs="+", default=STEPS_MS, help="in ms")
     parser.add_argument("--tasks", nargs="*", choices=TASKS, default=TASKS, help="only these")
     parser.add_argument("--tasks-only", action="store_true", help="without settled and jammed pegs")
-    parser.add_argument("--json", type=new_file, metavar="FILE", help="write all numbers")
     parser.add_argument("--fetch", action="store_true", help="install the engines, and measure")
-    arguments = parser.parse_args()
-    if unknown := sorted({*(arguments.engines or ()), *arguments.without} - {*ENGINES}):
-        parser.error(f"no engine {unknown[0]!r}; engines: {', '.join(ENGINES)}")
-    return arguments
 
 
-def main() -> None:
-    """Measures and prints."""
-    arguments = parsed()
-    if arguments.fetch:
+def measure(options: argparse.Namespace) -> dict[str, object]:
+    """Prints the tables; returns their numbers."""
+    if options.fetch:
         measure_elsewhere([word for word in sys.argv[1:] if word != "--fetch"])
     console = Console(width=150, highlight=False)
     found = available_engines()
     for reason in dict.fromkeys(found.missing.values()):
         console.print(f"skipped: {reason}", markup=False)
-    wanted = {*(found.available if arguments.engines is None else arguments.engines)}
-    wanted -= {*arguments.without}
+    wanted = {*(found.available if options.engines is None else options.engines)}
+    wanted -= {*(options.without or ())}
     engines = {name: each for name, each in found.available.items() if name in wanted}
-    if arguments.defaults:
+    if options.defaults:
         for module in {ENGINES[name] for name in engines}:
             for constant, value in DEFAULTS[module].items():
                 setattr(import_module(f"{base.__package__}.{module}"), constant, value)
-    rounds, hands = arguments.rounds, arguments.hands
+    rounds, hands = options.rounds, options.hands
     pegs: Results = []
-    if not arguments.tasks_only:
-        pegs = peg_rows([*OWN, *engines], arguments.steps, rounds, hands)
-    tasks = task_rows(arguments.tasks, list(engines), arguments.steps, rounds)
+    if not options.tasks_only:
+        pegs = peg_rows([*OWN, *engines], options.steps, rounds, hands)
+    tasks = task_rows(options.tasks, list(engines), options.steps, rounds)
     with one_core() as core:
         where = machine(core)
-    if arguments.json:
-        facts = {"machine": where, "pegs": pegs, "tasks": tasks}
-        text = json.dumps(finite_or_null(facts), indent=1)
-        arguments.json.write_text(text, encoding="utf-8")
     console.print(where)
     show_pegs(console, pegs, len(JAMS) * hands)
     show_tasks(console, tasks)
     for name, engine in engines.items():
         console.print(f"\n{name}: {engine.version}")
-        if arguments.defaults:
+        if options.defaults:
             console.print(f"  own defaults: {dict(DEFAULTS[ENGINES[name]])}", markup=False)
             continue
         for key, setting in engine.settings.items():
             console.print(f"  {key}: {setting.value}  [{setting.source}]", markup=False)
-
-
-if __name__ == "__main__":
-    try:
-        main()
-    except HapticBridgeError as error:
-        sys.exit(f"error: {error}")
+    return {"machine": where, "pegs": pegs, "tasks": tasks}

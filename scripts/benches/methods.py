@@ -1,5 +1,4 @@
-#!/usr/bin/env -S sh -c 'exec "$(dirname "$(readlink -f "$0")")/python" "$0" "$@"'
-"""Compare the passive methods in contact: every shipped scene, and the map's taps and hole.
+"""The passive methods in contact: every shipped scene, and the map's taps and hole.
 
 One line per scene and method: how many runs were strict, within the slack and active, in how many
 more of the slack was used than by 'implicit' in the same hand, the most energy that the environment
@@ -22,13 +21,14 @@ Nothing here depends on how fast the machine is.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from argument_types import whole
+from model_runs import LOOP_SCENES
+from random_hands import random_motion
 
 from hapticbridge.certificate import default_coupling
 from hapticbridge.device import SimulatedDevice
@@ -39,10 +39,6 @@ from hapticbridge.lab.maps.contact import cases_of
 from hapticbridge.lab.maps.contact_rigs import ContactRun, Treatment, contact_run, run_case
 from hapticbridge.lab.methods import METHODS
 from hapticbridge.scene import load_scene
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from model_runs import LOOP_SCENES
-from random_hands import random_motion
 
 PERIOD = 1e-3
 COMPARED = ("implicit", "compensated", "lossless")
@@ -75,66 +71,68 @@ def steepest(outcome: LoopOutcome) -> float:
     return float(np.linalg.norm(np.diff(force, axis=0), axis=1).max())
 
 
-def line(
-    runs: Sequence[LoopOutcome | ContactRun], implicit: Sequence[float], step: float | None
-) -> str:
-    """Returns the outcomes of runs as columns; ``implicit``: its share of the slack in each."""
+Runs = Sequence[LoopOutcome | ContactRun]
+COLUMNS = (*VERDICTS, "above", "created", "slack", "peak", "step")
+
+
+def row(runs: Runs, implicit: Sequence[float], step: float | None) -> dict[str, float | None]:
+    """Returns the outcomes of runs; ``implicit`` is its share of the slack in each."""
     counts = Counter(one.environment for one in runs)
     above = sum(one.slack_share > b + ROUNDING for one, b in zip(runs, implicit, strict=True))
-    created = max(one.created for one in runs)
-    return (
-        f"{' '.join(f'{counts[verdict]:6}' for verdict in VERDICTS)} {above:6} "
-        f"{max(created, 0.0):9.1e} {max(one.slack_share for one in runs):6.3f} "
-        f"{max(one.peak_force for one in runs):6.2f} "
-        f"{'-' if step is None else format(step, '.2f'):>7}"
+    return {verdict: counts[verdict] for verdict in VERDICTS} | {
+        "above": above,
+        "created": max(0.0, *(one.created for one in runs)),
+        "slack": max(one.slack_share for one in runs),
+        "peak": max(one.peak_force for one in runs),
+        "step": step,
+    }
+
+
+def compared(where: str, runs_of: Callable[[str], Runs]) -> dict[str, Any]:
+    """Prints and returns a row of each method in a scene or rig."""
+    rows: dict[str, Any] = {}
+    implicit: list[float] = []
+    for method in COMPARED:
+        runs = runs_of(method)
+        implicit = implicit or [one.slack_share for one in runs]
+        steps = [steepest(one) for one in runs if isinstance(one, LoopOutcome)]
+        found = rows[f"{where}, {method}"] = row(runs, implicit, max(steps, default=None))
+        cells = ("-" if found[key] is None else f"{found[key]:.3g}" for key in COLUMNS)
+        print(f"{where:14} {method:12}", *(f"{cell:>9}" for cell in cells), flush=True)
+    return rows
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds the number of hands and what the methods have in common."""
+    parser.add_argument("--hands", type=whole, default=20, help="per scene, its own one first")
+    parser.add_argument(
+        "--same", choices=("felt", "device"), default="felt", help="for all methods"
     )
 
 
-def scenes(hands: range, same: str) -> None:
-    """Prints the outcomes of the methods on every shipped scene."""
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Prints the table; returns its rows."""
+    print(f"{'scene':14} {'method':12}", *(f"{head:>9}" for head in COLUMNS))
+    rows: dict[str, Any] = {}
     shown = [(name, load_scene(name), 0.0) for name in LOOP_SCENES]
     # the one shipped scene that can use the slack: a peg that jams without friction
     shown.append(("slippery peg", load_scene("peg_in_hole", friction=0.0), INTO_HOLE))
     for name, scene, first in shown:
         loop = ClosedLoop(scene)
-        implicit: list[float] = []
-        for method in COMPARED:
-            runs = [run(loop, method, hand, same, first) for hand in hands]
-            implicit = implicit or [one.slack_share for one in runs]
-            step = max(steepest(one) for one in runs)
-            print(f"{name:14} {method:12} {line(runs, implicit, step)}", flush=True)
-
-
-def rigs(same: str) -> None:
-    """Prints the outcomes on two rigs of the map ``contact``, with MuJoCo's contact."""
+        rows |= compared(
+            name,
+            lambda method, loop=loop, first=first: [  # type: ignore[misc]
+                run(loop, method, hand, options.same, first) for hand in range(options.hands)
+            ],
+        )
     for rig in ("taps", "peg"):
-        implicit: list[float] = []
-        for method in COMPARED:
-            treatment = Treatment(method=method)
-            runs = [
-                contact_run(run_case(treatment, case, same_law=same == "device"))
+        rows |= compared(
+            f"map: {rig}",
+            lambda method, rig=rig: [  # type: ignore[misc]
+                contact_run(
+                    run_case(Treatment(method=method), case, same_law=options.same == "device")
+                )
                 for case in cases_of(rig)
-            ]
-            implicit = implicit or [one.slack_share for one in runs]
-            print(f"{f'map: {rig}':14} {method:12} {line(runs, implicit, None)}", flush=True)
-
-
-def main() -> None:
-    """Runs and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--hands", type=whole, default=20, help="per scene, its own one first")
-    parser.add_argument(
-        "--same", choices=("felt", "device"), default="felt", help="what the methods have in common"
-    )
-    given = parser.parse_args()
-    print(f"the same {given.same}")
-    heads = ("strict", "slack", "active", "above", "made, J", "share", "peak", "step, N")
-    widths = (6, 6, 6, 6, 9, 6, 6, 7)
-    columns = " ".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))
-    print(f"{'scene':14} {'method':12} {columns}")
-    scenes(range(max(1, given.hands)), given.same)
-    rigs(given.same)
-
-
-if __name__ == "__main__":
-    main()
+            ],
+        )
+    return rows

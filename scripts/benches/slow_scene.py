@@ -1,5 +1,4 @@
-#!/usr/bin/env -S sh -c 'exec "$(dirname "$(readlink -f "$0")")/python" "$0" "$@"'
-"""Measure a scene slower than the loop: a tap on a wall, the loop's times, the scene's throughput.
+"""A scene slower than the loop: a tap on a wall, the loop's times, the scene's throughput.
 
 The first table is deterministic: the tool of ``virtual_wall``, 50 g, runs against its wall at
 0.2 m/s, and the handle stops 5 mm behind it. K is 800 N/m, and the 0.8 m/T_s² up to which a tool is
@@ -15,21 +14,18 @@ before and its caches are cold, and in a loop without a pause.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from argument_types import new_file, positive, whole
+from argument_types import positive, whole
 from kernel_runs import T
+from measuring import in_turn
+from numpy.typing import NDArray
 from test_kernel_shown_tool import Loop
 from tick_blocks import UnpacedClock
 
@@ -178,27 +174,25 @@ def throughput(scene: str, rate: float, steps: int) -> float:
     return whole[0] / inside[0]
 
 
-def main() -> int:
-    """Prints the table and the times."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds durations and numbers of runs."""
     parser.add_argument("--seconds", type=positive, default=8.0, help="of each run in real time")
-    parser.add_argument("--repeats", type=whole, default=3, help="pairs of runs in real time")
-    parser.add_argument("--json", type=new_file, metavar="FILE", help="write taps and times")
-    arguments = parser.parse_args()
+    parser.add_argument("--passes", type=whole, default=3, help="runs of each in real time")
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Prints the table and the times; returns both."""
     print_taps(made := taps())
-    cases: dict[str, tuple[str, float, str | Reporter]] = {
-        f"{scene}, {name}": (scene, rate, device)
+    cases: dict[str, tuple[str, float, str | Reporter, float]] = {
+        f"{scene}, {name}": (scene, rate, device, options.seconds)
         for scene, rate in (("beads", 80.0), ("point_mass", 1000.0))
         for name, device in (("simulated", "simulated"), ("device that reports", Reporter()))
     }
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in cases}
-    for _ in range(arguments.repeats):
-        for name, (scene, rate, device) in cases.items():
-            found[name].append(loop_times(scene, rate, device, arguments.seconds))
+    ways = {name: partial(loop_times, *case) for name, case in cases.items()}
     loops = {}
-    for name, times in found.items():
+    for name, times in in_turn(ways, options.passes, warms=False).items():
         tick, late = 1e6 * np.median(times, axis=0)
-        busy = 1e6 * tick_time(*cases[name], arguments.seconds)
+        busy = 1e6 * tick_time(*cases[name])
         loops[name] = {"tick_us": busy, "realtime_us": float(tick), "late_us": float(late)}
         print(
             f"{name}: tick {busy:.2f} µs in the median without a pause, {tick:.2f} µs in real "
@@ -206,11 +200,4 @@ def main() -> int:
         )
     ratio = throughput("beads", 80.0, 200)
     print(f"beads: the scene's ticks take {ratio:.3f} of the time of MuJoCo's steps in them")
-    if arguments.json:
-        written = json.dumps({"loops": loops, "taps": made}, indent=1)
-        arguments.json.write_text(written, encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return {"loops": loops, "taps": made}

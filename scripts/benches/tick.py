@@ -1,5 +1,4 @@
-#!/usr/bin/env -S sh -c 'exec "$(dirname "$(readlink -f "$0")")/python" "$0" "$@"'
-"""Time one tick of the bridge against bare ``mj_step`` on the same scene, state and motion.
+"""One tick of the bridge against bare ``mj_step`` on the same scene, state and motion.
 
 One line per scene, "NAME 1.23 x ...": the ratio of the medians of a whole tick of the bridge's own
 loop (clock, device, step, wrench, ledger, guard, record into the ring) to ``mj_step`` alone. The
@@ -12,14 +11,6 @@ them off.
 
 The bridge runs as it does by default, pipelined, and once more plain. "sample to wrench 0.80 x" is
 the time that the device waits over bare ``mj_step``; what the pipeline leaves of it stands behind.
-
-``--force-limit N`` counts the ticks alone in which a force limit of N newtons acts, where a step is
-solved again. On the peg 0.5 N acts in 44 ticks of a pass, 0.3 N in 470, 0.1 N in 4000; the line
-says how many were counted.
-
-``--bodies N …`` measures scenes of N bodies instead, a tool of 0.1 kg in free air beside boxes that
-rest on a floor, bodies that float, or links of one chain. "beyond mj_step 2.5 µs +0.06 µs per body"
-is a straight line through what a tick costs more at these N: the loop, and what grows.
 
 ``--hands`` compares two hands with one instead, in a scene of two bodies that float: "two hands
 1.20 x" is a tick of two hands, a body each, over a tick of one hand that holds the first. Both
@@ -41,22 +32,25 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-from argument_types import positive, whole
+from argument_types import whole
+from measuring import in_turn, interval
 from numpy.typing import NDArray
 from tick_blocks import BLOCK, UnpacedClock
 
-from hapticbridge import Bridge, Grasp, Limits, Scene, load_scene
+from hapticbridge import Bridge, Grasp, Scene, load_scene
 from hapticbridge.jit import direct
 from hapticbridge.kernel.state import BoundKernel
 from hapticbridge.kernel.tick import after_step, before_step
-from hapticbridge.record import SAMPLE_DTYPE, TickFlag, has_flag
+from hapticbridge.record import SAMPLE_DTYPE
 from hapticbridge.rendering import prepare
 
 SCENES = {"point_mass": False, "peg_in_hole": True, "hex_key": True, "drawer": False}
@@ -68,34 +62,23 @@ METHODS = ("implicit", "compensated", "lossless")
 COPIED = ("qpos", "qvel", "act", "qacc_warmstart", "qfrc_applied")
 """Parts of the state that bare ``mj_step`` starts from, besides the inputs of the tick."""
 
-FEWEST = 20
-"""Smallest number of ticks that a median is taken of."""
+PARTS = ("tick", "sample to wrench", "before_step", "step", "after_step", "mj_step")
+"""Timed parts: of the bridge's tick the first two, the others on copies of the scene."""
 
 MOTION = 8.0
-HERE = Path(__file__).resolve().parents[1]
+HERE = Path(__file__).resolve().parents[2]
 Times = NDArray[np.float64]
 
 
-def measure(
-    name: str, method: str, *, in_contact: bool, pipelined: bool, level: float | None = None
-) -> dict[str, Times]:
-    """Runs a scene along its hand path once; returns the times in ns of the counted ticks.
-
-    With a force limit in N as ``level``, the ticks that it limits are counted.
-    """
-    scene, shadow, bare = (_loaded(name) for _ in range(3))
-    kept: dict[str, list[Times]] = {
-        part: []
-        for part in ("tick", "sample to wrench", "before_step", "step", "after_step", "mj_step")
-    }
+def times_of(name: str, method: str, *, pipelined: bool) -> dict[str, Times]:
+    """Runs a scene along its hand path once; returns the times in ns of the counted ticks."""
+    scene, shadow, bare = (load_scene(name) for _ in range(3))
+    kept: dict[str, list[Times]] = {part: [] for part in PARTS}
     now, mj_step = time.perf_counter_ns, mujoco.mj_step
     sample = np.zeros(1, SAMPLE_DTYPE)
     clock = UnpacedClock()
-    guard: dict[str, Any] = {"controller": "damper"}
-    if level is not None:
-        guard["limits"] = Limits(force=level, torque=0.5)
     with Bridge(
-        scene, "simulated", method=method, clock=clock, pipelined=pipelined, **guard
+        scene, "simulated", method=method, clock=clock, pipelined=pipelined, controller="damper"
     ) as bridge:
         prepare(shadow, bridge.setup.coupling, bridge.period, 1, bridge.setup.method)
         stock = bridge.setup.method.with_contact("scene")
@@ -136,9 +119,7 @@ def measure(
                 parts[k] = begin, stepping, stepped, ended, alone, now()
             if not np.array_equal(data.qpos, scene.data.qpos):
                 raise SystemExit(f"{name}: the bare steps went another way than the bridge")
-            counted = (rows["contacts"][:-1] > 0) | (not in_contact)
-            if level is not None:
-                counted = has_flag(rows, TickFlag.FORCE_LIMITED)[:-1]
+            counted = (rows["contacts"][:-1] > 0) | (not SCENES[name])
             times = {
                 "tick": np.diff(rows["wake_ns"]),
                 "sample to wrench": (rows["write_ns"] - rows["read_ns"])[:-1],
@@ -152,114 +133,60 @@ def measure(
     return {part: np.concatenate(values) for part, values in kept.items()}
 
 
-KINDS = "boxes", "floating", "chain"
-"""Kinds of bodies beside the tool for ``--bodies``."""
-
-
-def _loaded(name: str) -> Scene:
-    """Loads a scene, or N bodies beside a tool for a name such as "chain 30"."""
-    kind, _, count = name.partition(" ")
-    if not count:
-        return load_scene(name)
-    spec = mujoco.MjSpec()
-    spec.option.timestep, spec.option.cone = 1e-3, mujoco.mjtCone.mjCONE_ELLIPTIC
-    world, shape = spec.worldbody, mujoco.mjtGeom
-    tool = world.add_body(name="tool", pos=[0, 0, 0.5], gravcomp=1)
-    tool.add_freejoint()
-    tool.add_geom(size=[0.02, 0, 0], mass=0.1)
-    tool.add_site(name="grip")
-    if kind == "boxes":
-        world.add_geom(type=shape.mjGEOM_PLANE, size=[5, 5, 0.1])
-    last, wide = world, round(int(count) ** 0.5)
-    for i in range(int(count) - 1):
-        if kind == "chain":
-            last = last.add_body(pos=[0, 0, -0.05] if i else [0.5, 0, 1])
-            last.add_joint(axis=[i % 2, (i + 1) % 2, 0], damping=[1e-3, 0, 0])
-            size, side = [0.01, 0.025, 0], shape.mjGEOM_CAPSULE
-            last.add_geom(type=side, size=size, density=500, contype=0, conaffinity=0)
-            continue
-        height = 0.02 if kind == "boxes" else 1.0
-        place = [0.1 * (i % wide) - 0.05 * wide, 0.1 * (i // wide) + 0.1, height]
-        body = world.add_body(pos=place, gravcomp=float(kind == "floating"))
-        body.add_freejoint()
-        body.add_geom(type=shape.mjGEOM_BOX, size=[0.02, 0.02, 0.02], density=500)
-    return load_scene(spec)
-
-
 def clock_cost() -> float:
     """Returns the median time between two readings of the clock, in ns."""
     now = time.perf_counter_ns
     return float(np.median([-(now() - now()) for _ in range(20000)]))
 
 
-Pass = dict[tuple[str, bool], dict[str, Times]]
-"""Result of ``measure`` per method, pipelined and plain."""
+Passes = Mapping[tuple[str, bool], list[dict[str, Times]]]
+"""Results of ``times_of`` per method, pipelined and plain."""
 
 
-def joined(passes: list[Pass], method: str, *, pipelined: bool) -> dict[str, Times]:
-    """Returns the times of all passes, part by part."""
-    key = method, pipelined
-    return {part: np.concatenate([times[key][part] for times in passes]) for part in passes[0][key]}
-
-
-def report(name: str, method: str, passes: list[Pass], reading: float) -> float:
-    """Prints the ratio of medians, its spread over passes, and the parts of the time.
-
-    Returns:
-        What a tick costs more than bare ``mj_step``, in µs.
-    """
-    ratios = [
-        (np.median(times["tick"]) - reading) / (np.median(times["mj_step"]) - reading)
-        for times in (one[method, True] for one in passes)
-    ]
-    ahead, plain = (joined(passes, method, pipelined=pipelined) for pipelined in (True, False))
-    median = {part: (np.median(values) - reading) * 1e-3 for part, values in ahead.items()}
-    p99 = {part: (np.percentile(values, 99) - reading) * 1e-3 for part, values in ahead.items()}
-    extra = median["tick"] - median["mj_step"]
-    print(
-        f"{name} {method} {np.median(ratios):.2f} x (passes {min(ratios):.2f} to "
-        f"{max(ratios):.2f}): tick {median['tick']:.2f} µs, bare mj_step {median['mj_step']:.2f} "
-        f"µs, {extra:+.2f} µs; p99 {p99['tick']:.2f} and {p99['mj_step']:.2f} µs "
-        f"({p99['tick'] / p99['mj_step']:.2f} x); {ahead['tick'].size} ticks counted"
+def ratio(passes: Passes, method: str, over: str, part: str, reading: float) -> str:
+    """Returns the tick of a method over a part of another's, pass by pass."""
+    pairs = zip(passes[method, True], passes[over, True], strict=True)
+    return interval(
+        [
+            float((np.median(mine["tick"]) - reading) / (np.median(other[part]) - reading))
+            for mine, other in pairs
+        ]
     )
-    before = {part: (np.median(values) - reading) * 1e-3 for part, values in plain.items()}
+
+
+def report(name: str, method: str, passes: Passes, reading: float) -> dict[str, float]:
+    """Prints ratio and parts of the time; returns the medians in µs, pipelined and plain."""
+    joined = [
+        {part: np.concatenate([one[part] for one in passes[method, pipelined]]) for part in PARTS}
+        for pipelined in (True, False)
+    ]
+    (ahead, before), (late, plain_late) = (
+        [
+            {part: float(of(values) - reading) * 1e-3 for part, values in each.items()}
+            for each in joined
+        ]
+        for of in (np.median, lambda values: np.percentile(values, 99))
+    )
+    print(
+        f"{name} {method} {ratio(passes, method, method, 'mj_step', reading)}: tick "
+        f"{ahead['tick']:.2f} µs, bare mj_step {ahead['mj_step']:.2f} µs; p99 {late['tick']:.2f} "
+        f"and {late['mj_step']:.2f} µs; {joined[0]['tick'].size} ticks counted"
+    )
     answer = "sample to wrench"
-    late = (np.percentile(plain[answer], 99) - reading) * 1e-3
     print(
-        f"  {answer} {median[answer] / median['mj_step']:.2f} x: {median[answer]:.2f} µs (p99 "
-        f"{p99[answer]:.2f} µs); plain {before[answer]:.2f} µs (p99 {late:.2f} µs), of which the "
-        f"pipeline leaves {median[answer] / before[answer]:.2f}, for a full tick of "
-        f"{median['tick'] / before['tick']:.2f} x: {median['tick']:.2f} µs instead of "
-        f"{before['tick']:.2f} µs"
+        f"  {answer} {ahead[answer]:.2f} µs (p99 {late[answer]:.2f} µs); plain "
+        f"{before[answer]:.2f} µs (p99 {plain_late[answer]:.2f} µs) of {before['tick']:.2f} µs"
     )
-    rest = before["tick"] - sum(before[part] for part in ("before_step", "step", "after_step"))
     # parts are timed on a copy of their own, and medians do not add up
-    left = f"{rest:.2f} µs" if rest > 0.0 else "less than these medians resolve"
+    rest = before["tick"] - sum(before[part] for part in ("before_step", "step", "after_step"))
     print(
-        f"  of the plain tick: before_step {before['before_step']:.2f}, step {before['step']:.2f} "
-        f"({before['step'] / before['mj_step']:.2f} x mj_step), after_step "
-        f"{before['after_step']:.2f} µs, device, record, clock and loop {left}"
+        f"  of the plain tick: before_step {before['before_step']:.2f}, step {before['step']:.2f}, "
+        f"after_step {before['after_step']:.2f}, device, record, clock and loop {rest:.2f} µs"
     )
-    return float(extra)
-
-
-def report_growth(kind: str, method: str, extra: dict[int, float]) -> None:
-    """Prints the straight line through the extra cost in µs by the number of bodies."""
-    slope, fixed = np.polyfit(list(extra), list(extra.values()), 1)
-    print(f"{kind} {method} beyond mj_step {fixed:.2f} µs {slope:+.3f} µs per body")
-
-
-def compare(name: str, method: str, passes: list[Pass], reading: float) -> None:
-    """Prints the cost of a tick relative to the first method, pass by pass."""
-    ratios = [
-        (np.median(times[method, True]["tick"]) - reading)
-        / (np.median(times[METHODS[0], True]["tick"]) - reading)
-        for times in passes
-    ]
-    print(
-        f"{name}: a tick of {method} costs {np.median(ratios):.2f} x that of {METHODS[0]} "
-        f"(passes {min(ratios):.2f} to {max(ratios):.2f})"
-    )
+    if method != METHODS[0]:
+        words = ratio(passes, method, METHODS[0], "tick", reading)
+        print(f"  {words} the tick of {METHODS[0]}")
+    return ahead | {f"plain {part}": value for part, value in before.items()}
 
 
 @contextmanager
@@ -292,12 +219,10 @@ def answer(process: subprocess.Popen[str], **asked: object) -> dict[str, float |
     return dict(json.loads(line))
 
 
-def ratios_of_a_pass(
-    pair: list[subprocess.Popen[str]], name: str, method: str, *, in_contact: bool
-) -> dict[str, float]:
+def ratios_of_a_pass(pair: list[subprocess.Popen[str]], name: str, method: str) -> dict[str, float]:
     """Runs a scene along its hand path in both, block by block; returns the median ratios."""
     for process in pair:
-        answer(process, scene=name, method=method, in_contact=in_contact)
+        answer(process, scene=name, method=method, in_contact=SCENES[name])
     kept: dict[str, list[float]] = {}
     for k in range(round(MOTION * 1000) // BLOCK):
         order = pair if k % 2 else pair[::-1]
@@ -310,8 +235,8 @@ def ratios_of_a_pass(
     return {part: float(np.median(values)) for part, values in kept.items()}
 
 
-def compare_checkouts(other: Path, passes: int) -> None:
-    """Prints the cost of a tick in this checkout relative to another one."""
+def compare_checkouts(other: Path, passes: int, scenes: Sequence[str]) -> dict[str, list[float]]:
+    """Prints the cost of a tick in this checkout relative to another one; returns the ratios."""
     if other == HERE or not (other / "hapticbridge").is_dir():
         raise SystemExit(f"'{other}' is no other checkout of hapticbridge")
     core = max(os.sched_getaffinity(0))
@@ -321,20 +246,19 @@ def compare_checkouts(other: Path, passes: int) -> None:
             order = (HERE, other) if k % 2 else (other, HERE)
             started = {at: stack.enter_context(worker(at, core)) for at in order}
             pair = [started[HERE], started[other]]
-            for name, in_contact in SCENES.items():
-                for method in METHODS:
-                    found = ratios_of_a_pass(pair, name, method, in_contact=in_contact)
-                    for part, ratio in found.items():
-                        kept.setdefault((name, method, part), []).append(ratio)
+            for name, method in product(scenes, METHODS):
+                for part, one in ratios_of_a_pass(pair, name, method).items():
+                    kept.setdefault((name, method, part), []).append(one)
     print(f"this checkout over {other}, {passes} passes on core {core}")
     for key, values in kept.items():
         print(f"{' '.join(key)} {interval(values)}")
     for part in ("tick", "sample to wrench"):
         rows = [values for key, values in kept.items() if key[-1] == part]
         print(f"all {part} {interval(np.median(rows, axis=0).tolist())}")
+    return {" ".join(key): values for key, values in kept.items()}
 
 
-def compare_hands(passes: int) -> None:
+def compare_hands(passes: int) -> dict[str, list[float]]:
     """Prints what a tick of two hands costs over one of one hand in the same scene."""
     kept: list[float] = []
     for k in range(passes):
@@ -360,6 +284,7 @@ def compare_hands(passes: int) -> None:
                     ratios.append(times[two] / times[one])
         kept.append(float(np.median(ratios)))
     print(f"two hands {interval(kept)}")
+    return {"two hands": kept}
 
 
 def _two_bodies(grips: str | tuple[str, ...]) -> Scene:
@@ -372,63 +297,28 @@ def _two_bodies(grips: str | tuple[str, ...]) -> Scene:
     return load_scene(spec, grips)
 
 
-def interval(values: list[float]) -> str:
-    """Returns the median of the passes, their range, and its confidence level."""
-    sure = 1 - 2 ** (1 - len(values))
-    return f"{np.median(values):.3f} x ({min(values):.3f} to {max(values):.3f}, {100 * sure:.0f} %)"
-
-
-def main() -> None:
-    """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Adds the number of passes, and the two comparisons."""
     parser.add_argument("--passes", type=whole, default=6, help="passes over each hand path")
     parser.add_argument("--against", type=Path, help="checkout to compare this one with")
-    parser.add_argument(
-        "--force-limit", type=positive, help="force limit in N; only the ticks that it limits count"
-    )
     parser.add_argument("--hands", action="store_true", help="compare two hands with one")
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, help="only these scenes")
-    parser.add_argument(
-        "--bodies", type=whole, nargs="+", metavar="N", help="scenes of N bodies of each kind"
-    )
-    arguments = parser.parse_args()
-    if arguments.against is not None:
-        compare_checkouts(arguments.against.resolve(), arguments.passes)
-        return
-    if arguments.hands:
-        compare_hands(arguments.passes)
-        return
-    reading, level = clock_cost(), arguments.force_limit
-    scenes = {name: SCENES[name] for name in arguments.scenes or SCENES}
-    if arguments.bodies:
-        scenes = {f"{kind} {count}": False for kind in KINDS for count in arguments.bodies}
-    grown: dict[tuple[str, str], dict[int, float]] = {}
-    for name, in_contact in scenes.items():
-        for method in METHODS:
-            measure(name, method, in_contact=in_contact, pipelined=True, level=level)  # warm-up
-        passes = [
-            {
-                (method, pipelined): measure(
-                    name, method, in_contact=in_contact, pipelined=pipelined, level=level
-                )
-                for method in METHODS
-                for pipelined in (True, False)
-            }
-            for _ in range(arguments.passes)
-        ]
-        if min(len(times["tick"]) for each in passes for times in each.values()) < FEWEST:
-            print(f"{name}: fewer than {FEWEST} ticks are limited at {level} N")
-            continue
-        for method in METHODS:
-            kind, _, count = name.partition(" ")
-            extra = report(name, method, passes, reading)
-            grown.setdefault((kind, method), {})[int(count or 0)] = extra
-        for method in METHODS[1:]:
-            compare(name, method, passes, reading)
-    for (kind, method), extras in grown.items():
-        if len(extras) > 1:
-            report_growth(kind, method, extras)
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[*SCENES], help="only these")
 
 
-if __name__ == "__main__":
-    main()
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Prints the costs; returns them."""
+    if options.against is not None:
+        return compare_checkouts(options.against.resolve(), options.passes, options.scenes)
+    if options.hands:
+        return compare_hands(options.passes)
+    reading, found = clock_cost(), {}
+    for name in options.scenes:
+        ways = {
+            (method, pipelined): partial(times_of, name, method, pipelined=pipelined)
+            for method in METHODS
+            for pipelined in (True, False)
+        }
+        passes = in_turn(ways, options.passes)
+        for method in METHODS:
+            found[f"{name} {method}"] = report(name, method, passes, reading)
+    return found

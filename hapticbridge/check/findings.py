@@ -1,0 +1,152 @@
+"""Findings on a scene: the table of the rules, and those on options, start and own motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from hapticbridge.check.case import CompiledScene, Fault, SceneUnderCheck
+from hapticbridge.check.constraint_faults import constraint_faults, friction_faults
+from hapticbridge.check.contact_faults import (
+    contact_faults,
+    margin_faults,
+    shape_faults,
+    start_faults,
+)
+from hapticbridge.check.drive_faults import motor_faults, pump_faults, strongest_motor
+from hapticbridge.check.geometry_faults import (
+    UNITS,
+    angle_faults,
+    grip_faults,
+    mesh_faults,
+    unit_faults,
+    workspace_faults,
+)
+from hapticbridge.check.mass_faults import mass_faults
+from hapticbridge.check.own_motion import own_motion
+from hapticbridge.check.run_faults import run_faults
+from hapticbridge.check.source_map import Places
+from hapticbridge.errors import choices
+from hapticbridge.scene import Scene, SceneSource, compile_scene
+from hapticbridge.scene.checks import check_model, first_pump
+from hapticbridge.scene.compile import START_KEYFRAME
+
+# Faults of options, start, and motion without a hand
+
+_OWN_FAULT = "integrator:", "solver:", "start where"  # changes with a fault of their own
+
+
+_SAME_STEP = 1e-9  # relative: 0.001 as 1/1000
+
+
+def option_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields a time step that is not the run's, and concerns from loading the scene.
+
+    Integrator, solver and flags that a run needs are set when the scene is loaded
+    (``Scene.changes``), so that they are no faults.
+    """
+    option, places = case.source.spec.option, case.places
+    step = float(option.timestep)
+    if not case.has_chosen_period and abs(step - case.period) > _SAME_STEP * case.period:
+        yield Fault(
+            "time step",
+            places.option("timestep"),
+            f"the scene has a time step of {1e3 * step:g} ms; it runs at {1e3 * case.period:g} ms, "
+            f"one step per tick at {1 / case.period:g} Hz, and its contacts change with it",
+            f"{places.option_change('timestep', f'{case.period:g}')}, or check with --rate "
+            f"{1 / step:g}",
+            is_note=True,
+        )
+    for change in case.scene.changes:
+        if not change.startswith(_OWN_FAULT):
+            yield Fault(
+                "changed",
+                places.option("integrator"),
+                f"the scene runs with a change, {change}",
+                "run --as-is, which refuses the scene",
+                is_note=True,
+            )
+    concerns = [*case.source.concerns, *check_model(case.model, case.scene.grip)]
+    for concern in concerns:
+        if "integrator" not in concern:
+            attribute = "wind" if concern.startswith("wind") else "surfacevel"
+            place = places.with_attribute(attribute) or places.option(attribute)
+            yield Fault("unmetered work", place, concern, f"remove {attribute}")
+
+
+def own_motion_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields a fault if the scene alone moves noticeably differently than its file says."""
+    if case.refused or first_pump(case.model) is not None:
+        return  # the file's own scene does not compile, or a pump moves it without bound
+    scene = compile_scene(case.source, case.scene.grip, warns=False, checks_start=False)
+    found = own_motion(case.source, scene, case.setting)
+    place = case.places.option("timestep")
+    if found is not None and found.jnd > 1.0:
+        yield Fault("own motion", place, str(found), found.remedy(case.setting))
+    if found is not None and found.creation:
+        yield Fault("own motion", place, found.creation, "--contact rigid or --substeps")
+
+
+def keyframe_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields a fault if the scene has keyframes but no start among them."""
+    names = [str(key.name) for key in case.source.spec.keys]
+    if names and START_KEYFRAME not in names:
+        listed = choices(name for name in names if name)
+        yield Fault(
+            "keyframe",
+            case.places.named("key", names[0]),
+            f"the scene has keyframes ({listed}), but none is called '{START_KEYFRAME}': it starts "
+            "from the joints' zeros instead",
+            f'name="{START_KEYFRAME}"',
+        )
+
+
+# Rules by which a scene is judged
+
+RULES = (
+    option_faults,
+    own_motion_faults,
+    keyframe_faults,
+    mass_faults,
+    unit_faults,
+    pump_faults,
+    motor_faults,
+    angle_faults,
+    mesh_faults,
+    grip_faults,
+    workspace_faults,
+    start_faults,
+    contact_faults,
+    shape_faults,
+    margin_faults,
+    constraint_faults,
+    run_faults,
+)
+"""Functions that yield the faults of one subject, in the best order for mending."""
+
+AT_ONCE = (unit_faults, pump_faults, strongest_motor, angle_faults, friction_faults)
+"""Rules on faults that are felt from the first second, and seen without a motion."""
+
+
+def worst_faults(source: SceneSource, scene: Scene) -> Iterator[Fault]:
+    """Yields faults that make a run feel wrong from its first second.
+
+    They need no motion, so that a run can tell them at its start. The scene is reset.
+    """
+    loaded = CompiledScene(source, scene, Places(source, scene.model))
+    for rule in AT_ONCE:
+        scene.reset()
+        yield from rule(loaded)
+
+
+def find_faults(case: SceneUnderCheck) -> tuple[Fault, ...]:
+    """Returns all faults of a scene from ``open_case``; the scene is reset.
+
+    A tool in wrong units has faults of every kind, so that these wait until it is mended.
+    """
+    faults = [fault for rule in RULES for fault in rule(case)]
+    units = [fault for fault in faults if fault.kind == UNITS]
+    if not units or len(faults) == len(units):
+        return tuple(faults)
+    waiting = f"; {len(faults) - len(units)} more findings wait until this is mended"
+    return tuple(replace(fault, sentence=fault.sentence + waiting) for fault in units)

@@ -1,0 +1,195 @@
+"""Faults of masses: missing, chosen by MuJoCo, too unequal, or too heavy for the coupling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from hapticbridge.check.case import (
+    STAND_IN_INERTIA,
+    STAND_IN_MASS,
+    Fault,
+    SceneUnderCheck,
+    length,
+    number,
+    others,
+    weight,
+)
+from hapticbridge.scene.physics import (
+    body_inertia,
+)
+
+WATER = 1000.0
+"""Default density of a MuJoCo geom in kg/m³."""
+
+
+LARGEST_RATIO = 1000.0
+"""Largest ratio of two masses in contact, or of a load to its carrier, without unit. A contact has
+the stiffness of the lighter body, so the heavier one penetrates a thousand times as deep."""
+
+
+LARGEST_SAG = 1e-3
+"""Largest stretch in m of the coupling under the tool's weight at rest."""
+
+
+def mass_faults(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Yields missing, unintended and mismatched masses."""
+    for body, refusal in case.refused.items():
+        place = case.places.body(body)
+        is_none = "mass and" in refusal
+        what = "a mass and inertia > 0" if is_none else "inertias with A + B >= C"
+        mend = 'mass="…" in one of its geoms, or <inertial pos="0 0 0" mass="…" diaginertia="…"/>'
+        stand_in = f"{STAND_IN_MASS:g} kg and {STAND_IN_INERTIA:g} kg m²"
+        yield Fault(
+            "missing inertia" if is_none else "impossible inertia",
+            place,
+            f"{place.element} moves, and MuJoCo refuses its inertia: it needs {what}; here it is "
+            f"judged with {stand_in} instead",
+            mend if is_none else 'the right diaginertia, or balanceinertia="true" in <compiler>',
+        )
+    yield from _default_densities(case)
+    yield from _contact_ratios(case)
+    yield from _load_ratios(case)
+    yield from _sag(case)
+
+
+def _default_densities(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Finds moving bodies with a geom that has the default density."""
+    model, geoms = case.model, list(case.source.spec.geoms)
+    if len(geoms) != model.ngeom:  # the compiler dropped some, so ids do not match
+        return
+    silent: dict[int, list[int]] = {}
+    for geom, written in enumerate(geoms):
+        body = int(model.geom_bodyid[geom])
+        is_free_to_move = model.body_treeid[body] >= 0 and body not in case.refused
+        if is_free_to_move and _sets_no_mass(case, geom, written):
+            silent.setdefault(body, []).append(geom)
+    for body, those in silent.items():
+        collides = (model.geom_contype[those] | model.geom_conaffinity[those]) != 0
+        visual, solid = (np.array(those)[each].tolist() for each in (~collides, collides))
+        mass = float(model.body_mass[body])
+        if visual:
+            yield _made_of_water(case, body, visual, "visual geom with mass", 'mass="0"')
+        if len(those) == 1 and solid:
+            mend = f'mass="{number(mass)}", or what it really weighs'
+            yield _made_of_water(case, body, solid, "density of water", mend)
+        elif solid:
+            mend = f'mass="…" in each, what it really weighs; now {weight(mass)} together'
+            yield _made_of_water(case, body, solid, "density of water", mend)
+
+
+def _made_of_water(
+    case: SceneUnderCheck, body: int, geoms: list[int], kind: str, change: str
+) -> Fault:
+    place, name = case.places.geom(geoms[0]), case.places.body(body).element
+    made = "has neither mass nor density and so is made of water"
+    if len(geoms) > 1:
+        made = "have neither mass nor density and so are made of water"
+    return Fault(
+        kind,
+        place,
+        f"{place.element}{others(len(geoms) - 1)} {made} ({WATER:g} kg/m³); {name} "
+        f"weighs {weight(float(case.model.body_mass[body]))} with it",
+        change,
+    )
+
+
+def _sets_no_mass(case: SceneUnderCheck, geom: int, written: Any) -> bool:
+    compiler = case.source.spec.compiler
+    low, high = compiler.inertiagrouprange
+    return bool(
+        np.isnan(written.mass)
+        and written.density == WATER
+        and low <= written.group <= high
+        and not written.parent.explicitinertial
+        and "density" not in case.places.attributes_at(case.places.geom(geom))
+    )
+
+
+def _contact_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
+    model, reported = case.model, set()
+    case.scene.reset()
+    for pair in case.observation.meetings if case.observation else ():
+        bodies = [int(model.geom_bodyid[geom]) for geom in pair]
+        inverse = [1.0 / body_inertia(model, case.scene.data, body) for body in bodies]
+        key = frozenset(bodies)
+        if min(inverse) <= 0 or max(inverse) <= LARGEST_RATIO * min(inverse) or key in reported:
+            continue
+        reported.add(key)
+        light, heavy = (case.places.body(bodies[inverse.index(f(inverse))]) for f in (max, min))
+        least = 1.0 / (LARGEST_RATIO * min(inverse))
+        yield Fault(
+            "mass ratio",
+            light,
+            f"{light.element} ({weight(1 / max(inverse))}) meets {heavy.element} "
+            f"({weight(1 / min(inverse))}), 1 to {number(max(inverse) / min(inverse))}: the "
+            "contact is as stiff as the lighter one allows, and the heavier sinks in",
+            f'mass="{number(least)}" or more, or armature="{number(least)}" on its joint',
+        )
+
+
+def _load_ratios(case: SceneUnderCheck) -> Iterator[Fault]:
+    model = case.model
+    for body in range(1, model.nbody):
+        parent = int(model.body_weldid[model.body_parentid[body]])
+        if not model.body_dofnum[body] or model.body_treeid[parent] < 0:
+            continue
+        own = float(model.body_mass[model.body_weldid == parent].sum())
+        dofs = model.dof_bodyid == parent
+        if np.any(model.dof_armature[dofs] > 0):
+            continue
+        load = float(model.body_subtreemass[body])
+        if load > LARGEST_RATIO * own:
+            place, name = case.places.body(parent), case.places.body(body).element
+            yield Fault(
+                "mass ratio",
+                place,
+                f"{place.element} ({weight(own)}) carries {name} ({weight(load)}), "
+                f"1 to {number(load / own)}: its motion is computed from small differences",
+                f'mass="{load / LARGEST_RATIO:.3g}" or more in it',
+            )
+
+
+def _sag(case: SceneUnderCheck) -> Iterator[Fault]:
+    """Computes the tool's sag below the handle: (JᵀKJ + K_joints + K_servos) δq = its weight."""
+    model, scene = case.model, case.scene
+    scene.reset()
+    data, site = scene.data, model.site(scene.grip).id
+    dofs = np.flatnonzero(case.tool_bodies[model.dof_bodyid])
+    jacobian = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], site)
+    coupling = case.coupling
+    gains = np.repeat([coupling.stiffness, coupling.rotational_stiffness], 3)
+    data.qvel[:] = 0.0
+    bias = np.zeros(model.nv)
+    mujoco.mj_rne(model, data, 0, bias)
+    springs = np.zeros(model.nv)
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
+            springs[model.jnt_dofadr[joint]] = float(np.ravel(model.jnt_stiffness[joint])[0])
+    for actuator in range(model.nactuator):  # a position servo holds its joint like a spring
+        if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+            joint = int(model.actuator_trnid[actuator, 0])
+            gain = max(-float(model.actuator_biasprm[actuator, 1]), 0.0)
+            springs[model.jnt_dofadr[joint]] += gain * float(model.actuator_gear[actuator, 0]) ** 2
+    tool_jacobian = jacobian[:, dofs]
+    stiffness = tool_jacobian.T @ (gains[:, None] * tool_jacobian) + np.diag(springs[dofs])
+    pulls = (data.qfrc_gravcomp - bias)[dofs]
+    moved = np.linalg.lstsq(stiffness, pulls, rcond=1e-9)[0]
+    sag = float(np.linalg.norm(tool_jacobian[:3] @ moved))
+    if sag <= LARGEST_SAG:
+        return
+    of_tool = np.flatnonzero(case.tool_bodies)
+    mass = float(model.body_mass[of_tool].sum())
+    pull = sag * coupling.stiffness
+    yield Fault(
+        "heavy tool",
+        case.places.body(int(of_tool[0])),  # the first that moves
+        f"the tool weighs {weight(mass)}; the part the hand carries, {number(pull)} N, stretches "
+        f"the coupling of {coupling.stiffness:.4g} N/m by {length(sag)} at rest; a run carries "
+        "it where the device cannot, and with --no-tool-weight",
+        'gravcomp="1" in the body and those below it, or less mass',
+    )
