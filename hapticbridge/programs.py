@@ -40,7 +40,7 @@ def programs() -> list[Program]:
         Program(answer_step, (state, row, 0)),
         Program(finish_tick, (state, row, row, counts, 0, 0, 0, 0, 0, True)),
         Program(before_step, (state, sample, row, 0, 0.0)),
-        Program(simulate_recorded, (state, sample, counts, numbers, row, row)),
+        Program(simulate_recorded, (state, sample[None], counts[None], numbers, row, row[None])),
         Program(between_halves, (state,)),
         Program(stretch_at, (state[0], sample)),
         Program(next_sample, (np.zeros(1, HAND_DTYPE), np.empty((0, 8)), sample)),
