@@ -113,9 +113,9 @@ def _machine() -> tuple[Any, Any]:
 def processor() -> tuple[str, str]:
     """Returns name and features of the processor for which the code is made.
 
-    On x86-64 that is level 3 of the architecture where this processor has it, elsewhere on Linux
-    the 64-bit ARM architecture's baseline. Code made on another such machine then fits, and no
-    number changes: floating-point operations are never contracted or reordered.
+    That is level 3 of x86-64 if this processor has it, the baseline of 64-bit ARM, or else this
+    processor. Code that was made on another machine of that level fits. No number depends on the
+    level, because floating-point operations are never contracted or reordered.
     """
     name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features()
     machine = llvm.get_process_triple().partition("-")[0]
@@ -149,16 +149,19 @@ def program(
         releases_lock: True to release the interpreter lock in calls from Python.
 
     Returns:
-        LLVM's bitcode, empty if there is no entry for such a result.
+        LLVM's bitcode, empty if there is no entry for it.
     """
     if result not in _RESULTS:
         return b""
     target, _ = _machine()
     entry = _c_entry(symbol, c_types) if c_types else _entry(symbol, kinds, result, releases_lock)
-    module = llvm.parse_assembly(entry)
-    module.triple, module.data_layout = target.triple, str(target.target_data)
-    for part in parts:
-        module.link_in(part, preserve=True)
+    try:
+        module = llvm.parse_assembly(entry)
+        module.triple, module.data_layout = target.triple, str(target.target_data)
+        for part in parts:
+            module.link_in(part, preserve=True)
+    except RuntimeError:  # with an LLVM whose pointers have types
+        return b""
     for value in (*module.functions, *module.global_variables):
         if not value.is_declaration and value.name != _ENTRY:
             value.linkage = "internal"

@@ -53,14 +53,16 @@ def prepare_run(note: Callable[[int], None]) -> None:
     prepare(programs(), note)
 
 
+def words(left: int) -> str:
+    """Returns a line of progress; ``left`` is the number of programs that are left."""
+    return f"compiling for this machine, once, for about a minute; programs left: {left} …"
+
+
 def main() -> None:
-    """Compiles, tells how far it is, and runs and audits a scene once."""
+    """Compiles with lines of progress, and runs and audits a scene once."""
     from hapticbridge import Bridge, SimulatedClock, audit  # noqa: PLC0415 - they import much
 
-    def note(left: int) -> None:
-        print(f"compiling for this machine; programs left: {left} ...", file=sys.stderr, flush=True)
-
-    prepare_run(note)
+    prepare_run(lambda left: print(words(left), file=sys.stderr, flush=True))
     with TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path = Path(folder, "run.mcap")

@@ -45,7 +45,7 @@ from hapticbridge.options import (
     steady_rotational_stiffness,
     steady_stiffness,
 )
-from hapticbridge.programs import prepare_run
+from hapticbridge.programs import prepare_run, words
 from hapticbridge.realtime import busy_step_time, scene_ticks_for
 from hapticbridge.rehearsal import static_load
 from hapticbridge.rendering import RunCoupling, default_method
@@ -215,11 +215,6 @@ MAX_FAULTS = 2
 """Number of a scene's faults that a run repeats."""
 
 
-def _note_compiling(left: int) -> None:
-    """Tells how far the compilation is that comes once on a machine."""
-    err.print(f"compiling for this machine, once, for about a minute; programs left: {left} …")
-
-
 def _findings(source: SceneSource, scene: Scene) -> tuple[str, ...]:
     """Returns the worst of what ``hapticbridge check`` finds without a motion."""
     return tuple(
@@ -341,7 +336,7 @@ class Run:
             interrupts = stack.enter_context(interrupting_on_signals())
             with err.status("reading the scene …"):
                 source = read_scene(self.scene, **settings_from(self.settings))
-            prepare_run(_note_compiling)
+            prepare_run(lambda left: notify(words(left)))
             held = self._completed(held, own_grips(source))
             if len(held) > 1:
                 return self._run_hands(source, held, clock, stack, window, interrupts)
