@@ -21,7 +21,7 @@ from contextlib import suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import llvmlite.binding as llvm
 import numpy as np
@@ -30,9 +30,9 @@ if sys.platform != "win32":
     import grp
     import pwd
 
-Kind = type | tuple[np.dtype[Any], int]
-"""Type of an argument: ``bool``, ``int`` or ``float``; or the type of an array's items and the
-number of its axes, 0 for a record."""
+Kind: TypeAlias = "type | tuple[np.dtype[Any], int] | tuple[Kind, ...]"
+"""Type of an argument: ``bool``, ``int`` or ``float``; the type of an array's items and the number
+of its axes, 0 for a record; or the types of a tuple's items."""
 
 _ENTRY = "hapticbridge_entry"
 
@@ -68,6 +68,7 @@ _DECLARATIONS = """
 declare double @PyFloat_AsDouble(ptr)
 declare i64 @PyLong_AsLongLong(ptr)
 declare i32 @PyObject_IsTrue(ptr)
+declare ptr @PyTuple_GetItem(ptr, i64)
 declare ptr @PyBool_FromLong(i64)
 declare ptr @PyLong_FromLongLong(i64)
 declare ptr @PyFloat_FromDouble(double)
@@ -86,6 +87,9 @@ def kind_of(argument: object) -> Kind | None:
         return (argument.dtype, argument.ndim) if is_plain else None
     if type(argument) is np.void:
         return (argument.dtype, 0)
+    if type(argument) is tuple:
+        kinds = tuple(kind for kind in map(kind_of, argument) if kind is not None)
+        return kinds if kinds and len(kinds) == len(argument) else None
     return type(argument) if type(argument) in (bool, int, float) else None
 
 
@@ -283,7 +287,14 @@ def _unpacked(a: str, kind: Kind) -> tuple[list[str], list[str]]:
     if isinstance(kind, type):
         lines = [f"{a}.truth = call i32 @PyObject_IsTrue(ptr {a})"]
         return [*lines, f"{a}.value = trunc i32 {a}.truth to i8"], [f"i8 {a}.value"]
-    dtype, axes = kind
+    if not isinstance(kind[0], np.dtype):
+        lines, values = list[str](), list[str]()
+        for number, each in enumerate(cast(tuple[Kind, ...], kind)):
+            code, parts = _unpacked(f"{a}.{number}", each)
+            lines += (f"{a}.{number} = call ptr @PyTuple_GetItem(ptr {a}, i64 {number})", *code)
+            values += parts
+        return lines, values
+    dtype, axes = cast(tuple[np.dtype[Any], int], kind)
     offset = _HEADER if axes else _HEADER + 8
     lines = [
         f"{a}.field = getelementptr i8, ptr {a}, i64 {offset}",

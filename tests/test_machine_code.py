@@ -62,6 +62,11 @@ def raising(table: NDArray[np.float64]) -> int:
     return 1
 
 
+def paired(both: tuple[NDArray[np.float64], NDArray[np.void], int], factor: float) -> float:
+    both[0][0, 0] += factor
+    return float(both[0][2, 3] + both[1][1]["first"] * both[2])
+
+
 def arguments_of_weighted() -> tuple[Any, ...]:
     pairs = np.array([(1.5, 2), (2.5, 3)], PAIR)
     return np.arange(12.0).reshape(3, 4), pairs, pairs[0], 0.1, 7, True
@@ -72,6 +77,7 @@ CASES: dict[str, tuple[Callable[..., Any], Callable[[], tuple[Any, ...]]]] = {
     "truth": (is_above, lambda: (np.ones(1, PAIR)[0], 0.5)),
     "integer": (rows_of, lambda: (np.zeros((3, 4)),)),
     "no result": (clear, lambda: (np.ones((3, 4)),)),
+    "tuple": (paired, lambda: ((np.ones((3, 4)), np.ones(2, PAIR), 3), 0.5)),
     "allocation": (allocating, lambda: (np.ones((3, 4)),)),
 }
 
@@ -98,7 +104,8 @@ def test_machine_code_from_disk_does_what_python_does(name: str, folder: Path) -
         assert answer == result
         assert isinstance(answer, type(result)) or isinstance(result, type(answer))
         for one, other in zip(given, expected, strict=True):
-            assert np.array_equal(one, other)
+            pairs = zip(one, other, strict=True) if isinstance(one, tuple) else ((one, other),)
+            assert all(np.array_equal(*pair) for pair in pairs)
     (path,) = folder.glob("*.o")
     assert bool(machine_code.read(path)) == (name != "allocation")
 
